@@ -1,0 +1,220 @@
+"""Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Intrinsics of one camera.
+
+    Attributes
+    ----------
+    width, height : int
+        Image size, pixels.
+    fx, fy, cx, cy : float
+        Focal lengths and principal point, pixels; (0, 0) is the centre of the top-left pixel.
+    distortion : ndarray, shape (5,)
+        The paper's (k1, k2, k3, k4, k5), which is OpenCV's (k1, k2, p1, p2, k3): k1, k2, k5 radial, k3, k4 tangential.
+    covariance : ndarray, shape (9, 9), or None
+        Of (fx, fy, cx, cy, k1..k5), where it is known.
+    rms_px : float or None
+        Reprojection error of the calibration the intrinsics come from.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(5))
+    covariance: np.ndarray | None = None
+    rms_px: float | None = None
+
+    @property
+    def matrix(self):
+        """The 3 x 3 matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def parameters(self):
+        """(fx, fy, cx, cy, k1..k5), shape (9,)."""
+        return np.r_[self.fx, self.fy, self.cx, self.cy, self.distortion]
+
+    def with_parameters(self, values, covariance=None, rms_px=None):
+        """The same image size with other intrinsics, given in the order of `parameters`."""
+        fx, fy, cx, cy = (float(v) for v in values[:4])
+        return CameraModel(self.width, self.height, fx, fy, cx, cy, np.asarray(values[4:9], float), covariance, rms_px)
+
+
+def pinhole(p_camera, model):
+    """Project points to undistorted pixels: a pinhole with `model`'s K and no lens, equation (19).
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Undistorted pixels; NaN where z <= 0.
+    """
+    p_camera = np.asarray(p_camera, float)
+    z = np.where(p_camera[..., 2] > 0, p_camera[..., 2], np.nan)
+    return np.stack([model.fx * p_camera[..., 0] / z + model.cx, model.fy * p_camera[..., 1] / z + model.cy], axis=-1)
+
+
+def pinhole_jacobian(p_camera, model):
+    """Derivative of :func:`pinhole` by the point, shape (..., 2, 3), pixels per metre."""
+    p_camera = np.asarray(p_camera, float)
+    x, y, z = p_camera[..., 0], p_camera[..., 1], p_camera[..., 2]
+    out = np.zeros(p_camera.shape[:-1] + (2, 3))
+    out[..., 0, 0], out[..., 0, 2] = model.fx / z, -model.fx * x / z**2
+    out[..., 1, 1], out[..., 1, 2] = model.fy / z, -model.fy * y / z**2
+    return out
+
+
+def distort(normalized, distortion):
+    """Lens distortion of normalised image coordinates, equation (18) read as 1 + k1 r^2 + k2 r^4 + k5 r^6.
+
+    Parameters
+    ----------
+    normalized : array_like, shape (..., 2)
+        (x / z, y / z).
+    distortion : array_like, shape (5,)
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+    """
+    normalized = np.asarray(normalized, float)
+    k1, k2, k3, k4, k5 = distortion
+    x, y = normalized[..., 0], normalized[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
+    return np.stack(
+        [x * radial + 2 * k3 * x * y + k4 * (r2 + 2 * x * x), y * radial + k3 * (r2 + 2 * y * y) + 2 * k4 * x * y], axis=-1
+    )
+
+
+def project(p_camera, model):
+    """Project points to pixels through the pinhole with lens distortion, equations (18) and (19).
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Pixels; NaN where z <= 0.
+    """
+    p_camera = np.asarray(p_camera, float)
+    z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
+    return distort(p_camera[..., :2] / z, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
+
+
+def project_jacobians(p_camera, model):
+    """Derivatives of :func:`project` by the point and by the intrinsics.
+
+    Parameters
+    ----------
+    p_camera : array_like, shape (..., 3)
+        Points in front of the camera, metres.
+    model : CameraModel
+
+    Returns
+    -------
+    by_point : ndarray, shape (..., 2, 3)
+    by_intrinsics : ndarray, shape (..., 2, 9)
+        In the order of `CameraModel.parameters`.
+    """
+    p_camera = np.asarray(p_camera, float)
+    k1, k2, k3, k4, k5 = model.distortion
+    z = p_camera[..., 2]
+    x, y = p_camera[..., 0] / z, p_camera[..., 1] / z
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k5)), 2 * (k1 + r2 * (2 * k2 + 3 * k5 * r2))
+    xx = radial + slope * x * x + 2 * k3 * y + 6 * k4 * x
+    xy = slope * x * y + 2 * k3 * x + 2 * k4 * y
+    yy = radial + slope * y * y + 6 * k3 * y + 2 * k4 * x
+    u = np.stack([xx / z, xy / z, -(xx * x + xy * y) / z], -1) * model.fx
+    v = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], -1) * model.fy
+    lens = distort(np.stack([x, y], -1), model.distortion)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    powers = [r2, r2**2, None, None, r2**3]
+    du = [x * powers[0], x * powers[1], 2 * x * y, r2 + 2 * x * x, x * powers[4]]
+    dv = [y * powers[0], y * powers[1], r2 + 2 * y * y, 2 * x * y, y * powers[4]]
+    iu = np.stack([lens[..., 0], zero, one, zero, *(model.fx * d for d in du)], -1)
+    iv = np.stack([zero, lens[..., 1], zero, one, *(model.fy * d for d in dv)], -1)
+    return np.stack([u, v], axis=-2), np.stack([iu, iv], axis=-2)
+
+
+def undistort(uv, model):
+    """Undistorted pixels of image points.
+
+    Parameters
+    ----------
+    uv : array_like, shape (..., 2)
+        Pixels as recorded.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Pixels of a camera with the same K and no lens distortion.
+    """
+    uv = np.asarray(uv, float)
+    if uv.size == 0:
+        return uv.copy()
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+    flat = np.ascontiguousarray(uv.reshape(-1, 1, 2))
+    out = cv2.undistortPoints(flat, model.matrix, model.distortion, None, None, model.matrix, stop)
+    return out.reshape(uv.shape)
+
+
+def line_through(a, b):
+    """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels, shape (..., 3)."""
+    a, b = np.broadcast_arrays(np.asarray(a, float), np.asarray(b, float))
+    along = b - a
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    if np.any(length == 0):
+        raise ValueError(f"a line needs two different points, got {a} twice")
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / length
+    return np.concatenate([normal, -np.sum(normal * a, axis=-1, keepdims=True)], axis=-1)
+
+
+def line_distance(uv, line):
+    """Signed distance of pixels from lines, equation (20) with its sign kept; pixels."""
+    uv, line = np.asarray(uv, float), np.asarray(line, float)
+    return np.sum(uv * line[..., :2], axis=-1) + line[..., 2]
+
+
+def board_line_in_image(line, T_camera_board, model):
+    """Undistorted pixel line of a line drawn on the board.
+
+    Parameters
+    ----------
+    line : array_like, shape (3,)
+        ``a x + b y + c = 0`` in the board frame.
+    T_camera_board : RigidTransform
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        With unit normal on the same side as the board line's (both sides keep their sign in front of the camera).
+    """
+    pose = T_camera_board.as_matrix()
+    homography = model.matrix @ pose[:3, [0, 1, 3]]
+    out = np.linalg.solve(homography.T, np.asarray(line, float))
+    return out / np.hypot(out[0], out[1])

@@ -1,0 +1,64 @@
+"""Projection, undistortion, pixel lines."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib import camera as c
+
+MODEL = c.CameraModel(1280, 720, 700.0, 702.0, 640.0, 350.0, np.array([-0.17, 0.02, 0.001, -0.0004, 0.003]))
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform([-1, -0.6, 1.5], [1, 0.6, 3], (60, 3))
+
+
+def numeric(function, x, step=1e-6):
+    steps = step * np.eye(len(x))
+    return np.stack([(function(x + s) - function(x - s)) / (2 * step) for s in steps], axis=-1)
+
+
+def test_the_papers_distortion_is_opencvs(points):
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MODEL.matrix, MODEL.distortion)[0][:, 0]
+    np.testing.assert_allclose(c.project(points, MODEL), expected, atol=1e-9)
+
+
+def test_undistort_undoes_the_lens(points):
+    np.testing.assert_allclose(c.undistort(c.project(points, MODEL), MODEL), c.pinhole(points, MODEL), atol=1e-7)
+    assert c.undistort(np.zeros((0, 2)), MODEL).shape == (0, 2)
+
+
+def test_points_behind_the_camera_are_nan():
+    behind = np.array([0.1, 0.1, -1.0])
+    assert np.isnan(c.project(behind, MODEL)).all() and np.isnan(c.pinhole(behind, MODEL)).all()
+
+
+def test_jacobians_are_the_numeric_ones(points):
+    for p in points[:5]:
+        by_point, by_intrinsics = c.project_jacobians(p, MODEL)
+        np.testing.assert_allclose(by_point, numeric(lambda x: c.project(x, MODEL), p), rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(c.pinhole_jacobian(p, MODEL), numeric(lambda x: c.pinhole(x, MODEL), p), rtol=1e-6, atol=1e-5)
+        expected = numeric(lambda k, p=p: c.project(p, MODEL.with_parameters(k)), MODEL.parameters)
+        np.testing.assert_allclose(by_intrinsics, expected, rtol=1e-6, atol=1e-5)
+
+
+def test_line_distance_is_signed_and_in_pixels():
+    line = c.line_through([0, 0], [10, 0])
+    np.testing.assert_allclose(c.line_distance([[3, 2], [3, -2], [99, 0]], line), [-2, 2, 0])
+
+
+def test_a_line_through_one_point_is_refused():
+    with pytest.raises(ValueError, match="two different points"):
+        c.line_through([1, 2], [1, 2])
+
+
+def test_board_lines_project_with_their_side():
+    pose = RigidTransform.from_components([0.1, -0.2, 1.7], Rotation.from_rotvec([0.3, -0.4, 0.9]))
+    board_line = np.array([0.6, 0.8, -0.35])
+    on_line, outside = np.array([[0.35 * 0.6 + 0.8 * s, 0.35 * 0.8 - 0.6 * s, 0] for s in (-0.3, 0.2)]), [0.9, 0.9, 0]
+    line = c.board_line_in_image(board_line, pose, MODEL)
+    np.testing.assert_allclose(c.line_distance(c.pinhole(pose.apply(on_line), MODEL), line), 0, atol=1e-9)
+    assert c.line_distance(c.pinhole(pose.apply(outside), MODEL), line) > 0
+    assert np.hypot(*line[:2]) == pytest.approx(1)

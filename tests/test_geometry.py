@@ -1,0 +1,112 @@
+"""Frames, tilt axis, planes and lines."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib import geometry as g
+
+
+def random_transform(rng, angle=1.0, shift=0.3):
+    return RigidTransform.from_components(rng.normal(size=3) * shift, Rotation.from_rotvec(rng.normal(size=3) * angle))
+
+
+def test_polar_points_lie_in_the_scan_plane_at_their_range():
+    p = g.polar_to_points([1.0, 2.0, np.nan], np.deg2rad([0.0, 90.0, 10.0]))
+    np.testing.assert_allclose(p[:2], [[1, 0, 0], [0, 2, 0]], atol=1e-15)
+    assert np.isnan(p[2]).all()
+
+
+def test_polar_covariance_matches_a_monte_carlo():
+    rng = np.random.default_rng(1)
+    r, b = 2.0 + 0.01 * rng.normal(size=40000), 0.7 + 0.002 * rng.normal(size=40000)
+    sample = np.cov(g.polar_to_points(r, b).T)
+    np.testing.assert_allclose(g.polar_covariance(2.0, 0.7, 0.01, 0.002), sample, atol=3e-6)
+
+
+def test_positive_pitch_lifts_the_view():
+    np.testing.assert_allclose(g.tilt([0.0, 1.0, 0.0], np.pi / 2), [0, 0, 1], atol=1e-15)
+
+
+def test_tilt_is_the_rotation_about_x():
+    rng = np.random.default_rng(2)
+    p, pitch = rng.normal(size=(20, 3)), rng.normal(size=20)
+    np.testing.assert_allclose(g.tilt(p, pitch), Rotation.from_rotvec(np.outer(pitch, [1, 0, 0])).apply(p), atol=1e-14)
+
+
+def test_hat_is_the_cross_product():
+    rng = np.random.default_rng(3)
+    v, u = rng.normal(size=(2, 7, 3))
+    np.testing.assert_allclose((g.hat(v) @ u[..., None])[..., 0], np.cross(v, u), atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1, 1e-7])
+def test_the_axis_survives_every_chart(scale):
+    T = random_transform(np.random.default_rng(4), 0.5 * scale, 0.2)
+    axis = g.axis_of(T)
+    for again in (g.head_from_axis(axis), g.head_from_paper(*g.paper_parameters(T))):
+        angle, offset = g.axis_difference(axis, g.axis_of(again))
+        assert angle < 1e-12 and offset < 1e-12
+
+
+def test_turning_about_x_and_sliding_along_x_do_not_change_the_axis():
+    T = random_transform(np.random.default_rng(5))
+    other = RigidTransform.from_components([0.4, 0, 0], Rotation.from_euler("x", 0.7)) * T
+    assert max(g.axis_difference(g.axis_of(T), g.axis_of(other))) < 1e-12
+
+
+def test_head_from_axis_leaves_an_aligned_axis_alone():
+    T = g.head_from_axis(g.TiltAxis(np.array([1.0, 0, 0]), np.array([0, -0.01, -0.15])))
+    np.testing.assert_allclose(T.rotation.as_matrix(), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(T.translation, [0, 0.01, 0.15])
+
+
+def test_an_axis_through_the_origin_has_no_phi_x():
+    phi, ty = g.paper_parameters(RigidTransform.identity())
+    assert ty == 0.0 and phi[0] == 0.0
+
+
+def test_head_mounted_camera_sees_a_scan_at_its_own_pitch_unchanged():
+    rng = np.random.default_rng(6)
+    T, p = random_transform(rng), rng.normal(size=(5, 3))
+    np.testing.assert_allclose(g.lrf_to_source(p, 0.3, T, "head", 0.3), p, atol=1e-14)
+
+
+def test_head_and_platform_sources_agree_through_the_head():
+    rng = np.random.default_rng(7)
+    T, p, pitch = random_transform(rng), rng.normal(size=(5, 3)), rng.normal(size=5)
+    head = g.lrf_to_source(p, pitch, T, "head", 0.2)
+    np.testing.assert_allclose(g.lrf_to_platform(head, 0.2, T), g.lrf_to_source(p, pitch, T, "platform"), atol=1e-14)
+
+
+def test_unknown_mount_is_refused():
+    with pytest.raises(ValueError, match="'head' or 'platform', got 'roof'"):
+        g.lrf_to_source(np.zeros((1, 3)), 0.0, RigidTransform.identity(), "roof")
+
+
+def test_plane_and_line_fits_recover_exact_data():
+    rng = np.random.default_rng(8)
+    normal, distance, rms = g.fit_plane(np.column_stack([rng.normal(size=(9, 2)), np.full(9, -2.0)]))
+    np.testing.assert_allclose(np.r_[normal, distance], [0, 0, -1, 2], atol=1e-12)
+    assert rms < 1e-9
+    _, direction, rms = g.fit_line(np.outer(rng.normal(size=9), [1, 2, 2]) / 3 + 1)
+    np.testing.assert_allclose(abs(direction @ [1, 2, 2]) / 3, 1, atol=1e-12)
+    assert rms < 1e-7
+
+
+@pytest.mark.parametrize("points", [np.zeros((2, 3)), np.outer(np.arange(5.0), [1, 1, 1])])
+def test_a_plane_needs_more_than_a_line(points):
+    with pytest.raises(g.DegenerateGeometry, match="plane needs three|unobservable"):
+        g.fit_plane(points)
+
+
+def test_a_line_needs_two_points():
+    with pytest.raises(g.DegenerateGeometry, match="two distinct points"):
+        g.fit_line(np.ones((4, 3)))
+
+
+def test_line_gap_of_crossing_skew_and_parallel_lines():
+    x, y = np.eye(3)[:2]
+    assert g.line_gap(np.zeros(3), x, 5 * x, y) == pytest.approx(0)
+    assert g.line_gap(np.zeros(3), x, [1, 2, 3], y) == pytest.approx(3)
+    assert g.line_gap(np.zeros(3), x, [9, 3, 4], 2 * x) == pytest.approx(5)
