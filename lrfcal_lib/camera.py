@@ -99,9 +99,9 @@ def distort(normalized, distortion):
     x, y = normalized[..., 0], normalized[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
-    return np.stack(
-        [x * radial + 2 * k3 * x * y + k4 * (r2 + 2 * x * x), y * radial + k3 * (r2 + 2 * y * y) + 2 * k4 * x * y], axis=-1
-    )
+    tangential_x = 2 * k3 * x * y + k4 * (r2 + 2 * x * x)
+    tangential_y = k3 * (r2 + 2 * y * y) + 2 * k4 * x * y
+    return np.stack([x * radial + tangential_x, y * radial + tangential_y], axis=-1)
 
 
 def project(p_camera, model):

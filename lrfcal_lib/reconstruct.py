@@ -37,7 +37,9 @@ class Cloud:
 
     def __repr__(self):
         share = 100 * self.seen.mean() if len(self.seen) else 0.0
-        return f"Cloud({len(self.points)} points of {len(np.unique(self.placement))} placements, {share:.1f} % coloured)"
+        return (
+            f"Cloud({len(self.points)} points of {len(np.unique(self.placement))} placements, {share:.1f} % coloured)"
+        )
 
 
 def visible(uv, depth, width, height, *, cell=4, tolerance=0.02):
@@ -135,7 +137,9 @@ def blend(colors):
 
 def join(clouds):
     """One cloud of several."""
-    return Cloud(*(np.concatenate([getattr(c, name) for c in clouds]) for name in ("points", "colors", "seen", "placement")))
+    return Cloud(
+        *(np.concatenate([getattr(c, name) for c in clouds]) for name in ("points", "colors", "seen", "placement"))
+    )
 
 
 def write_ply(path, cloud):
@@ -181,6 +185,10 @@ class MeasuredBoard:
     corners: dict
     lengths: dict
 
+    def corner_point(self, name):
+        """The corner where an edge starts, shape (3,), in the frame of the cloud."""
+        return self.T_source_plane[:3, 3] + self.T_source_plane[:3, :2] @ self.corners[name]
+
 
 def plane_frame(points):
     """A frame in the plane of some points, shape (4, 4): origin in their centre, z along the normal."""
@@ -218,7 +226,9 @@ def measure_board(face, sides, edges):
         lines[name] = np.r_[normal, -normal @ centre[:2]]
     before = dict(zip(edges, edges[-1:] + edges[:-1], strict=True))
     after = dict(zip(edges, edges[1:] + edges[:1], strict=True))
-    corners = {name: _meet(lines[before[name]], lines[name]) for name in edges if name in lines and before[name] in lines}
+    corners = {
+        name: _meet(lines[before[name]], lines[name]) for name in edges if name in lines and before[name] in lines
+    }
     lengths = {
         name: float(np.linalg.norm(corners[after[name]] - corners[name]))
         for name in edges

@@ -53,7 +53,8 @@ def test_ply_round_trip(tmp_path):
 
 
 def test_exact_edge_points_give_exact_lengths():
-    board, pose = triangle_board(), RigidTransform.from_components([0.1, 0.2, 1.5], Rotation.from_rotvec([0.2, 0.5, -0.7]))
+    board = triangle_board()
+    pose = RigidTransform.from_components([0.1, 0.2, 1.5], Rotation.from_rotvec([0.2, 0.5, -0.7]))
     corners = np.column_stack([board.corners, np.zeros(3)])
     s = np.linspace(0.1, 0.9, 12)[:, None]
     sides = {e: pose.apply(corners[i] * (1 - s) + corners[(i + 1) % 3] * s) for i, e in enumerate(board.edges)}

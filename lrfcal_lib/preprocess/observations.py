@@ -31,6 +31,9 @@ class CameraObservations:
         Standard deviation of the image line at the crossing, pixels.
     crossing_placement : ndarray of int, shape (n,)
     crossing_edge : ndarray of str, shape (n,)
+    crossing_across : ndarray of bool, shape (n,)
+        Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
+        the recorded pitch. The paper uses none of these.
     plane_points : ndarray, shape (m, 3)
         Points on the face of the board, metres.
     plane_covariance : ndarray, shape (m, 3, 3)
@@ -65,6 +68,7 @@ class CameraObservations:
     crossing_line_sigma: np.ndarray
     crossing_placement: np.ndarray
     crossing_edge: np.ndarray
+    crossing_across: np.ndarray
     plane_points: np.ndarray
     plane_covariance: np.ndarray
     plane_placement: np.ndarray
@@ -86,6 +90,12 @@ class CameraObservations:
         parts = (self.crossing_placement, self.plane_placement, self.placements, self.scene_placement)
         return np.unique(np.concatenate(parts))
 
+    def along(self):
+        """Without the edges found across the scan lines: what the paper works on."""
+        keep = ~self.crossing_across
+        names = [f.name for f in fields(self) if f.name.startswith("crossing_")]
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+
     def select(self, placements):
         """The observations of some placements only (for leave-one-out and random halves).
 
@@ -104,7 +114,10 @@ class CameraObservations:
             "scene_": np.isin(self.scene_placement, wanted),
         }
         changed = {
-            f.name: getattr(self, f.name)[keep] for f in fields(self) for prefix, keep in groups.items() if f.name.startswith(prefix)
+            f.name: getattr(self, f.name)[keep]
+            for f in fields(self)
+            for prefix, keep in groups.items()
+            if f.name.startswith(prefix)
         }
         keep = np.isin(self.placements, wanted)
         for name in ("placements", "board_poses", "board_covariance", "pattern_pixels"):

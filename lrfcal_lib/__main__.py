@@ -1,0 +1,89 @@
+"""``python -m lrfcal_lib VERB``: the work outside notebooks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+
+def _import_lasersetero(args):
+    from lrfcal_lib.importers import import_lasersetero
+
+    miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+    print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+
+
+def _check(args):
+    from lrfcal_lib.session import validate
+
+    problems = validate(args.session)
+    print("\n".join(problems) or f"{args.session}: nothing to complain about")
+    return 1 if problems else 0
+
+
+def _calibrate(args):
+    from lrfcal_lib.export import calibrate_session
+
+    return calibrate_session(args.session)
+
+
+def _report(args):
+    from lrfcal_lib.report import main
+
+    return main(args.rest)
+
+
+def parser():
+    """The command line.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+    """
+    top = argparse.ArgumentParser(prog="python -m lrfcal_lib", description=__doc__.replace("``", ""))
+    verbs = top.add_subparsers(title="verbs", metavar="VERB", required=True)
+    kinds = verbs.add_parser("import", help="make a session of a recording by other people")
+    kinds = kinds.add_subparsers(title="recordings", metavar="KIND", required=True)
+    add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
+    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m")
+    add.add_argument("dst", help="folder of the new session")
+    choices = {"choices": ("own", "published"), "default": "own"}
+    add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
+    add.set_defaults(run=_import_lasersetero)
+    check = verbs.add_parser("check", help="say what is wrong with a session")
+    check.add_argument("session")
+    check.set_defaults(run=_check)
+    calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
+    calibrate.add_argument("session")
+    calibrate.set_defaults(run=_calibrate)
+    report = verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
+    report.set_defaults(run=_report)
+    return top
+
+
+def main(argv=None):
+    """Run a verb.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Without the program's name.
+
+    Returns
+    -------
+    int
+        0, or 1 after a message on stderr (a ``ValueError`` is bad input, not a bug).
+    """
+    args, args.rest = parser().parse_known_args(argv)
+    if args.rest and args.run is not _report:
+        parser().error(f"unrecognized arguments: {' '.join(args.rest)}")
+    try:
+        result = args.run(args)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return result if isinstance(result, int) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

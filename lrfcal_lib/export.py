@@ -1,0 +1,155 @@
+"""Calibrations on disk: the native ``calibration.json``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lrfcal_lib import __version__
+from lrfcal_lib.evaluate import plane_residuals_of, rms, trusted_sigma
+from lrfcal_lib.pipeline import calibrate, color_cloud
+from lrfcal_lib.reconstruct import write_ply
+from lrfcal_lib.session import open_session
+from lrfcal_lib.solvers.camera import edge_residuals_px
+
+SCHEMA = 1
+FRAMES = (
+    "destination first: p_camera = T_camera_source p_source; metres, radians; "
+    "covariances of [w, v]: R <- exp(w) R, t <- t + v"
+)
+
+
+def calibration_record(prepared, platform, observations, solutions, method):
+    """Everything a calibration says, ready for JSON.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    platform : PlatformCalibration
+    observations : dict of (str, str) to CameraObservations
+    solutions : dict of (str, str) to Solution
+    method : str
+        The method whose camera poses are handed over.
+
+    Returns
+    -------
+    dict
+        Schema, library version, session with the SHA-256 of its files, frames and units, platform, and for each camera
+        its pose, intrinsics, covariance, and residual statistics.
+    """
+    session = prepared.session
+    cameras = {
+        camera: _camera(prepared.models[camera], observations[camera, "half_step"], solutions[camera, method])
+        for camera in prepared.views
+        if (camera, method) in solutions
+    }
+    return {
+        "schema": SCHEMA,
+        "lrfcal": __version__,
+        "session": session.name,
+        "inputs_sha256": file_hashes(session.path),
+        "conventions": FRAMES,
+        "method": method,
+        "platform": _transform(platform.T_head_lrf)
+        | {
+            "maps": "lrf to head",
+            "axis_covariance": platform.covariance.tolist(),
+            "axis_covariance_of": AXIS_PARAMETERS,
+        },
+        "cameras": cameras,
+    }
+
+
+AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
+
+
+def _camera(model, obs, solution):
+    edge = edge_residuals_px(obs, solution.transform, solution.model)
+    return {
+        "maps": f"{obs.source} to {obs.camera}",
+        **_transform(solution.transform),
+        "sigma": dict(zip(solution.names[:6], trusted_sigma(solution)[:6].tolist(), strict=True)),
+        "covariance": solution.covariance[:6, :6].tolist(),
+        "intrinsics": _intrinsics(solution.model or model),
+        "converged": bool(solution.converged),
+        "unobservable": list(solution.unobservable),
+        "edge_rms_px": rms(edge),
+        "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution)),
+        "n_crossings": len(edge),
+        "placements": obs.all_placements.tolist(),
+    }
+
+
+def _transform(transform):
+    return {
+        "matrix": transform.as_matrix().tolist(),
+        "rotvec_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
+
+
+def _intrinsics(model):
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return {"width": model.width, "height": model.height} | dict(zip(names, model.parameters.tolist(), strict=True))
+
+
+def file_hashes(folder):
+    """SHA-256 of every file of a session, by its path within it."""
+    files = sorted(p for p in Path(folder).rglob("*") if p.is_file())
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def write_calibration(path, record):
+    """Write a calibration as JSON; NaN becomes null.
+
+    Parameters
+    ----------
+    path : path-like
+    record : dict
+        Of :func:`calibration_record`.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(_plain(record), indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def calibrate_session(path, out=None):
+    """Calibrate a session from the command line: print what came out, write ``calibration.json`` and ``cloud.ply``.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder of the session.
+    out : path-like, optional
+        ``reports/<name>`` under the current folder when left out.
+
+    Returns
+    -------
+    int
+        0, or 1 when no camera could be calibrated.
+    """
+    found = calibrate(open_session(path))
+    folder = Path(out or Path("reports") / Path(path).resolve().name)
+    for (camera, method), solution in found.solutions.items():
+        turn, shift = np.rad2deg(solution.parameters[:3]).round(3), (1000 * solution.parameters[3:6]).round(1)
+        print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
+    for key, why in (found.prepared.problems | found.problems).items():
+        print(f"{key}: {why}")
+    if not any(method == "line" for _, method in found.solutions):
+        return 1
+    record = calibration_record(found.prepared, found.platform, found.observations, found.solutions, "line")
+    write_calibration(folder / "calibration.json", record)
+    write_ply(folder / "cloud.ply", color_cloud(found))
+    print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")
+    return 0

@@ -1,0 +1,370 @@
+"""Pair what the LRF and a camera saw: name the sides a scan crosses, and stack the observations every method takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.board import corners_of_lines
+from lrfcal_lib.geometry import DegenerateGeometry, fit_line, lrf_to_platform, lrf_to_source, tilt
+from lrfcal_lib.prepared import VARIANTS, Prepared
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.observations import CameraObservations
+from lrfcal_lib.reconstruct import MeasuredBoard, measure_board
+from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
+
+CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
+FACE_POINTS = 150  # per placement, for the same reason
+NAME_DISTANCE = 0.08  # metres between a side in the cloud and the board edge it is named after, at most
+LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
+NAME_ANGLE = np.deg2rad(
+    3.0
+)  # between them; a larger one means that the side is none (a cloud cut by hand, an occluder)
+
+
+def observe(prepared, camera, variant="half_step", T_head_lrf=None, pitch_offset=None):
+    """Pair what the LRF and one camera saw of the board.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    camera : str
+    variant : {'half_step', 'last_beam'}
+        Rule for the edge point.
+    T_head_lrf : RigidTransform, optional
+        Platform calibration to use instead of the session's own.
+    pitch_offset : dict of int to float, optional
+        Radians to add to the recorded pitch, by placement.
+
+    Returns
+    -------
+    CameraObservations
+    """
+    view_of = prepared.views[camera]
+    sources = _Sources(prepared, camera, platform_of(prepared, T_head_lrf), pitch_offset or {})
+    posed = [p for p, view in view_of.items() if view.T_camera_board is not None]
+    pattern = prepared.board.pattern
+    k = 0 if pattern is None else pattern.columns * pattern.rows
+    pixels = [view_of[p].pixels if view_of[p].pixels is not None else np.full((k, 2), np.nan) for p in posed]
+    return CameraObservations(
+        camera=camera,
+        source="platform" if prepared.session.cameras[camera].mount == "platform" else "lrf",
+        model=prepared.models[camera],
+        placements=np.array(posed, int),
+        board_poses=_stack([view_of[p].T_camera_board.as_matrix() for p in posed], (4, 4)),
+        board_covariance=_stack([view_of[p].covariance for p in posed], (6, 6)),
+        pattern_points=_pattern_points(pattern, prepared.relief),
+        pattern_pixels=_stack(pixels, (k, 2)),
+        pattern_sigma_px=max(prepared.models[camera].rms_px or 0.0, 0.05),
+        **_planes(prepared, sources),
+        **_crossings(prepared, camera, variant, sources),
+        **_corners(prepared, camera, variant, sources),
+    )
+
+
+def _pattern_points(pattern, relief):
+    """Corners of the pattern in the board frame, with the waves of the sheet where they are known."""
+    if pattern is None:
+        return np.zeros((0, 3))
+    points = pattern.points()
+    if relief is not None:
+        points[:, 2] += relief
+    return points
+
+
+def platform_of(prepared, T_head_lrf=None):
+    """The platform calibration to use: the one given, else the session's, else a tilt axis along x of the LRF."""
+    if T_head_lrf is None:
+        T_head_lrf = prepared.session.T_head_lrf
+    return RigidTransform.identity() if T_head_lrf is None else T_head_lrf
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """Turns LRF points of a placement into the frame the camera is fixed to."""
+
+    prepared: Prepared
+    camera: str
+    T_head_lrf: RigidTransform
+    pitch_offset: dict
+
+    def transform(self, placement):
+        mount = self.prepared.session.cameras[self.camera].mount
+        view = self.prepared.views[self.camera].get(placement)
+        image_pitch = 0.0 if mount == "platform" or view is None else view.pitch
+        offset = self.pitch_offset.get(placement, 0.0)
+        return lambda p, pitch: lrf_to_source(p, np.asarray(pitch) + offset, self.T_head_lrf, mount, image_pitch)
+
+    def points(self, placement, p_lrf, pitch):
+        return self.transform(placement)(p_lrf, pitch)
+
+    def pitch_covariance(self, placement, p_lrf, pitch):
+        """What the error of the recorded pitch does to points, shape (n, 3, 3)."""
+        turn, step = self.transform(placement), 1e-6
+        by_pitch = (turn(p_lrf, pitch + step) - turn(p_lrf, pitch - step)) / (2 * step)
+        middle = np.mean(self.prepared.scans[placement].sweep.pitch)
+        moved = by_pitch * self.prepared.pitch_noise.sigma(pitch, middle)[:, None]
+        return moved[:, :, None] * moved[:, None, :]
+
+    def corner_covariance(self, placement, corner, face):
+        """What the error of the recorded pitch does to a corner of the cloud (platform frame), shape (3, 3)."""
+        up = [np.arctan2(p[2], p[1]) for p in (corner, np.mean(face, axis=0))]
+        step = self.prepared.pitch_noise.sigma(up[0], up[1]) * np.cross([1.0, 0.0, 0.0], corner)
+        moved = self.from_platform(placement, corner + step) - self.from_platform(placement, corner)
+        return np.outer(moved, moved)
+
+    def from_platform(self, placement, p_platform):
+        """Platform points in the source frame."""
+        if self.prepared.session.cameras[self.camera].mount == "platform":
+            return p_platform
+        return self.T_head_lrf.inv().apply(tilt(p_platform, -self.prepared.views[self.camera][placement].pitch))
+
+    def covariance(self, placement, covariance, pitch):
+        turn = self.transform(placement)
+        origin = turn(np.zeros((len(pitch), 3)), pitch)
+        axes = [turn(np.tile(e, (len(pitch), 1)), pitch) - origin for e in np.eye(3)]
+        rotation = np.stack(axes, axis=-1)
+        return rotation @ covariance @ rotation.swapaxes(-1, -2)
+
+
+def _stack(parts, shape):
+    return np.stack(parts) if len(parts) else np.zeros((0,) + shape)
+
+
+def join_parts(parts, shape, dtype=float):
+    """Concatenate arrays, or make an empty one of the right shape."""
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros((0,) + shape, dtype)
+
+
+def _planes(prepared, sources):
+    """Face points of the placements of which the camera knows the board's pose."""
+    points, covariances, numbers = [], [], []
+    for placement, board_scan in prepared.scans.items():
+        view = prepared.views[sources.camera].get(placement)
+        if view is None or view.T_camera_board is None:
+            continue
+        p_lrf, pitch, covariance = scan.face_points(board_scan, FACE_POINTS)
+        points.append(sources.points(placement, p_lrf, pitch))
+        covariances.append(sources.covariance(placement, covariance, pitch))
+        numbers.append(np.full(len(p_lrf), placement))
+    return {
+        "plane_points": join_parts(points, (3,)),
+        "plane_covariance": join_parts(covariances, (3, 3)),
+        "plane_placement": join_parts(numbers, (), int),
+    }
+
+
+def _crossings(prepared, camera, variant, sources):
+    """Crossings of named sides with the image line of the same edge, thinned evenly along each edge."""
+    parts = {key: [] for key in ("points", "covariance", "lines", "line_sigma", "placement", "edge", "across")}
+    for placement, name, found, side, across in _named_sides(prepared, variant):
+        view = prepared.views[camera].get(placement)
+        edge = None if view is None else view.edge(name)
+        if edge is None:
+            continue
+        rows = thin(np.flatnonzero(found.side == side), CROSSINGS_PER_EDGE)
+        p_lrf, pitch = found.points[rows], found.pitch[rows]
+        parts["points"].append(sources.points(placement, p_lrf, pitch))
+        noise = sources.pitch_covariance(placement, p_lrf, pitch)
+        parts["covariance"].append(sources.covariance(placement, found.covariance[rows], pitch) + noise)
+        parts["lines"].append(np.tile(edge.line, (len(rows), 1)))
+        parts["line_sigma"].append(np.full(len(rows), np.sqrt(edge.covariance[0, 0])))
+        for key, value in (("placement", placement), ("edge", name), ("across", across)):
+            parts[key].append(np.full(len(rows), value))
+    shapes = {"points": (3,), "covariance": (3, 3), "lines": (3,)}
+    kinds = {"placement": int, "edge": object, "across": bool}
+    return {f"crossing_{k}": join_parts(v, shapes.get(k, ()), kinds.get(k, float)) for k, v in parts.items()}
+
+
+def _named_sides(prepared, variant):
+    """All named sides: placement, edge, points, side number, and whether it was found across the scan lines."""
+    for placement, names in prepared.names.items():
+        along, swept = prepared.edges[variant].get(placement), prepared.swept[variant].get(placement)
+        numbers = set(np.unique(along.side))
+        for side, name in names.items():
+            if side in numbers:
+                yield placement, name, along, side, False
+            elif swept is not None:
+                yield placement, name, swept, side, True
+
+
+def thin(rows, count):
+    """At most `count` of some rows, evenly spread."""
+    return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+
+
+def name_sides(prepared, variant="half_step"):
+    """Name the sides that scans cross: the nearest edge of the board, which the images place in the scan.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        With views. The cameras' poses come from the planes alone (Zhang and Pless), which needs no names.
+    variant : str
+
+    Returns
+    -------
+    dict of int to dict of int to str
+        Edge name by placement and side number. Sides farther than 8 cm from every edge stay unnamed.
+    """
+    rough = {}
+    for camera in prepared.views:
+        obs = observe(prepared, camera, variant)
+        try:
+            rough[camera] = solve_zhang_pless(obs).transform
+        except DegenerateGeometry as error:
+            prepared.problems[f"camera {camera}"] = str(error)
+    names = {}
+    for placement, along in prepared.edges[variant].items():
+        to_board = _to_board(prepared, placement, rough)
+        if to_board is None:
+            continue
+        sides = {}
+        for found in (along, prepared.swept[variant].get(placement)):
+            for side in () if found is None else np.unique(found.side[found.side >= 0]):
+                rows = found.side == side
+                sides.setdefault(int(side), to_board(found.points[rows], found.pitch[rows]))
+        names[placement], crooked = _nearest_edges(prepared.board, sides)
+        prepared.problems.update(
+            {f"{placement} {side}": f"placement {placement}: {why}" for side, why in crooked.items()}
+        )
+    return names
+
+
+def _to_board(prepared, placement, rough):
+    """Function from LRF points of a placement to the board frame, through any camera that sees the board."""
+    for camera, T_camera_source in rough.items():
+        view = prepared.views[camera].get(placement)
+        if view is not None and view.T_camera_board is not None:
+            turn = _Sources(prepared, camera, platform_of(prepared), {}).transform(placement)
+            T_board_source = view.T_camera_board.inv() * T_camera_source
+            return lambda p, pitch: T_board_source.apply(turn(p, pitch))
+    return None
+
+
+def _nearest_edges(board, sides):
+    """Edge names of sides (board-frame points by number), each given once, and why the others got none."""
+    lines, names, problems = board.lines(), {}, {}
+    distances = {number: np.abs(p[:, :2] @ lines[:, :2].T + lines[:, 2]) for number, p in sides.items()}
+    cost = np.array([np.median(d, axis=0) for d in distances.values()]).reshape(-1, len(lines))
+    numbers = list(sides)
+    for row, column in zip(*linear_sum_assignment(cost), strict=True):
+        number, edge = numbers[row], board.edges[column]
+        turned = _angle_to_line(sides[number], lines[column])
+        if cost[row, column] > NAME_DISTANCE:
+            problems[number] = (
+                f"a side of the scan is {1000 * cost[row, column]:.0f} mm from the edge '{edge}': not used"
+            )
+        elif turned > NAME_ANGLE:
+            problems[number] = (
+                f"the scan's side '{edge}' is turned by {np.rad2deg(turned):.1f} deg against the board: not used"
+            )
+        else:
+            names[number] = edge
+    return names, problems
+
+
+def _angle_to_line(points, line):
+    """Angle between the line through board-frame points and a board line, radians; 0 for fewer than 3 points."""
+    if len(points) < 3:
+        return 0.0
+    direction = fit_line(points)[1]
+    return float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
+
+
+def _stretch(found, side):
+    """Length over which a side is seen, metres."""
+    return next((s.length for s in found.sides if s.side == side), 0.0)
+
+
+@dataclass(frozen=True)
+class PlacementOutline:
+    """The board's outline in the cloud of one placement.
+
+    Attributes
+    ----------
+    measured : MeasuredBoard
+        In the platform frame.
+    face, sides : ndarray, shape (n, 3), and dict of str to ndarray, shape (k, 3)
+        The points it was measured from, platform frame, metres.
+    across : frozenset of str
+        Edges found across the scan lines (where the sweep enters or leaves the board): their place hangs on the
+        recorded pitch.
+    """
+
+    measured: MeasuredBoard
+    face: np.ndarray
+    sides: dict
+    across: frozenset
+
+
+def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
+    """Measure the board's outline in the cloud of a placement.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    placement : int
+    variant : {'half_step', 'last_beam'}
+    T_head_lrf : RigidTransform, optional
+        The session's own when left out.
+
+    Returns
+    -------
+    PlacementOutline
+        Without sides of which less than 40 % is seen: a stub does not carry a line to its corners.
+
+    Raises
+    ------
+    DegenerateGeometry
+        If the sweep does not cross enough scan lines to span a plane.
+    """
+    T_head_lrf = platform_of(prepared, T_head_lrf)
+    face_lrf, pitch, _ = scan.face_points(prepared.scans[placement])
+    face = lrf_to_platform(face_lrf, pitch, T_head_lrf)
+    sides, across, length = {}, set(), prepared.board.lengths()
+    for number, name, found, side, swept in _named_sides(prepared, variant):
+        rows = found.side == side
+        if number == placement and _stretch(found, side) >= LEAST_STRETCH * length[name]:
+            sides[name] = lrf_to_platform(found.points[rows], found.pitch[rows], T_head_lrf)
+            across |= {name} if swept else set()
+    return PlacementOutline(measure_board(face, sides, prepared.board.edges), face, sides, frozenset(across))
+
+
+def _corners(prepared, camera, variant, sources):
+    """Corners of the outline that the cloud and the image can both name: where two fitted edges meet."""
+    parts = {key: [] for key in ("points", "covariance", "pixels", "sigma_px", "placement")}
+    for placement in prepared.names:
+        view = prepared.views[camera].get(placement)
+        if view is None or placement not in prepared.scans or placement not in prepared.swept[variant]:
+            continue
+        outline = outline_of(prepared, placement, variant, sources.T_head_lrf)
+        for name, before in zip(prepared.board.edges, np.roll(prepared.board.edges, 1), strict=True):
+            seen = view.edge(name), view.edge(str(before))
+            if name not in outline.measured.corners or None in seen:
+                continue
+            sigma = max(_scatter(outline, name), _scatter(outline, str(before)))
+            parts["points"].append(sources.from_platform(placement, outline.measured.corner_point(name))[None])
+            noise = sources.corner_covariance(placement, outline.measured.corner_point(name), outline.face)
+            parts["covariance"].append((sigma**2 * np.eye(3) + noise)[None])
+            parts["pixels"].append(corners_of_lines(np.stack([seen[1].line, seen[0].line]))[1][None])
+            parts["sigma_px"].append([np.hypot(*(np.sqrt(edge.covariance[0, 0]) for edge in seen))])
+            parts["placement"].append([placement])
+    shapes = {"points": (3,), "covariance": (3, 3), "pixels": (2,)}
+    return {
+        f"scene_{k}": join_parts(v, shapes.get(k, ()), int if k == "placement" else float) for k, v in parts.items()
+    }
+
+
+def _scatter(outline, name):
+    """Rms distance of a side's points from its line; not averaged down, because neighbours share errors."""
+    return fit_line(outline.sides[name])[2]
+
+
+def observe_all(prepared, T_head_lrf=None, pitch_offset=None):
+    """Observations of all cameras in both edge-point variants, keyed by (camera, variant)."""
+    keys = [(camera, variant) for camera in prepared.views for variant in VARIANTS]
+    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, pitch_offset) for camera, variant in keys}

@@ -1,0 +1,403 @@
+"""The stages in order, each one call: prepare a session, calibrate the platform, calibrate the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.geometry import (
+    DegenerateGeometry,
+    TiltAxis,
+    axis_of,
+    head_from_axis,
+    lrf_to_platform,
+    lrf_to_source,
+    polar_to_points,
+)
+from lrfcal_lib.pairing import FACE_POINTS, join_parts, name_sides, observe, observe_all, platform_of, thin
+from lrfcal_lib.prepared import PitchNoise, Prepared, prepare_images, prepare_scans
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.image import stereo_check
+from lrfcal_lib.reconstruct import Cloud, blend, color_points, join
+from lrfcal_lib.solvers import METHODS
+from lrfcal_lib.solvers.pitch_errors import SweepPoints, estimate_pitch_errors
+from lrfcal_lib.solvers.platform import PlatformObservations, chart_parameters, solve_platform
+from lrfcal_lib.solvers.pose import pose_array
+from lrfcal_lib.solvers.projected import solve_projected
+
+RIGHT_ANGLE = 0.15  # largest |cosine| between two sides that are taken for the board's perpendicular edges
+PLATFORM_POINTS = 40  # per edge
+# what a ruler and a set square say about a rig, for a session that states its platform without a standard deviation
+STATED_SIGMA = np.array([np.deg2rad(0.5), np.deg2rad(0.5), 0.010, 0.010])
+
+
+def prepare(session):
+    """Preprocess scans and images, and name the sides that scans cross.
+
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    Prepared
+        Placements that cannot be used are in `problems` with their reason.
+    """
+    ready = prepare_images(prepare_scans(session))
+    ready = replace(ready, names=name_sides(ready))
+    return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
+
+
+def find_pitch_errors(prepared):
+    """Ask the cameras that are fixed to the base whether the platform tells the truth about its pitch.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    PitchErrors or None
+        None where no camera is fixed to the base, or too few placements are seen.
+    """
+    fixed = [c for c in prepared.views if prepared.session.cameras[c].mount == "platform"]
+    if not fixed or not prepared.scans:
+        return None
+    faces = {placement: scan.face_points(board, 2 * FACE_POINTS) for placement, board in prepared.scans.items()}
+    number = np.repeat(list(faces), [len(pitch) for _, pitch, _ in faces.values()])
+    points, pitch = (np.concatenate([face[i] for face in faces.values()]) for i in (0, 1))
+    direction = {placement: prepared.session.sweep_direction(placement) for placement in faces}
+    middle = {placement: float(np.mean(board.sweep.pitch)) for placement, board in prepared.scans.items()}
+    sweeps = SweepPoints(points, pitch, number, platform_of(prepared), direction, middle)
+    try:
+        return estimate_pitch_errors(sweeps, {c: observe(prepared, c) for c in fixed})
+    except DegenerateGeometry:
+        return None
+
+
+def pitch_noise(errors):
+    """How far a recorded pitch is off, from the errors of all sweeps; zero where the data do not ask for any.
+
+    Parameters
+    ----------
+    errors : PitchErrors or None
+
+    Returns
+    -------
+    PitchNoise
+    """
+    if errors is None or errors.wanted == "none":
+        return PitchNoise()
+    model = errors.models[errors.wanted]
+    return PitchNoise(float(np.sqrt(np.mean(model.offset**2))), float(np.sqrt(np.mean(model.stretch**2))))
+
+
+def platform_observations(prepared, variant="half_step"):
+    """Two perpendicular sides and the face of the board in every sweep, for the platform calibration.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        No cameras are needed.
+    variant : {'half_step', 'last_beam'}
+
+    Returns
+    -------
+    PlatformObservations
+        Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that one.
+    """
+    edge, face = {k: [] for k in ("points", "covariance", "pitch", "placement", "edge")}, {k: [] for k in _FACE}
+    for placement, found in prepared.swept[variant].items():
+        for number, (edges, side) in enumerate(_perpendicular(prepared.edges[variant][placement], found), 1):
+            rows = thin(np.flatnonzero(edges.side == side), PLATFORM_POINTS)
+            for key in ("points", "covariance", "pitch"):
+                edge[key].append(getattr(edges, key)[rows])
+            edge["placement"].append(np.full(len(rows), placement))
+            edge["edge"].append(np.full(len(rows), number))
+        points, pitch, covariance = scan.face_points(prepared.scans[placement], FACE_POINTS)
+        for key, values in zip(_FACE, (points, covariance, pitch, np.full(len(pitch), placement)), strict=True):
+            face[key].append(values)
+    shapes = {"points": (3,), "covariance": (3, 3)}
+    parts = {k: join_parts(v, shapes.get(k, ()), int if k in ("placement", "edge") else float) for k, v in edge.items()}
+    faces = {f"face_{k}": join_parts(v, shapes.get(k, ()), int if k == "placement" else float) for k, v in face.items()}
+    return PlatformObservations(**parts, **faces)
+
+
+_FACE = ("points", "covariance", "pitch", "placement")
+
+
+def _perpendicular(along, swept):
+    """The longest pair of perpendicular sides of a sweep, or the longest side: (edges, side number) each."""
+    known = {s.side for s in along.sides}
+    sides = [(along, s) for s in along.sides] + [(swept, s) for s in swept.sides if s.side not in known]
+    pairs = [(a, b) for a, b in combinations(sides, 2) if abs(_cosine(a[1], b[1])) < RIGHT_ANGLE]
+    if pairs:
+        best = max(pairs, key=lambda pair: pair[0][1].length * pair[1][1].length)
+    else:
+        best = sorted(sides, key=lambda found: -found[1].length)[:1]
+    return [(edges, s.side) for edges, s in best]
+
+
+def _cosine(a, b):
+    u, v = a.ends[1] - a.ends[0], b.ends[1] - b.ends[0]
+    return u @ v / (np.linalg.norm(u) * np.linalg.norm(v))
+
+
+@dataclass(frozen=True)
+class PlatformCalibration:
+    """The tilt axis by every method, and the one to use.
+
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+        To use: the stated platform, corrected by what the data know better. Rotation about the axis and shift along it,
+        which no data can show, are the stated ones.
+    covariance : ndarray, shape (4, 4)
+        Of the four numbers in `parameters` of that axis; radians and metres.
+    solutions : dict of str to PlatformSolution
+        ``projected_last_beam`` (the paper), ``line_3d``.
+    problems : dict of str to str
+        Why a method has no result.
+    stated : RigidTransform or None
+    """
+
+    T_head_lrf: RigidTransform
+    covariance: np.ndarray
+    solutions: dict
+    problems: dict
+    stated: RigidTransform | None
+
+    def parameters(self):
+        """Angles of the axis out of and within the scan plane, and its offsets within and across it, by method."""
+        found = {name: (s.solution.parameters, trusted_axis_covariance(s)) for name, s in self.solutions.items()}
+        if self.stated is not None:
+            found["stated"] = chart_parameters(pose_array(self.stated)), np.diag(STATED_SIGMA**2)
+        return found | {"combined": (chart_parameters(pose_array(self.T_head_lrf)), self.covariance)}
+
+    def transform(self, method):
+        """``T_head_lrf`` of a method (also 'stated' and 'combined')."""
+        special = {"stated": self.stated, "combined": self.T_head_lrf}
+        return special[method] if method in special else self.solutions[method].T_head_lrf
+
+
+def calibrate_platform(prepared, sigma_pitch=0.0):
+    """Estimate the tilt axis by the paper's projected fits and by whitened 3D fits, and combine it with the stated one.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        No cameras are needed.
+    sigma_pitch : float
+        Standard deviation of a recorded pitch, radians.
+
+    Returns
+    -------
+    PlatformCalibration
+
+    Raises
+    ------
+    DegenerateGeometry
+        If the session neither states its platform nor holds sweeps that determine it.
+    """
+    stated, solutions, problems = prepared.session.T_head_lrf, {}, {}
+    methods = {
+        "projected_last_beam": lambda: solve_projected(platform_observations(prepared, "last_beam"), stated),
+        "line_3d": lambda: solve_platform(platform_observations(prepared), stated, sigma_pitch=sigma_pitch),
+    }
+    for name, solve in methods.items():
+        try:
+            solutions[name] = solve()
+        except DegenerateGeometry as error:
+            problems[name] = str(error)
+    if "line_3d" in solutions:
+        T_head_lrf, covariance = combine(solutions["line_3d"], stated)
+    elif stated is not None:
+        T_head_lrf, covariance = stated, np.diag(STATED_SIGMA**2)
+    else:
+        raise DegenerateGeometry(f"the platform is neither stated nor determined by the sweeps: {problems}")
+    return PlatformCalibration(T_head_lrf, covariance, solutions, problems, stated)
+
+
+def trusted_axis_covariance(solution):
+    """The scatter over placements where it is known (it holds model errors too), else the propagated noise."""
+    return solution.covariance if solution.covariance_placements is None else solution.covariance_placements
+
+
+def combine(solution, stated):
+    """Weigh an estimated axis and the stated one by their covariances.
+
+    Parameters
+    ----------
+    solution : PlatformSolution
+    stated : RigidTransform or None
+
+    Returns
+    -------
+    T_head_lrf : RigidTransform
+    covariance : ndarray, shape (4, 4)
+    """
+    covariance = trusted_axis_covariance(solution)
+    if stated is None:
+        return solution.T_head_lrf, covariance
+    prior, known = np.diag(STATED_SIGMA**2), chart_parameters(pose_array(stated))
+    gain = prior @ np.linalg.inv(prior + covariance)
+    axis = axis_from_chart(known + gain @ (solution.solution.parameters - known))
+    unseen = stated * head_from_axis(axis_of(stated)).inv()  # rotation about the axis and shift along it
+    return unseen * head_from_axis(axis), prior - gain @ prior
+
+
+def axis_from_chart(parameters):
+    """The axis of two angles and two offsets; undoes :func:`lrfcal_lib.solvers.platform.chart_parameters`."""
+    out_of_plane, within, *offset = parameters
+    direction = np.array([1.0, -np.tan(within), np.tan(out_of_plane)])
+    direction /= np.linalg.norm(direction)
+    y, z = -np.asarray(offset)
+    return TiltAxis(direction, np.array([-(direction[1] * y + direction[2] * z) / direction[0], y, z]))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Everything that a calibrated session holds.
+
+    Attributes
+    ----------
+    prepared : Prepared
+    platform : PlatformCalibration
+    observations : dict of (str, str) to CameraObservations
+        By camera and edge-point variant, made with the calibrated platform.
+    solutions : dict of (str, str) to Solution
+        By camera and method.
+    problems : dict of (str, str) to str
+        Why a method has no result for a camera.
+    """
+
+    prepared: Prepared
+    platform: PlatformCalibration
+    observations: dict
+    solutions: dict
+    problems: dict
+
+
+def calibrate(session, methods=tuple(METHODS)):
+    """All stages: preprocessing, platform, cameras.
+
+    Parameters
+    ----------
+    session : Session
+    methods : sequence of str
+        Of :data:`lrfcal_lib.solvers.METHODS`.
+
+    Returns
+    -------
+    Calibration
+    """
+    prepared = prepare(session)
+    platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
+    observations = observe_all(prepared, platform.T_head_lrf)
+    solutions, problems = calibrate_cameras(observations, methods)
+    return Calibration(prepared, platform, observations, solutions, problems)
+
+
+def stereo_reference(prepared):
+    """Relative pose of the first two cameras from the chessboard in both images.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    cameras : (str, str)
+    T_second_first : RigidTransform
+    covariance : ndarray, shape (6, 6)
+
+    Raises
+    ------
+    ValueError
+        With fewer than two cameras, without a pattern, or when no placement is seen by both.
+    """
+    if len(prepared.views) < 2 or prepared.board.pattern is None:
+        raise ValueError(f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras")
+    first, second = list(prepared.views)[:2]
+    views = [list(prepared.views[camera].values()) for camera in (first, second)]
+    models = [prepared.models[camera] for camera in (first, second)]
+    T_second_first, covariance, _ = stereo_check(
+        *views, prepared.board.pattern, models, relief=prepared.relief, refine=True
+    )
+    return (first, second), T_second_first, covariance
+
+
+def color_cloud(calibration, method="line", every=1):
+    """All sweeps of a session as one coloured cloud in the platform frame.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    method : str
+        Whose camera poses colour the cloud.
+    every : int
+        Take every n-th point of a sweep.
+
+    Returns
+    -------
+    Cloud
+        Each sweep takes its colours from the images of its own placement, of all cameras that see the point.
+    """
+    prepared, clouds = calibration.prepared, []
+    for placement, board in prepared.scans.items():
+        line, beam = (index[::every] for index in np.nonzero(board.mask))
+        p_lrf = polar_to_points(board.sweep.ranges[line, beam], board.sweep.bearings[beam])
+        pitch = board.sweep.pitch[line]
+        points = lrf_to_platform(p_lrf, pitch, calibration.platform.T_head_lrf)
+        layers = [_layer(calibration, method, camera, placement, p_lrf, pitch) for camera in prepared.views]
+        colors, seen = blend([layer for layer in layers if layer is not None] or [np.full(points.shape, np.nan)])
+        clouds.append(Cloud(points, colors, seen, np.full(len(points), placement)))
+    return join(clouds)
+
+
+def _layer(calibration, method, camera, placement, p_lrf, pitch):
+    """Colours that one camera gives to the points of a placement, None without an image or a calibration."""
+    prepared, session = calibration.prepared, calibration.prepared.session
+    view = prepared.views[camera].get(placement)
+    if view is None or (camera, method) not in calibration.solutions:
+        return None
+    record = next(r for r in session.images(camera, placement=placement) if r.file.name == Path(view.file).name)
+    mount = session.cameras[camera].mount
+    image_pitch = view.pitch if mount == "head" else 0.0
+    points = lrf_to_source(p_lrf, pitch, calibration.platform.T_head_lrf, mount, image_pitch)
+    transform = calibration.solutions[camera, method].transform
+    return color_points(points, session.read_image(record), transform, prepared.models[camera])[0]
+
+
+def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):
+    """Calibrate every camera by every method.
+
+    Parameters
+    ----------
+    observations : dict of (str, str) to CameraObservations
+        Of :func:`observe_all`.
+    methods : sequence of str
+    T0 : dict of str to RigidTransform, optional
+        Rough measurements by camera; closed forms where there is none.
+
+    Returns
+    -------
+    solutions : dict of (str, str) to Solution
+        By camera and method.
+    problems : dict of (str, str) to str
+        Why a method has no result for a camera.
+    """
+    solutions, problems = {}, {}
+    for camera in dict.fromkeys(camera for camera, _ in observations):
+        for name in methods:
+            method = METHODS[name]
+            try:
+                start = (T0 or {}).get(camera)
+                solutions[camera, name] = method.solve(observations[camera, method.variant], start)
+            except DegenerateGeometry as error:
+                problems[camera, name] = str(error)
+    return solutions, problems

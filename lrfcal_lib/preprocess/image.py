@@ -1,0 +1,291 @@
+"""What the cameras of a session see of the board: intrinsics, poses, straight edges, the outline nobody measured.
+
+The stages have modules of their own and can be called from here: :mod:`.pattern` (corners, intrinsics, pose),
+:mod:`.wide` and :mod:`.edges` (straight edges), :mod:`.view`, :mod:`.outline`,
+:mod:`.silhouette` (boards without pattern).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import PurePath
+
+import numpy as np
+
+from lrfcal_lib.board import Board
+from lrfcal_lib.preprocess.adjustment import Adjustment
+from lrfcal_lib.preprocess.edges import EdgeNotSeen, ImageEdge
+from lrfcal_lib.preprocess.outline import Outline, edge_lengths, measure_outline, rough_outline
+from lrfcal_lib.preprocess.pattern import (
+    PatternNotFound,
+    board_pose,
+    estimate_intrinsics,
+    estimate_relief,
+    find_pattern,
+    stereo_transform,
+    turn_pattern,
+)
+from lrfcal_lib.preprocess.silhouette import OutlineNotFound
+from lrfcal_lib.preprocess.view import BoardView, best_order, view_board
+from lrfcal_lib.preprocess.wide import common_lines, edge_votes, resolve_turns
+
+__all__ = [
+    "Adjustment",
+    "BoardView",
+    "EdgeNotSeen",
+    "ImageEdge",
+    "Outline",
+    "OutlineNotFound",
+    "PatternNotFound",
+    "Survey",
+    "board_pose",
+    "edge_lengths",
+    "estimate_intrinsics",
+    "find_pattern",
+    "measure_outline",
+    "stereo_check",
+    "survey",
+    "view_board",
+    "views_of",
+]
+LEAST_VIEWS_FOR_RELIEF = 8
+REMEMBERED_IMAGES = 128
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The board in all images of a session.
+
+    Attributes
+    ----------
+    views : dict of str to list of BoardView
+        By camera.
+    models : dict of str to CameraModel
+    outline : Outline or None
+        None where the board is known and has no pattern.
+    board : Board
+        With corners.
+    relief : ndarray, shape (k,), or None
+        Heights of the pattern's corners over the sheet's mean plane, metres (zero for a flat sheet).
+    """
+
+    views: dict
+    models: dict
+    outline: Outline | None
+    board: Board
+    relief: np.ndarray | None = field(default=None, repr=False)
+
+
+def survey(records, read, board, models, picks=()):
+    """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
+
+    Parameters
+    ----------
+    records : sequence of ImageRecord
+        With ``camera, file, placement, pitch``.
+    read : callable
+        ``read(record)`` gives the image, uint8.
+    board : Board
+    models : dict of str to (CameraModel or None)
+        By camera; None asks for an estimate from these images.
+    picks : sequence of EdgePick
+
+    Returns
+    -------
+    Survey
+
+    Raises
+    ------
+    ValueError
+        If a camera has no intrinsics and the board no pattern, or too few images show it.
+    """
+    read = lru_cache(maxsize=REMEMBERED_IMAGES)(read)
+    cameras = {c: [r for r in records if r.camera == c] for c in models}
+    if board.pattern is None:
+        return _survey_plain(cameras, read, board, models, picks)
+    found = {c: [_try_pattern(read(r), board) for r in group] for c, group in cameras.items()}
+    flat = {c: m or _intrinsics(c, found[c], board, cameras[c], read) for c, m in models.items()}
+    if board.corners is not None:
+        lines, ordered = None, _ordered_by_outline(cameras, read, board, flat, found)
+    else:
+        lines, ordered = _ordered_by_votes(cameras, read, board, flat, found)
+    models, relief = _with_relief(ordered, board, models, flat)
+    outline = None if lines is None else rough_outline(lines, board)
+    for _ in range(1 if lines is None else 2):
+        views = _view_all(cameras, read, board, models, outline, picks, ordered, relief)
+        outline = measure_outline(views, board, models) if lines is not None else None
+    return Survey(views, models, outline, board if outline is None else outline.board, relief)
+
+
+def _survey_plain(cameras, read, board, models, picks):
+    unknown = [c for c, m in models.items() if m is None]
+    if unknown:
+        raise ValueError(
+            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
+        )
+    views = {
+        camera: [view_board(read(r), board, models[camera], None, _of(r, picks), **_names(r)) for r in _shown(group)]
+        for camera, group in cameras.items()
+    }
+    return Survey(views, dict(models), None, board)
+
+
+def _shown(group):
+    """Images taken for the intrinsics only belong to no placement and make no view."""
+    return [r for r in group if r.purpose != "intrinsics"]
+
+
+def _of(record, picks):
+    return [p for p in picks if p.camera == record.camera and p.file == record.file]
+
+
+def _names(record):
+    name = PurePath(record.file).name
+    return {"camera": record.camera, "file": name, "placement": record.placement, "pitch": record.pitch}
+
+
+def _try_pattern(image, board):
+    """Corners, or the reason why there are none."""
+    try:
+        return find_pattern(image, board.pattern)
+    except PatternNotFound as error:
+        return str(error)
+
+
+def _seen(found):
+    return [p for p in found if not isinstance(p, str)]
+
+
+def _intrinsics(camera, found, board, group, read):
+    try:
+        size = read(group[0]).shape[1::-1] if group else (0, 0)
+        return estimate_intrinsics(_seen(found), board.pattern, size).model
+    except ValueError as error:
+        raise ValueError(f"camera '{camera}': {error}") from error
+
+
+def _ordered_by_outline(cameras, read, board, models, found):
+    """Corners of every image in the order that the known outline asks for."""
+    out = {}
+    for camera, group in cameras.items():
+        out[camera] = [
+            p if isinstance(p, str) else best_order(read(r), board, models[camera], p)
+            for r, p in zip(group, found[camera], strict=True)
+        ]
+    return out
+
+
+def _ordered_by_votes(cameras, read, board, models, found):
+    """Rough lines of the outline, and the corners of every image turned alike."""
+    if len(board.edges) != 4:
+        raise ValueError(
+            f"board '{board.name}' has {len(board.edges)} edges and no known corners: only four edges around a pattern "
+            "can be measured from images, give the corners"
+        )
+    votes, up, at = [], [], []
+    for camera, group in cameras.items():
+        for i, (record, pixels) in enumerate(zip(group, found[camera], strict=True)):
+            if not isinstance(pixels, str):
+                pose = board_pose(pixels, board.pattern, models[camera])[0]
+                votes.append(edge_votes(read(record), board, models[camera], pose))
+                up.append(pose.rotation.as_matrix()[1, 1])
+                at.append((camera, i))
+    if not votes:
+        raise ValueError(f"none of {sum(map(len, cameras.values()))} images shows the pattern of board '{board.name}'")
+    turned = resolve_turns(votes, up)
+    ordered = {c: list(f) for c, f in found.items()}
+    for (camera, i), turn in zip(at, turned, strict=True):
+        if turn:
+            ordered[camera][i] = turn_pattern(ordered[camera][i])
+    votes = np.stack(votes)
+    votes[turned] = votes[turned][:, [2, 3, 0, 1]]
+    return common_lines(votes, board), ordered
+
+
+def _with_relief(ordered, board, models, flat):
+    """Intrinsics and the shape of the sheet, now that the corners of all images are in one order."""
+    out, reliefs = {}, []
+    for camera, found in ordered.items():
+        pixels = _seen(found)
+        if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
+            out[camera] = flat[camera]
+            continue
+        if models[camera] is None:
+            size = (flat[camera].width, flat[camera].height)
+            result = estimate_intrinsics(pixels, board.pattern, size, relief=True)
+            out[camera] = result.model
+        else:
+            out[camera] = models[camera]
+            result = estimate_relief(pixels, board.pattern, models[camera])
+        reliefs.append(result.relief)
+    return out, np.mean(reliefs, axis=0) if reliefs else np.zeros(len(board.pattern.points()))
+
+
+def _view_all(cameras, read, board, models, outline, picks, ordered, relief):
+    views = {camera: [] for camera in cameras}
+    for camera, group in cameras.items():
+        for record, pixels in zip(group, ordered[camera], strict=True):
+            options = {"pixels": pixels, "relief": relief, **_names(record)}
+            if record.purpose == "intrinsics":
+                continue
+            if isinstance(pixels, str):
+                views[camera].append(BoardView(**_names(record), reason=pixels))
+            else:
+                seen = view_board(read(record), board, models[camera], outline, _of(record, picks), **options)
+                views[camera].append(seen)
+    return views
+
+
+def views_of(session, models=None):
+    """The board in all images of a session: :func:`survey` of its records.
+
+    Parameters
+    ----------
+    session : Session
+    models : dict of str to CameraModel, optional
+        Replace the session's intrinsics. A camera without any gets an estimate from its images of the pattern.
+
+    Returns
+    -------
+    Survey
+    """
+    known = {name: info.model for name, info in session.cameras.items()} | dict(models or {})
+    records = [r for r in session.images() if r.purpose in ("board", "intrinsics")]
+    return survey(records, session.read_image, session.board, known, session.picks)
+
+
+def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
+    """Relative pose of two cameras from the pattern's corners in views of the same placements.
+
+    Parameters
+    ----------
+    first, second : sequence of BoardView
+        Of two cameras; views with the same placement belong together.
+    pattern : Chessboard
+    models : pair of CameraModel
+        Intrinsics.
+    relief : ndarray, shape (k,), optional
+        Non-zero heights: the sheet is wavy, its shape is estimated along.
+    refine : bool
+        Estimate the intrinsics of both cameras along: the best knowledge of the mounting. Without, the result goes with
+        the given intrinsics (so does a calibration that uses them), and the covariance leaves their errors out.
+
+    Returns
+    -------
+    T_second_first : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of ``[w, v]``.
+    adjustment : Adjustment
+
+    Raises
+    ------
+    ValueError
+        If no placement is seen by both cameras.
+    """
+    corners = [
+        {v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0} for views in (first, second)
+    ]
+    wavy = relief is not None and bool(np.any(relief))
+    result = stereo_transform(*corners, pattern, models, intrinsics=refine, relief=wavy)
+    return result.mounting[1], result.mounting_covariance[0], result

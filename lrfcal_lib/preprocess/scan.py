@@ -1,0 +1,354 @@
+"""Where the board's edges cross the scan: edge points with covariance, grouped to straight sides.
+
+The board itself is found in :mod:`lrfcal_lib.preprocess.board_scan`, whose names are offered here as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.preprocess.board_scan import (
+    BoardScan,
+    EdgeProfile,
+    count_jump_points,
+    edge_profile,
+    face_points,
+    find_board,
+    jump_points,
+    median_filter,
+    row_ends,
+    row_median,
+)
+from lrfcal_lib.preprocess.segment import BoardNotFound, depth_jump, plane_axes, segments
+from lrfcal_lib.preprocess.sides import LEAST_TURN, line_of, straight_runs
+
+__all__ = [
+    "BoardNotFound", "BoardScan", "EdgeProfile", "ScanEdges", "ScanSide", "count_jump_points", "edge_points",
+    "edge_profile", "face_points", "find_board", "jump_points", "median_filter", "segments", "sweep_edges",
+]  # fmt: skip
+
+VARIANTS = ("half_step", "last_beam")
+BORDER = 3  # beams or lines at the border of the view, where the board's end cannot be told from the view's end
+LEAST_ANGLE = np.radians(20)
+SHORTEST_SIDE = 0.1  # of the board's size
+UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of width 1
+EDGE_SCATTER = 0.006  # metres; about twice what the end points of a real board scatter about a straight edge
+SAME_SIDE = 0.02  # metres; a side found by lines and by columns
+
+
+@dataclass(frozen=True)
+class ScanSide:
+    """A straight side of the board as a scan sees it.
+
+    Attributes
+    ----------
+    side : int
+        Number within the placement; the same in all variants and in :func:`sweep_edges`.
+    end : int
+        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of :func:`sweep_edges`: -1
+        where it ends columns at low pitch, +1 at high pitch.
+    n_points : int
+    length : float
+        Of the stretch with points, metres.
+    rms : float
+        Distance of the points from the side within the board's plane, metres.
+    angle : float
+        Between the side and the scan lines (0 .. pi/2, radians). A side seen at a small angle is crossed by few
+        scan lines and moves along with every error of the pitch.
+    ends : ndarray, shape (2, 3)
+        Of the stretch, nominal platform frame, metres.
+    """
+
+    side: int
+    end: int
+    n_points: int
+    length: float
+    rms: float
+    angle: float
+    ends: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScanEdges:
+    """Where the board's edges cross the scan.
+
+    Attributes
+    ----------
+    placement : int
+    variant : {'half_step', 'last_beam'}
+    points : ndarray, shape (n, 3)
+        LRF frame at the pitch of the point, metres; on the fitted scan line.
+    covariance : ndarray, shape (n, 3, 3)
+    pitch : ndarray, shape (n,)
+        Radians.
+    line : ndarray of int, shape (n,)
+        Scan line (of :func:`sweep_edges`: the last one that hit the board).
+    end : ndarray of int, shape (n,)
+        As in `ScanSide`.
+    side : ndarray of int, shape (n,)
+        Number of the straight side; -1 for outliers.
+    sides : tuple of ScanSide
+    """
+
+    placement: int
+    variant: str
+    points: np.ndarray
+    covariance: np.ndarray
+    pitch: np.ndarray
+    line: np.ndarray
+    end: np.ndarray
+    side: np.ndarray
+    sides: tuple[ScanSide, ...]
+
+
+def edge_points(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
+    """Where scan lines cross the board's edges; step (iii) of the paper's preprocessing.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    variant : {'half_step', 'last_beam'}
+        'half_step': halfway between the last beam on the board and the first off it, unbiased for an edge anywhere
+        between them. 'last_beam': the paper's rule, half a step inside on average.
+    min_angle : float
+        Sides that meet the scan lines at a smaller angle are left out (their points get side -1), radians: there the
+        pitch decides where a line ends, and :func:`sweep_edges` sees the side better.
+
+    Returns
+    -------
+    ScanEdges
+        Ends of scan lines at holes inside the board do not appear; neither do ends at the border of the field of
+        view, nor where something nearer hides the board. The points lie on the fitted straight line (the paper), moved
+        along the ray by what the outermost beams say where the board turns out to be warped. The covariance holds the
+        beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that.
+
+    Raises
+    ------
+    ValueError
+        For another variant.
+    """
+    _check_variant(variant)
+    row, beam, end = _line_ends(scan)
+    bearings, pitch = scan.sweep.bearings, scan.sweep.pitch[row]
+    shift, warp_sigma = _warp(scan, row, beam, end)
+    points, along, line_sigma = _crossings(scan, row, (bearings[beam] + bearings[beam + end]) / 2, shift)
+    side, sides = _group(scan, points, pitch, row, end)
+    sigma = np.abs(bearings[beam + end] - bearings[beam]) * UNIFORM
+    sigma = sigma * _inflation(_to_platform(scan, along, pitch), sigma, side, sides)
+    if variant == "last_beam":
+        points, along, line_sigma = _crossings(scan, row, bearings[beam], shift)
+    covariance = _outer(along * sigma[:, None]) + _outer(_rays(points) * np.hypot(line_sigma, warp_sigma)[:, None])
+    side, sides = _keep(side, sides, [s for s in sides if s.angle >= min_angle])
+    return ScanEdges(scan.placement, variant, points, covariance, pitch, row, end, side, sides)
+
+
+def _keep(side, sides, kept):
+    """Forget all sides but some; without sides (scans at one pitch) nothing changes."""
+    if not sides:
+        return side, sides
+    return np.where(np.isin(side, [s.side for s in kept]), side, -1), tuple(kept)
+
+
+def _rays(points):
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def _check_variant(variant):
+    if variant not in VARIANTS:
+        raise ValueError(f"variant is one of {', '.join(VARIANTS)}, got '{variant}'")
+
+
+def _line_ends(scan):
+    """Ends of scan lines on the board that may be edges: rows, beams, -1 / +1 for low and high bearings."""
+    rows, first, last = row_ends(scan.mask)
+    row, beam = np.r_[rows, rows], np.r_[first, last]
+    end = np.repeat([-1, 1], len(rows))
+    keep = (beam >= BORDER) & (beam < scan.mask.shape[1] - BORDER) & np.isfinite(scan.lines[row, 0])
+    row, beam, end = row[keep], beam[keep], end[keep]
+    here, step = scan.fitted[row, beam], np.median(np.diff(scan.sweep.bearings))
+    visible = ~(scan.sweep.ranges[row, beam + end] < here - depth_jump(here, step))
+    return row[visible], beam[visible], end[visible]
+
+
+def _crossings(scan, row, bearing, shift=0.0):
+    """Points of fitted lines (plus a shift of the range) at bearings, derivative by the bearing, sigma of the range."""
+    u, ray = scan.lines[row], np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    turned = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
+    r = 1 / np.sum(u * ray, axis=1)
+    slope = -(r**2) * np.sum(u * turned, axis=1)
+    along = np.column_stack([slope[:, None] * ray + r[:, None] * turned, np.zeros(len(r))])
+    variance = r**4 * np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[row], ray)
+    return polar_to_points(r + shift, bearing), along, np.sqrt(variance)
+
+
+def _warp(scan, row, beam, end, most=15):
+    """How far the board lies from the fitted lines at their ends, and the standard deviation of that, metres.
+
+    A board bends, and cardboard reads farther than paper. The outermost eighth of a line (15 beams at most) says how
+    far each end is off; how much these medians vary beyond their noise over all lines says how far to believe them.
+    On a flat board that is nothing, and the ends stay on the fitted lines.
+    """
+    hits = scan.mask[row].sum(axis=1)
+    count = np.clip(hits // 8, 1, most)
+    at = beam[:, None] - end[:, None] * np.arange(most)
+    use = (np.arange(most) < count[:, None]) & (at >= 0) & (at < scan.mask.shape[1])
+    at = np.where(use, at, 0)
+    use &= scan.mask[row[:, None], at]
+    miss = np.where(use, scan.sweep.ranges[row[:, None], at] - scan.fitted[row[:, None], at], np.nan)
+    middle, noise = row_median(miss), np.pi / 2 * scan.sigma_range**2 / np.maximum(use.sum(axis=1), 1)
+    shift, sigma = np.zeros(len(row)), np.zeros(len(row))
+    for mine in (end == -1, end == 1):
+        if mine.any():
+            excess = max(np.median(middle[mine] ** 2) / 0.455 - np.median(noise[mine]), 0.0)  # 0.455: median of chi2(1)
+            shift[mine] = middle[mine] * excess / (excess + noise[mine])
+            sigma[mine] = np.sqrt(excess * noise[mine] / (excess + noise[mine]))
+    return shift, sigma
+
+
+def _outer(v):
+    return v[:, :, None] * v[:, None, :]
+
+
+def _to_platform(scan, vectors, pitch):
+    """Directions (not points) from the LRF at a pitch to the nominal platform frame."""
+    return tilt(vectors @ scan.T_head_lrf.rotation.as_matrix().T, pitch)
+
+
+def _inflation(along, sigma, side, sides):
+    """How much more the points of a side scatter about it than their spacing explains, at least 1, for each point.
+
+    `along` is the derivative of the points by the angle that `sigma` belongs to, nominal platform frame.
+    """
+    out = np.ones(len(side))
+    for s in sides:
+        mine = side == s.side
+        direction = (s.ends[1] - s.ends[0]) / np.linalg.norm(s.ends[1] - s.ends[0])
+        across = along[mine] - (along[mine] @ direction)[:, None] * direction
+        expected = np.sqrt(np.mean(sigma[mine] ** 2 * np.sum(across**2, axis=1)))
+        out[mine] = max(1.0, s.rms / expected) if expected > 0 else 1.0
+    return out
+
+
+def _group(scan, p_lrf, pitch, order, end, known=()):
+    """Assign points to straight sides in the board's plane; returns side numbers and the sides."""
+    side, sides = np.full(len(p_lrf), -1), []
+    if len(scan.sweep.pitch) == 1 or np.ptp(scan.sweep.pitch) < 1e-4:
+        return (end + 1) // 2, ()  # scans at one pitch show one point a side
+    axes = plane_axes(scan.normal)
+    flat = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf) @ axes.T
+    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0)) if len(flat) else 0.0
+    for e in (-1, 1):
+        mine = np.flatnonzero(end == e)
+        for found in straight_runs(flat[mine], order[mine], max(_spacing(scan), EDGE_SCATTER), shortest):
+            rows = mine[found]
+            new = _describe(scan, flat[rows], axes, e, float(np.mean(pitch[rows])))
+            number = next((s.side for s in known if _is_same(s, new)), len(known) + len(sides))
+            side[rows] = number
+            sides.append(replace(new, side=number))
+    return side, tuple(sides)
+
+
+def _describe(scan, flat, axes, end, pitch):
+    """A ScanSide (number still open) from its points in the plane."""
+    centre, direction, along, across = line_of(flat)
+    ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
+    scan_plane = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
+    level = np.cross(scan_plane, scan.normal)
+    cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
+    rms = float(np.sqrt(np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)))
+    return ScanSide(-1, end, len(flat), float(np.ptp(along)), rms, float(np.arccos(min(cosine, 1.0))), ends)
+
+
+def _is_same(a, b):
+    """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
+    along = (a.ends[1] - a.ends[0]) / a.length
+    other = (b.ends[1] - b.ends[0]) / b.length
+    apart = np.cross(b.ends.mean(axis=0) - a.ends.mean(axis=0), along)
+    return abs(along @ other) > np.cos(LEAST_TURN) and np.linalg.norm(apart) < SAME_SIDE
+
+
+def _spacing(scan):
+    """Typical distance of neighbouring beams on the board, metres."""
+    row = np.flatnonzero(np.isfinite(scan.lines[:, 0]))
+    first, last = row_ends(scan.mask[row])[1:]
+    ends = [_crossings(scan, row, scan.sweep.bearings[beam])[1] for beam in (first, last)]
+    return float(np.median(np.linalg.norm(np.concatenate(ends), axis=1)) * np.median(np.diff(scan.sweep.bearings)))
+
+
+def sweep_edges(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
+    """Where columns of the range image (one beam over the pitch) cross the board's edges.
+
+    Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    variant : {'half_step', 'last_beam'}
+        As in :func:`edge_points`, with scan lines for beams.
+    min_angle : float
+        Sides that meet the columns at a smaller angle are left out, radians.
+
+    Returns
+    -------
+    ScanEdges
+        Nothing ends at the first or last scan lines of the sweep, which may have been cut. The points lie on the
+        board at the pitch given with them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points`
+        sees too has the same number.
+        The covariance is that of the pitch step (as a displacement on the board) and of the line fit.
+
+    Raises
+    ------
+    ValueError
+        For another variant.
+    """
+    _check_variant(variant)
+    line, beam, beyond, end = _column_ends(scan)
+    pitch = scan.sweep.pitch
+    middle, step = (pitch[line] + pitch[beyond]) / 2, np.abs(np.diff(pitch))
+    points, by_pitch = _at_pitch(scan, line, beam, middle)
+    side, sides = _group(scan, points, middle, beam, end, edge_points(scan, min_angle=0.0).sides)
+    sigma = UNIFORM * np.maximum(np.abs(pitch[beyond] - pitch[line]), np.median(step) if len(step) else 0.0)
+    sigma = sigma * _inflation(_to_platform(scan, by_pitch, middle), sigma, side, sides)
+    chosen = middle if variant == "half_step" else pitch[line]
+    points, by_pitch = _at_pitch(scan, line, beam, chosen)
+    range_sigma = _crossings(scan, line, scan.sweep.bearings[beam])[2]
+    covariance = _outer(by_pitch * sigma[:, None]) + _outer(_rays(points) * range_sigma[:, None])
+    side, sides = _keep(side, sides, [s for s in sides if s.angle <= np.pi / 2 - min_angle])
+    return ScanEdges(scan.placement, variant, points, covariance, chosen, line, end, side, sides)
+
+
+def _column_ends(scan):
+    """Ends of columns: last line on the board, beam, the next line off it, and -1 / +1 for low and high pitch."""
+    beams, first, last = row_ends(scan.mask.T)
+    line, beyond, beam = np.r_[first, last], np.r_[first - 1, last + 1], np.r_[beams, beams]
+    keep = (line >= BORDER) & (line < len(scan.mask) - BORDER) & np.isfinite(scan.lines[line, 0])
+    line, beyond, beam = line[keep], beyond[keep], beam[keep]
+    here, step = scan.fitted[line, beam], scan.sweep.pitch[beyond] - scan.sweep.pitch[line]
+    visible = ~(scan.sweep.ranges[beyond, beam] < here - depth_jump(here, step))
+    line, beyond, beam = line[visible], beyond[visible], beam[visible]
+    upwards = np.polyfit(np.arange(len(scan.sweep.pitch)), scan.sweep.pitch, 1)[0] > 0 if len(scan.mask) > 1 else True
+    return line, beam, beyond, np.where((beyond > line) == upwards, 1, -1)
+
+
+def _at_pitch(scan, line, beam, pitch):
+    """The board along a beam at a pitch near that of a scan line, and how the point moves on the board with it.
+
+    The range comes from the scan line's fit, plus the change that the board's plane predicts up to `pitch`.
+    """
+    rays = polar_to_points(np.ones(len(beam)), scan.sweep.bearings[beam])
+    change = _plane_range(scan, rays, pitch) - _plane_range(scan, rays, scan.sweep.pitch[line])
+    points = (scan.fitted[line, beam] + change)[:, None] * rays
+    rotation = scan.T_head_lrf.rotation.as_matrix()
+    turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation  # d p / d pitch, in the LRF frame
+    normal = tilt(scan.normal, -pitch) @ rotation
+    slide = np.sum(normal * turned, axis=1) / np.sum(normal * rays, axis=1)
+    return points, turned - slide[:, None] * rays
+
+
+def _plane_range(scan, rays, pitch):
+    """Range along rays (LRF frame) to the board's plane."""
+    origin = lrf_to_platform(np.zeros((len(rays), 3)), pitch, scan.T_head_lrf)
+    return (scan.distance - origin @ scan.normal) / (_to_platform(scan, rays, pitch) @ scan.normal)

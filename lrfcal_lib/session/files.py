@@ -1,0 +1,276 @@
+"""The data files of a session: scan lines, images and tables, checked while they are read."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+
+from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_table, short
+from lrfcal_lib.session.stated import numbers
+from lrfcal_lib.session.telegrams import read_telegrams
+
+IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
+EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
+PURPOSES = ("intrinsics", "board", "scene")
+LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One row of images.csv.
+
+    Attributes
+    ----------
+    camera : str
+    file : Path
+        Where the image is now.
+    placement : int
+        -1 where the image belongs to no placement.
+    pitch : float
+        Of the platform, radians; NaN where unknown or of no importance (camera on the base).
+    time_s : float
+        NaN where unknown.
+    purpose : {'intrinsics', 'board', 'scene'}
+    """
+
+    camera: str
+    file: Path
+    placement: int
+    pitch: float
+    time_s: float
+    purpose: str
+
+
+@dataclass(frozen=True)
+class EdgePick:
+    """An edge of the board picked by hand; overrides the detector.
+
+    Attributes
+    ----------
+    camera : str
+    file : Path
+        The image.
+    edge : str
+        Name of the board's edge.
+    ends : ndarray, shape (2, 2)
+        Two pixels on the edge as recorded (distorted), far apart.
+    """
+
+    camera: str
+    file: Path
+    edge: str
+    ends: np.ndarray
+
+
+def read_scans(path, file=None):
+    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
+    if file is None:
+        file = next((name for name in _READERS if (path / name).is_file()), "lrf/scans.npz")
+    target = inside(path, file, "session.json: file of the LRF")
+    if file not in _READERS:
+        raise SessionError(f"{path}: the LRF's file is one of {short(_READERS)}, got '{file}'")
+    if not target.is_file() and sorted((path / "lrf").glob("part_*.npz")):
+        raise SessionError(f"{path}: the recording was interrupted; lrfcal_lib.session.finish('{path}') completes it")
+    return _READERS[file](target)
+
+
+def read_npz(file):
+    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            scans = {key: archive[key] for key in archive.files}
+    except FileNotFoundError as error:
+        raise SessionError(f"{file}: no such file; a session needs the scan lines") from error
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise SessionError(f"{file}: cannot be read ({error}); truncated?") from error
+    with naming(file):
+        return check_scans(scans)
+
+
+def _without_log(file):
+    return read_npz(file), None
+
+
+def _from_telegrams(file):
+    scans, log = read_telegrams(file)
+    with naming(file):
+        return check_scans(scans), log
+
+
+_READERS = {"lrf/scans.npz": _without_log, "lrf/telegrams.bin": _from_telegrams}
+
+
+def check_scans(scans):
+    """Scan lines with consistent shapes and credible units.
+
+    Parameters
+    ----------
+    scans : dict of ndarray
+        ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and intensities (N, B)
+        where there are any.
+
+    Returns
+    -------
+    dict of ndarray
+        The same as floats (placement: integers); ranges that are zero or infinite became NaN, in place.
+
+    Raises
+    ------
+    KeyError, ValueError
+        For a missing array, wrong shapes, ranges in millimetres, angles in degrees, bearings that do not ascend, or
+        no range at all.
+    """
+    ranges = np.asarray(scans["ranges"], float)
+    if ranges.ndim != 2:
+        raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
+    lines, beams = ranges.shape
+    shapes = {"bearings": (beams,), "placement": (lines,), "pitch": (lines,), "time_s": (lines,)}
+    shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
+    for key, shape in shapes.items():
+        if scans[key].shape != shape:
+            raise ValueError(f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}")
+    scans = {key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes}
+    _check_ranges(ranges)
+    _check_angles(scans["bearings"], scans["pitch"])
+    ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
+    return {**scans, "ranges": ranges}
+
+
+def _check_ranges(ranges):
+    seen = ranges[np.isfinite(ranges)]
+    if seen.size == 0:
+        raise ValueError(f"no range in {ranges.shape[0]} scan lines (all NaN): nothing was recorded")
+    if np.median(seen) > LONGEST_MEDIAN_RANGE:
+        raise ValueError(f"the median range is {np.median(seen):g} m: millimetres? Divide by 1000")
+    if seen.min() < 0:
+        raise ValueError(f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN")
+
+
+def _check_angles(bearings, pitch):
+    for name, angles, limit in (("bearing", bearings, 2 * np.pi), ("pitch", pitch, np.pi)):
+        if not np.isfinite(angles).all():
+            raise ValueError(f"{np.sum(~np.isfinite(angles))} values of {name} are not finite")
+        if np.abs(angles).max(initial=0) > limit + 1e-6:
+            raise ValueError(f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians")
+    if np.any(np.diff(bearings) <= 0):
+        raise ValueError("bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round")
+
+
+def missing_parts(placements, scans, records, cameras):
+    """What a session states and does not hold, as sentences; the rest can be used."""
+    seen = np.unique(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)])
+    out = [f"placement {p}: no scan line with a range" for p in placements if p not in seen]
+    extra = sorted(set(seen.tolist()) - set(placements))
+    out += [f"placement {p}: in the scan lines but not in session.json, ignored" for p in extra]
+    shot = {(r.camera, r.placement) for r in records}
+    out += [f"placement {p}: no image of camera '{c}'" for p in placements for c in cameras if (c, p) not in shot]
+    return tuple(out)
+
+
+def inside(path, name, where):
+    """The file a session names; it must lie inside the session's folder (no ``..``, absolute path or link out)."""
+    windows, posix = PureWindowsPath(name), PurePosixPath(name)
+    odd = windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts
+    if odd or not (path / name).resolve().is_relative_to(path.resolve()):
+        raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
+    return path / name
+
+
+def read_images(path, stated):
+    """The records of images.csv; every image must exist, be complete and have its camera's size."""
+    file = path / "images.csv"
+    if not stated["cameras"] and not file.exists():
+        return ()
+    out = []
+    for number, row in enumerate(read_table(file, IMAGE_COLUMNS), start=2):
+        with naming(f"{file} line {number}"):
+            out.append(_image_record(path, row, stated))
+            check_image_size(out[-1].file, image_size(out[-1].file), stated["cameras"][row["camera"]])
+    return tuple(out)
+
+
+def _image_record(path, row, stated):
+    if row["camera"] not in stated["cameras"]:
+        raise ValueError(f"no camera '{row['camera']}' in session.json, which has {short(stated['cameras'])}")
+    if row["purpose"] not in PURPOSES:
+        raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
+    placement = int(row["placement"]) if row["placement"] else -1
+    if placement not in stated["placements"] + (-1,):
+        raise ValueError(f"placement {placement} is not in session.json")
+    pitch, time = (float(row[k]) if row[k] else math.nan for k in ("pitch_deg", "t_s"))
+    target = inside(path, row["file"], "images.csv: file")
+    return ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"])
+
+
+def read_edges(path, stated, records):
+    """The picks of edges.csv, if there is one, for images and edges that the session knows."""
+    file = path / "edges.csv"
+    if not file.exists():
+        return ()
+    known = {(r.camera, r.file): r for r in records}
+    out = []
+    for number, row in enumerate(read_table(file, EDGE_COLUMNS), start=2):
+        with naming(f"{file} line {number}"):
+            target = inside(path, row["file"], "edges.csv: file")
+            if (row["camera"], target) not in known:
+                raise ValueError(f"images.csv has no '{row['file']}' of camera '{row['camera']}'")
+            if row["edge"] not in stated["board"].edges:
+                raise ValueError(f"edge is one of {short(stated['board'].edges)}, got '{row['edge']}'")
+            ends = numbers([float(row[k]) for k in EDGE_COLUMNS[3:]], (4,), "u1, v1, u2, v2").reshape(2, 2)
+            if np.linalg.norm(ends[1] - ends[0]) < 5:
+                raise ValueError(f"the two pixels {ends.tolist()} are too close for a direction: pick them far apart")
+            out.append(EdgePick(row["camera"], target, row["edge"], ends))
+    return tuple(out)
+
+
+def image_size(file):
+    """Width and height of a PNG or JPEG image from its header; also notices a cut-off end.
+
+    Parameters
+    ----------
+    file : path-like
+
+    Returns
+    -------
+    tuple of int
+
+    Raises
+    ------
+    SessionError
+        For a missing, truncated or other file.
+    """
+    data = read_bytes(file)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        size, complete = (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), b"IEND" in data[-16:]
+    elif data[:2] == b"\xff\xd8":
+        size, complete = _jpeg_size(data), b"\xff\xd9" in data[-64:]
+    else:
+        raise SessionError(f"{file}: neither PNG nor JPEG; convert the image")
+    if size is None or not complete:
+        raise SessionError(f"{file}: the image is truncated after {len(data)} bytes; restore it or remove its row")
+    return size
+
+
+def _jpeg_size(data):
+    """Walk the segments of a JPEG file to the frame header, which holds the size; None where it is missing."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 2 + length
+    return None
+
+
+def check_image_size(file, size, camera):
+    """Refuse an image (width, height) of another size than its camera's."""
+    if tuple(size) != (camera.width, camera.height):
+        raise SessionError(
+            f"{file}: {size[0]} x {size[1]} pixels, but camera '{camera.name}' has {camera.width} x {camera.height}; "
+            "intrinsics hold for one image size only"
+        )

@@ -1,0 +1,248 @@
+"""Open a session, check it, and hand out its sweeps and images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.board import Board
+from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, short
+from lrfcal_lib.session.files import (
+    EdgePick,
+    ImageRecord,
+    check_image_size,
+    missing_parts,
+    read_edges,
+    read_images,
+    read_scans,
+)
+from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
+from lrfcal_lib.session.telegrams import TelegramLog, other_than_stated
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The scan lines of one placement of the board.
+
+    Attributes
+    ----------
+    placement : int
+    ranges : ndarray, shape (L, B)
+        Metres, in the order of acquisition; NaN where nothing came back or nothing was recorded.
+    bearings : ndarray, shape (B,)
+        Radians, ascending; 0 right, pi/2 ahead.
+    pitch : ndarray, shape (L,)
+        Radians; positive lifts the view.
+    time_s : ndarray, shape (L,)
+        NaN where unknown.
+    intensities : ndarray, shape (L, B), or None
+    """
+
+    placement: int
+    ranges: np.ndarray
+    bearings: np.ndarray
+    pitch: np.ndarray
+    time_s: np.ndarray
+    intensities: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Session:
+    """A recorded session; the arrays are read when it is opened, the images when they are asked for.
+
+    Attributes
+    ----------
+    path : Path
+    name, licence, source : str
+        `source` says where the recording came from.
+    simulated : bool
+    board : Board
+    lrf : LrfInfo
+    T_head_lrf : RigidTransform or None
+        The platform as its maker or a tape measure states it.
+    cameras : dict of str to CameraInfo
+    placements : tuple of int
+        All that the session states, also those without data.
+    image_records : tuple of ImageRecord
+    picks : tuple of EdgePick
+    reference : dict
+        Results other people published about this recording; free form, never used in an estimate.
+    problems : tuple of str
+        What is missing without making the rest useless, such as a placement without scan lines.
+    telegrams : TelegramLog or None
+        What became of the recorded telegrams; None for a session of scan lines.
+    """
+
+    path: Path
+    name: str
+    licence: str
+    source: str
+    simulated: bool
+    board: Board
+    lrf: LrfInfo
+    T_head_lrf: RigidTransform | None
+    cameras: dict[str, CameraInfo]
+    placements: tuple[int, ...]
+    image_records: tuple[ImageRecord, ...]
+    picks: tuple[EdgePick, ...]
+    reference: dict
+    problems: tuple[str, ...]
+    scans: dict[str, np.ndarray] = field(repr=False)
+    telegrams: TelegramLog | None = field(default=None, repr=False)
+
+    def sweep(self, placement):
+        """The scan lines of a placement.
+
+        Parameters
+        ----------
+        placement : int
+
+        Returns
+        -------
+        Sweep
+
+        Raises
+        ------
+        SessionError
+            If the placement is not in the session, or has no scan line with a range.
+        """
+        if placement not in self.placements:
+            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
+        rows = self.scans["placement"] == placement
+        picked = {k: v[rows] for k, v in self.scans.items() if k in ("ranges", "pitch", "time_s", "intensities")}
+        if not np.isfinite(picked["ranges"]).any():
+            raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
+        return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
+
+    def images(self, camera=None, placement=None, purpose=None):
+        """The records of images that match all that is given, in the order of images.csv.
+
+        Parameters
+        ----------
+        camera : str, optional
+        placement : int, optional
+        purpose : str, optional
+
+        Returns
+        -------
+        tuple of ImageRecord
+        """
+        wanted = {"camera": camera, "placement": placement, "purpose": purpose}
+        wanted = {k: v for k, v in wanted.items() if v is not None}
+        return tuple(r for r in self.image_records if all(getattr(r, k) == v for k, v in wanted.items()))
+
+    def read_image(self, record):
+        """The pixels of an image.
+
+        Parameters
+        ----------
+        record : ImageRecord
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            Blue, green, red.
+
+        Raises
+        ------
+        SessionError
+            If the file cannot be decoded or has another size than the camera.
+        """
+        data = np.frombuffer(read_bytes(record.file), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        if image is None:
+            raise SessionError(f"{record.file}: cannot be decoded; remove its row from images.csv or restore the file")
+        check_image_size(record.file, image.shape[1::-1], self.cameras[record.camera])
+        return image
+
+    def telegram_report(self, placement=None):
+        """What became of the recorded telegrams: counts, CRC failures, special values by reason.
+
+        Parameters
+        ----------
+        placement : int, optional
+            All by default.
+
+        Returns
+        -------
+        dict
+            See :meth:`lrfcal_lib.session.telegrams.TelegramLog.report`.
+
+        Raises
+        ------
+        SessionError
+            If the session holds scan lines instead of telegrams, or has no such placement.
+        """
+        if self.telegrams is None:
+            raise SessionError(f"{self.path}: recorded as lrf/scans.npz; only lrf/telegrams.bin tells about telegrams")
+        if placement is not None and placement not in self.placements:
+            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
+        return self.telegrams.report(placement)
+
+    def sweep_direction(self, placement):
+        """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one pitch."""
+        pitch = self.sweep(placement).pitch
+        moved = np.nanmedian(pitch[-(len(pitch) // 4 + 1) :]) - np.nanmedian(pitch[: len(pitch) // 4 + 1])
+        return int(np.sign(moved)) if abs(moved) > 1e-4 else 0
+
+
+def open_session(path):
+    """Open a session and check all of it.
+
+    Parameters
+    ----------
+    path : path-like
+        The session's folder.
+
+    Returns
+    -------
+    Session
+
+    Raises
+    ------
+    SessionError
+        With the file, the value and the remedy, for anything that makes the session unusable. What only takes a part
+        away (a placement without scan lines) is in `Session.problems`.
+    """
+    path = Path(path)
+    data = read_json(path / "session.json")
+    if data.get("schema") != SCHEMA:
+        raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
+    with naming(path / "session.json"):
+        stated = parse_session(data)
+        scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
+    records = read_images(path, stated)
+    picks = read_edges(path, stated, records)
+    problems = missing_parts(stated["placements"], scans, records, stated["cameras"])
+    problems += () if log is None else (*log.problems, *other_than_stated(scans, stated["lrf"]))
+    found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
+    return Session(path=path, **found, **stated)
+
+
+def validate(path):
+    """Everything that is wrong with a session, as sentences.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    list of str
+        Empty for a sound session. The first entry is what keeps the session from being opened, if anything does.
+    """
+    try:
+        session = open_session(path)
+    except SessionError as error:
+        return [str(error)]
+    found = list(session.problems)
+    for record in session.image_records:
+        try:
+            session.read_image(record)
+        except SessionError as error:
+            found.append(str(error))
+    return found

@@ -1,0 +1,254 @@
+"""session.json: what is stated about the rig, the board and the recording; units are part of the keys."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.board import Board, Chessboard
+from lrfcal_lib.camera import CameraModel
+from lrfcal_lib.session.common import short
+
+SCHEMA = "lrfcal-session/1"
+MOUNTS = ("head", "platform")
+LONGEST_BOARD = 20.0  # metres
+LONGEST_LEVER = 10.0  # metres between the parts of a rig
+
+
+@dataclass(frozen=True)
+class LrfInfo:
+    """What is known about the laser range finder, read from the device or its data, never from the model's name.
+
+    Attributes
+    ----------
+    model : str
+    field_of_view : tuple of float
+        First and last bearing it can measure, radians (0 right, pi/2 ahead).
+    bearing_step : float
+        Radians between neighbouring beams.
+    sigma_range : float
+        Standard deviation of a range, metres.
+    sigma_bearing : float
+        Standard deviation of a bearing, radians; 0 where unknown.
+    range_resolution : float
+        Step of the recorded ranges, metres.
+    max_range : float
+        Metres.
+    """
+
+    model: str
+    field_of_view: tuple[float, float]
+    bearing_step: float
+    sigma_range: float
+    sigma_bearing: float = 0.0
+    range_resolution: float = 0.001
+    max_range: float = math.inf
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera of the rig.
+
+    Attributes
+    ----------
+    name : str
+    mount : {'head', 'platform'}
+        What it is fixed to: it turns with the LRF, or it stands on the base.
+    width, height : int
+        Image size, pixels.
+    model : CameraModel or None
+        None where the intrinsics have to be estimated from the session's own images.
+    guess : RigidTransform or None
+        Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+    """
+
+    name: str
+    mount: str
+    width: int
+    height: int
+    model: CameraModel | None = None
+    guess: RigidTransform | None = None
+
+
+def parse_session(data):
+    """The statements of session.json as fields of a Session; KeyError, TypeError or ValueError for a wrong one."""
+    rig = data["rig"]
+    placements = tuple(int(p) for p in data["placements"])
+    if len(set(placements)) != len(placements) or min(placements, default=0) < 0:
+        raise ValueError(f"placements are different numbers from 0 on, got {short(placements)}")
+    return {
+        "name": plain_name(data["name"], "name of the session"),
+        "licence": str(data["licence"]),
+        "source": str(data["source"]),
+        "simulated": bool(data["simulated"]),
+        "board": board_from_json(data["board"]),
+        "lrf": lrf_from_json(rig["lrf"]),
+        "T_head_lrf": transform_from_json(rig["platform"]["T_head_lrf"]),
+        "cameras": {name: camera_from_json(name, c) for name, c in rig["cameras"].items()},
+        "placements": placements,
+        "reference": dict(data.get("reference", {})),
+    }
+
+
+def plain_name(name, what):
+    """A name that is safe as a file name."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise ValueError(f"the {what} becomes a file name: letters, digits, '_', '-' and '.' only, got {name!r}")
+    return name
+
+
+def numbers(values, shape, what):
+    """Finite numbers of a given shape."""
+    out = np.asarray(values, float)
+    if out.shape != shape or not np.isfinite(out).all():
+        raise ValueError(f"{what} must be {' x '.join(map(str, shape)) or 'one'} finite numbers, got {values!r}")
+    return out
+
+
+def _positive(value, what):
+    value = float(numbers(value, (), what))
+    if value <= 0:
+        raise ValueError(f"{what} must be positive, got {value}")
+    return value
+
+
+def transform_to_json(transform):
+    """A RigidTransform (or None) as rotation vector and translation."""
+    if transform is None:
+        return None
+    return {
+        "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
+
+
+def transform_from_json(data):
+    """Inverse of :func:`transform_to_json`."""
+    if data is None:
+        return None
+    shift = numbers(data["translation_m"], (3,), "translation_m")
+    if np.abs(shift).max() > LONGEST_LEVER:
+        raise ValueError(f"translation_m is {shift.tolist()}: millimetres? Divide by 1000")
+    rotation = Rotation.from_rotvec(numbers(data["rotation_vector_rad"], (3,), "rotation_vector_rad"))
+    return RigidTransform.from_components(shift, rotation)
+
+
+def board_to_json(board):
+    """A board as it stands in session.json."""
+    pattern = None
+    if board.pattern is not None:
+        p = board.pattern
+        pattern = {"kind": "chessboard", "columns": p.columns, "rows": p.rows, "square_m": p.square}
+        pattern["origin_m"] = list(p.origin)
+    corners = None if board.corners is None else np.asarray(board.corners).tolist()
+    named = {"name": board.name, "edges": list(board.edges), "features": list(board.features)}
+    return {**named, "corners_m": corners, "pattern": pattern}
+
+
+def board_from_json(data):
+    """Inverse of :func:`board_to_json`; refuses a board larger than 20 m."""
+    edges = tuple(str(e) for e in data["edges"])
+    features = tuple(str(f) for f in data["features"])
+    if len(edges) < 3 or len(set(edges)) != len(edges):
+        raise ValueError(f"a board needs three or more edges with different names, got {short(edges)}")
+    if len(features) != 2 or not set(features) <= set(edges):
+        raise ValueError(f"features are two of the edges {short(edges)}, got {short(features)}")
+    corners = data["corners_m"]
+    if corners is not None:
+        corners = numbers(corners, (len(edges), 2), "corners_m")
+        if np.ptp(corners, axis=0).max() > LONGEST_BOARD:
+            raise ValueError(f"the board is {np.ptp(corners, axis=0).max():g} m large: millimetres? Divide by 1000")
+    return Board(str(data["name"]), edges, corners, _pattern_from_json(data["pattern"]), features)
+
+
+def _pattern_from_json(data):
+    if data is None:
+        return None
+    if data["kind"] != "chessboard":
+        raise ValueError(f"pattern kind is 'chessboard', got {data['kind']!r}")
+    square = _positive(data["square_m"], "square_m")
+    if square > 1:
+        raise ValueError(f"square_m is {square:g}: millimetres? Divide by 1000")
+    columns, rows = int(data["columns"]), int(data["rows"])
+    if min(columns, rows) < 3:
+        raise ValueError(f"a chessboard needs three or more inner corners each way, got {columns} x {rows}")
+    return Chessboard(columns, rows, square, tuple(numbers(data.get("origin_m", (0, 0)), (2,), "origin_m").tolist()))
+
+
+def lrf_to_json(lrf):
+    """An LrfInfo as it stands in session.json (degrees there)."""
+    return {
+        "model": lrf.model,
+        "field_of_view_deg": np.round(np.degrees(lrf.field_of_view), 9).tolist(),
+        "bearing_step_deg": round(math.degrees(lrf.bearing_step), 9),
+        "sigma_range_m": lrf.sigma_range,
+        "sigma_bearing_deg": round(math.degrees(lrf.sigma_bearing), 9),
+        "range_resolution_m": lrf.range_resolution,
+        "max_range_m": lrf.max_range if math.isfinite(lrf.max_range) else None,
+    }
+
+
+def lrf_from_json(data):
+    """Inverse of :func:`lrf_to_json`."""
+    first, last = np.radians(numbers(data["field_of_view_deg"], (2,), "field_of_view_deg"))
+    if not first < last <= first + 2 * np.pi + 1e-9:
+        raise ValueError(f"field_of_view_deg is two ascending bearings, got {data['field_of_view_deg']}")
+    sigma = _positive(data["sigma_range_m"], "sigma_range_m")
+    if sigma > 1:
+        raise ValueError(f"sigma_range_m is {sigma:g}: millimetres? Divide by 1000")
+    longest = data.get("max_range_m")
+    return LrfInfo(
+        model=str(data["model"]),
+        field_of_view=(float(first), float(last)),
+        bearing_step=math.radians(_positive(data["bearing_step_deg"], "bearing_step_deg")),
+        sigma_range=sigma,
+        sigma_bearing=math.radians(float(numbers(data.get("sigma_bearing_deg", 0.0), (), "sigma_bearing_deg"))),
+        range_resolution=float(numbers(data.get("range_resolution_m", 0.001), (), "range_resolution_m")),
+        max_range=math.inf if longest is None else _positive(longest, "max_range_m"),
+    )
+
+
+def model_to_json(model):
+    """Intrinsics (or None) as they stand in session.json."""
+    if model is None:
+        return None
+    out = {k: float(getattr(model, k)) for k in ("fx", "fy", "cx", "cy")}
+    out["distortion"] = np.asarray(model.distortion, float).tolist()
+    out["covariance"] = None if model.covariance is None else np.asarray(model.covariance).tolist()
+    return {**out, "rms_px": model.rms_px}
+
+
+def model_from_json(data, width, height):
+    """Inverse of :func:`model_to_json`."""
+    if data is None:
+        return None
+    focal = [_positive(data[k], k) for k in ("fx", "fy")]
+    centre = [float(numbers(data[k], (), k)) for k in ("cx", "cy")]
+    covariance = data.get("covariance")
+    if covariance is not None:
+        covariance = numbers(covariance, (9, 9), "covariance")
+    rms = data.get("rms_px")
+    distortion = numbers(data["distortion"], (5,), "distortion")
+    return CameraModel(width, height, *focal, *centre, distortion, covariance, None if rms is None else float(rms))
+
+
+def camera_to_json(camera):
+    """A CameraInfo as it stands in session.json."""
+    out = {"mount": camera.mount, "width": camera.width, "height": camera.height}
+    return {**out, "intrinsics": model_to_json(camera.model), "guess": transform_to_json(camera.guess)}
+
+
+def camera_from_json(name, data):
+    """Inverse of :func:`camera_to_json`."""
+    plain_name(name, "name of a camera")
+    if data["mount"] not in MOUNTS:
+        raise ValueError(f"camera '{name}': mount is one of {short(MOUNTS)}, got {data['mount']!r}")
+    width, height = int(data["width"]), int(data["height"])
+    if min(width, height) < 1:
+        raise ValueError(f"camera '{name}': width and height must be positive, got {width} x {height}")
+    model = model_from_json(data["intrinsics"], width, height)
+    return CameraInfo(name, data["mount"], width, height, model, transform_from_json(data.get("guess")))

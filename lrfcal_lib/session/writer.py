@@ -1,0 +1,273 @@
+"""Write a session so that a crash loses at most what was being written."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lrfcal_lib.session.common import SessionError, naming, short
+from lrfcal_lib.session.files import IMAGE_COLUMNS, PURPOSES, check_image_size, check_scans, image_size, read_npz
+from lrfcal_lib.session.stated import (
+    SCHEMA,
+    board_to_json,
+    camera_to_json,
+    lrf_to_json,
+    parse_session,
+    transform_to_json,
+)
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS
+
+
+class SessionWriter:
+    """Write a session so that a crash loses at most what was being written.
+
+    Every sweep and every image is on the disk (fsync) before the table that names it is; :func:`finish` then makes
+    the one scans.npz, or leaves the telegrams as they are. An interrupted session is completed by ``finish(path)``.
+    A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
+
+    Parameters
+    ----------
+    path : path-like
+        Must not exist or be an empty folder.
+    board : Board
+    lrf : LrfInfo
+    cameras : iterable of CameraInfo
+    T_head_lrf : RigidTransform, optional
+    name : str, optional
+        The folder's name by default.
+    licence, source : str
+    simulated : bool
+    reference : dict, optional
+    placements : iterable of int
+        Placements known beforehand; those of added sweeps and images are added.
+
+    Raises
+    ------
+    SessionError
+        If the target exists, or something cannot stand in a session.
+
+    Examples
+    --------
+    ``with SessionWriter(path, board, lrf, cameras) as writer: writer.add_sweep(1, ranges, bearings, pitch)``
+    """
+
+    def __init__(
+        self, path, board, lrf, cameras=(), T_head_lrf=None, *, name=None, licence="", source="", simulated=False,
+        reference=None, placements=(),
+    ):  # fmt: skip
+        self.path = Path(path)
+        self.cameras = {camera.name: camera for camera in cameras}
+        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
+        self.telegrams = self.path / "lrf" / "telegrams.bin"
+        data = {"schema": SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source}
+        rig = {"lrf": lrf_to_json(lrf), "platform": {"T_head_lrf": transform_to_json(T_head_lrf)}}
+        rig["cameras"] = {c.name: camera_to_json(c) for c in self.cameras.values()}
+        data |= {"simulated": simulated, "board": board_to_json(board), "rig": rig}
+        self.data = {**data, "placements": [int(p) for p in placements], "reference": reference or {}}
+        with naming(self.path):
+            parse_session(json.loads(json.dumps(self.data)))
+        self._create()
+
+    def _create(self):
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+        (self.path / "lrf").mkdir(parents=True)
+        for name in self.cameras:
+            (self.path / "images" / name).mkdir(parents=True)
+        if self.cameras:
+            _write(self.path / "images.csv", ",".join(IMAGE_COLUMNS) + "\n")
+        self._write_index()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if kind is None:
+            finish(self.path)
+
+    def _write_index(self):
+        _write(self.path / "session.json", json.dumps(self.data, indent=1) + "\n")
+
+    def _note_placement(self, placement):
+        if placement >= 0 and placement not in self.data["placements"]:
+            self.data["placements"] = sorted([*self.data["placements"], int(placement)])
+            self._write_index()
+
+    def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
+        """Append the scan lines of a placement.
+
+        Parameters
+        ----------
+        placement : int
+        ranges : array_like, shape (L, B)
+            Metres, NaN where nothing came back.
+        bearings : array_like, shape (B,)
+            Radians, ascending; the same in all sweeps of a session.
+        pitch : array_like, shape (L,)
+            Radians.
+        time_s : array_like, shape (L,), optional
+        intensities : array_like, shape (L, B), optional
+
+        Raises
+        ------
+        SessionError
+            For wrong shapes, wrong units, or other bearings than before.
+        """
+        if self.telegrams.exists():
+            raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
+        ranges, bearings = np.array(ranges, float, ndmin=2), np.asarray(bearings, float)
+        time_s = np.full(len(ranges), np.nan) if time_s is None else np.asarray(time_s, float)
+        scans = {"ranges": ranges, "bearings": bearings, "pitch": np.asarray(pitch, float), "time_s": time_s}
+        scans |= {"placement": np.full(len(ranges), placement)}
+        scans |= {} if intensities is None else {"intensities": np.asarray(intensities, float)}
+        with naming(f"{self.path}: placement {placement}"):
+            scans = check_scans(scans)
+            if self.bearings is not None and not np.array_equal(self.bearings, bearings):
+                raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
+        self.bearings, self.parts = bearings, self.parts + 1
+        _write(self.path / "lrf" / f"part_{self.parts:06d}.npz", scans)
+        self._note_placement(placement)
+
+    def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
+        """Append telegrams as the device sent them.
+
+        Parameters
+        ----------
+        placement : int
+            -1 for telegrams of no placement, such as the configuration (0xF4) or status (0xB1) reply with which a
+            recording should begin: it states the measuring mode, which a scan does not tell.
+        telegrams : sequence of bytes
+            One telegram each, from its start byte to its CRC, also damaged ones.
+        pitch : float or array_like, shape (len(telegrams),)
+            Radians.
+        time_s : float or array_like, shape (len(telegrams),)
+
+        Raises
+        ------
+        SessionError
+            For other numbers of pitches or times, pitches that are no radians, something that is no bytes, or a session
+            that has scan lines already.
+        """
+        with naming(f"{self.path}: placement {placement}"):
+            telegrams = _checked_telegrams(telegrams)
+            pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
+            if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
+                raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
+            if self.parts:
+                raise ValueError("the session has scan lines: add_sweep, or begin another one")
+        if not self.telegrams.exists():
+            _write(self.telegrams.with_name("index.csv"), ",".join(INDEX_COLUMNS) + "\n")
+        self._note_placement(placement)
+        offset = _append(self.telegrams, b"".join(telegrams))
+        rows = []
+        for raw, angle, time in zip(telegrams, np.degrees(pitch), time_s, strict=True):
+            rows.append([_cell(time), offset, len(raw), "" if placement < 0 else placement, _cell(angle)])
+            offset += len(raw)
+        _append(self.telegrams.with_name("index.csv"), "".join(",".join(map(str, row)) + "\n" for row in rows))
+
+    def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
+        """Append an image.
+
+        Parameters
+        ----------
+        camera : str
+        image : path-like or ndarray of uint8, shape (h, w, 3)
+            A PNG or JPEG file, copied byte for byte, or blue-green-red pixels.
+        placement : int
+            -1 for none.
+        pitch : float
+            Radians.
+        time_s : float
+        purpose : {'board', 'intrinsics', 'scene'}
+
+        Raises
+        ------
+        SessionError
+            For an unknown camera or purpose, or an image of another size than the camera's.
+        """
+        if camera not in self.cameras or purpose not in PURPOSES:
+            known = f"cameras are {short(self.cameras)}, purposes {short(PURPOSES)}"
+            raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
+        pixels = isinstance(image, np.ndarray)
+        size = image.shape[1::-1] if pixels else image_size(image)
+        check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
+        self.shots[camera] += 1
+        suffix = ".png" if pixels else Path(image).suffix.lower()
+        name = f"images/{camera}/{self.shots[camera]:04d}{suffix}"
+        _write(self.path / name, cv2.imencode(".png", image)[1].tobytes() if pixels else Path(image).read_bytes())
+        self._note_placement(placement)
+        cells = [_cell(time_s), camera, name, "" if placement < 0 else placement, _cell(math.degrees(pitch)), purpose]
+        _append(self.path / "images.csv", ",".join(map(str, cells)) + "\n")
+
+
+def finish(path):
+    """Complete a session: one scans.npz out of the sweeps. Also completes a session whose recording was interrupted.
+
+    A recording of telegrams is complete as it is; only what a crash cut off at the end of a table is removed.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    SessionError
+        If there is no sweep, or one of them is damaged.
+    """
+    path = Path(path)
+    for table in (path / "images.csv", path / "lrf" / "index.csv"):
+        if table.exists() and not table.read_text().endswith("\n"):
+            _write(table, table.read_text().rpartition("\n")[0] + "\n")  # a row cut off by a crash
+    if (path / "lrf" / "telegrams.bin").exists():
+        return
+    parts = sorted((path / "lrf").glob("part_*.npz"))
+    if not parts:
+        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
+    sweeps = [read_npz(part) for part in parts]
+    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
+    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
+    _write(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, compress=True)
+    for part in parts:
+        part.unlink()
+
+
+def _checked_telegrams(telegrams):
+    if isinstance(telegrams, bytes | bytearray):
+        raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
+    telegrams = [bytes(raw) for raw in telegrams]
+    if not telegrams or min(map(len, telegrams)) < 7:
+        lengths = short(sorted({len(raw) for raw in telegrams}))
+        raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {lengths}")
+    return telegrams
+
+
+def _cell(value):
+    return "" if math.isnan(value) else repr(round(float(value), 9))
+
+
+def _write(file, content, compress=False):
+    """Write a file so that it is either complete or not there: under another name, fsync, rename."""
+    draft = file.with_name(file.name + ".draft")
+    with draft.open("wb") as stream:
+        if isinstance(content, dict):
+            (np.savez_compressed if compress else np.savez)(stream, **content)
+        else:
+            stream.write(content.encode() if isinstance(content, str) else content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(draft, file)
+
+
+def _append(file, content):
+    """Append to a file, which is on the disk afterwards; where the new part begins."""
+    with file.open("ab") as stream:
+        begin = stream.tell()
+        stream.write(content.encode() if isinstance(content, str) else content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    return begin

@@ -1,0 +1,91 @@
+"""What every solver hands back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.camera import CameraModel
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver hands back.
+
+    Attributes
+    ----------
+    transform : RigidTransform or None
+        The estimate (a stack of them for a batch of trials).
+    parameters : ndarray, shape (..., k)
+        For a transform its rotation vector and translation (radians, metres), then whatever else was unknown.
+    names : tuple of str, length k
+    converged : bool or ndarray of bool
+    iterations : int
+    cost_history : ndarray, shape (iterations + 1, ...)
+        Half the sum of squared whitened residuals (of the loss, where one is used).
+    residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
+        Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]`` for a transform).
+    weights : ndarray, shape (..., n)
+        Robust weights, 1 without a loss.
+    covariance : ndarray, shape (..., k, k)
+        Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the stated noise is too
+        small, and the covariance is multiplied by `inflation`, chi-square per degree of freedom; never shrunk below 1.
+    covariance_placements : ndarray, shape (..., k, k), or None
+        Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T`` where ``d_g`` is the
+        change of the estimate when placement g is left out. Model errors are common to one placement, which the first
+        covariance cannot know. None where one placement alone carries an unknown, or with fewer than three placements.
+    unobservable : tuple of str
+        Motions that the data do not determine, in words.
+    method : str
+    n_observations : int
+    chi2 : float or ndarray
+        Sum of squared whitened residuals (weighted).
+    inflation : float or ndarray
+        1 where chi-square agrees with the stated noise.
+    model : CameraModel or None
+        Refined intrinsics of a joint refinement.
+    board_poses : ndarray, shape (p, 4, 4), or None
+        Refined ``T_camera_board`` of a joint refinement, in the order of the observations' `placements`.
+    state : object
+        What the core moved about: everything that was unknown, shared or not.
+    """
+
+    transform: RigidTransform | None
+    parameters: np.ndarray
+    names: tuple[str, ...]
+    converged: bool | np.ndarray
+    iterations: int
+    cost_history: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    weights: np.ndarray
+    covariance: np.ndarray
+    covariance_placements: np.ndarray | None
+    unobservable: tuple[str, ...]
+    method: str
+    n_observations: int
+    chi2: float | np.ndarray
+    inflation: float | np.ndarray
+    model: CameraModel | None = None
+    board_poses: np.ndarray | None = None
+    state: Any = None
+
+    @property
+    def sigma(self):
+        """Standard deviations of the increments from `covariance`, shape (..., k)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def sigma_placements(self):
+        """Standard deviations from `covariance_placements`, shape (..., k), or None."""
+        found = self.covariance_placements
+        return None if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+
+    def __repr__(self):
+        state = "converged" if np.all(self.converged) else "NOT converged"
+        return (
+            f"Solution({self.method}: {state} after {self.iterations} iterations, {self.n_observations} observations)"
+        )

@@ -1,0 +1,32 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+matplotlib.use("Agg")
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def real_data():
+    """Folder of other people's recordings: LRFCAL_REAL_DATA, else ../shared/real beside the checkout."""
+    folder = Path(os.environ.get("LRFCAL_REAL_DATA") or ROOT.parent / "shared" / "real")
+    if not folder.is_dir():
+        reason = f"no recordings in {folder}: set LRFCAL_REAL_DATA to the folder that holds lms400_zed"
+        if os.environ.get("CI"):
+            pytest.fail(reason + " (a CI server must have them)")
+        pytest.skip(reason)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def lms400_session(real_data, tmp_path_factory):
+    """Folder of the session imported from lms400_zed, made once a test run."""
+    from lrfcal_lib.importers import import_lasersetero
+
+    target = tmp_path_factory.mktemp("sessions") / "lms400_zed"
+    import_lasersetero(real_data / "lms400_zed", target)
+    return target

@@ -1,0 +1,98 @@
+"""Tables of residuals, stereo check and edge lengths."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_observations, random_board_poses, random_rig
+
+from lrfcal_lib import evaluate
+from lrfcal_lib.solvers.camera import solve_lines
+from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
+
+
+@pytest.fixture(scope="module")
+def observed():
+    rng = np.random.default_rng(5)
+    rig = random_rig(rng)
+    poses = random_board_poses(rng, 14, rig)
+    return {noise: camera_observations(rng, rig, poses, noise=noise) for noise in (0.0, 1.0)}
+
+
+def test_rms_ignores_what_is_missing():
+    assert evaluate.rms([3.0, np.nan, -3.0]) == 3.0
+    assert np.isnan(evaluate.rms([np.nan]))
+
+
+def test_left_out_errors_vanish_without_noise(observed):
+    obs = observed[0.0]
+    edge, plane = evaluate.left_out_residuals(obs, obs, solve_lines, solve_lines(obs))
+    assert np.abs(edge).max() < 1e-6 and np.nanmax(np.abs(plane)) < 1e-8
+
+
+def test_left_out_errors_are_larger_than_fitted_ones(observed):
+    obs = observed[1.0]
+    full = solve_zhang_pless(obs)
+    _, plane = evaluate.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    assert evaluate.rms(plane) > evaluate.rms(evaluate.plane_residuals_of(obs, full))
+
+
+def test_placements_that_leave_too_little_are_nan(observed):
+    obs = observed[0.0].select(observed[0.0].placements[:3])
+    full = SimpleNamespace(transform=solve_zhang_pless(observed[0.0]).transform)
+    edge, plane = evaluate.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    assert np.isnan(edge).all() and np.isnan(plane).all()
+
+
+def test_comparison_has_a_row_a_method(observed):
+    obs = observed[1.0]
+    observations = {("left", "half_step"): obs, ("left", "last_beam"): obs}
+    solutions = {("left", "line"): solve_lines(obs), ("left", "zhang_pless"): solve_zhang_pless(obs)}
+    table = evaluate.method_comparison(observations, solutions)
+    assert table.method.tolist() == ["line", "zhang_pless"] and (table.n_placements == 14).all()
+    without = evaluate.method_comparison(observations, solutions, left_out=False)
+    assert without.left_out_edge_rms_px.isna().all()
+    pd.testing.assert_series_equal(without.edge_rms_px, table.edge_rms_px)
+
+
+def test_poses_under_the_same_intrinsics_stay(observed):
+    obs = observed[0.0]
+    assert evaluate.poses_under(obs, None) is obs.board_poses
+    np.testing.assert_allclose(evaluate.poses_under(obs, obs.model), obs.board_poses, atol=1e-6)
+
+
+def test_camera_table_shows_degrees_and_millimetres(observed):
+    solution = solve_lines(observed[1.0])
+    table = evaluate.camera_calibration_table({("left", "line"): solution}).set_index("parameter")
+    np.testing.assert_allclose(table.value[["rx", "ry", "rz"]], np.rad2deg(solution.parameters[:3]))
+    np.testing.assert_allclose(table.value[["tx", "ty", "tz"]], 1000 * solution.parameters[3:])
+    assert (table.sigma > 0).all() and table.unit["tx"] == "mm"
+
+
+def test_stereo_check_is_zero_for_exact_cameras():
+    rng = np.random.default_rng(6)
+    first, second = (RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng)) for _ in range(2))
+    solutions = {
+        ("left", "line"): SimpleNamespace(transform=first),
+        ("right", "line"): SimpleNamespace(transform=second),
+    }
+    table = evaluate.stereo_check(solutions, ("left", "right"), second * first.inv())
+    assert table.method.tolist() == ["line"]
+    assert table[["baseline_error_mm", "translation_error_mm", "rotation_error_deg"]].abs().max(axis=None) < 1e-6
+
+
+def test_the_papers_mean_error_is_reproduced():
+    errors = [abs(measured - stated) for stated, measured in evaluate.PAPER_EDGES_MM.values()]
+    assert np.mean(errors) == pytest.approx(8.8410, abs=5e-5)
+
+
+def test_summary_groups_by_source_ends_and_variant():
+    rows = [
+        ("a", 1, "top", "scan", "half_step", 100.0, 103.0, 3.0),
+        ("a", 2, "top", "scan", "half_step", 100.0, 99.0, -1.0),
+    ]
+    columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "error_mm"]
+    row = evaluate.edge_summary(pd.DataFrame(rows, columns=columns)).iloc[0]
+    assert (row.n, row.mean_abs_error_mm, row.mean_error_mm) == (2, 2.0, 1.0)

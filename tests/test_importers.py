@@ -1,0 +1,220 @@
+"""Other people's recordings become sessions without loss."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lrfcal_lib import importers
+from lrfcal_lib.__main__ import main
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
+from lrfcal_lib.session import SessionError, open_session, transform_from_json
+
+BOUGUET = """
+fc = [ 700.5 ; 701.5 ];
+cc = [ 15.25 ; 11.75 ];
+alpha_c = 0.000000000000000;
+kc = [ -0.17 ; 0.02 ; -0.0003 ; 0.0004 ; 0.0 ];
+fc_error = [ 3.0 ; 6.0 ];
+cc_error = [ 0.3 ; 0.6 ];
+kc_error = [ 0.003 ; 0.0 ; 0.0 ; 0.0 ; 0.0 ];
+%-- Image size:
+nx = 32;
+ny = 24;
+omc_1 = [ -7.4e-01 ; -3.0e-01 ; 1.4e+00 ];
+Tc_1  = [ -1.428e+02 ; 9.8e+01 ; 1.3e+03 ];
+"""
+
+
+def authors_points(ranges, bearing_deg, p):
+    """The README's formulas of the authors' platform, point by point; their bearing and pitch angle."""
+    b = np.radians(bearing_deg)
+    X, S = ranges * np.sin(b) - 0.038, ranges * np.cos(b) + 0.0045
+    y, z = 0.157 * np.cos(p) + S * np.sin(p), 0.157 * np.sin(p) - S * np.cos(p) + 0.2
+    return np.round(np.stack([X, y, z], axis=-1), 6)
+
+
+def polar(rng, lines=6):
+    """Ranges (whole millimetres), the authors' bearings and pitch of a few scan lines in acquisition order."""
+    rows = [np.arange(*np.sort(rng.choice(np.arange(-300, 301), 2, replace=False)) + [0, 9]) / 10 for _ in range(lines)]
+    ranges = [np.round(1.5 + 0.3 * rng.random(len(row)), 3) for row in rows]
+    return ranges, rows, np.linspace(1.0, 1.4, lines)
+
+
+def write_source(folder, rng):
+    folder.mkdir()
+    for n in (1, 2):
+        ranges, bearings, pitch = polar(rng)
+        points = np.concatenate([authors_points(r, b, p) for r, b, p in zip(ranges, bearings, pitch, strict=True)])
+        header = f"# .PCD v.7\nFIELDS x y z\nPOINTS {len(points)}\nDATA ascii\n"
+        rows = "\n".join(" ".join(f"{v:.6f}" for v in p) for p in points)
+        (folder / f"plane_{n:02d}.pcd").write_text(header + rows)
+    for name in ("left", "right"):
+        (folder / f"Calib_Results_{name}.m").write_text(BOUGUET)
+        for n in (1, 2):
+            cv2.imwrite(str(folder / f"{name}_{n:02d}.png"), rng.integers(0, 255, (24, 32, 3)).astype(np.uint8))
+    return folder
+
+
+@pytest.fixture
+def source(tmp_path):
+    return write_source(tmp_path / "src", np.random.default_rng(1))
+
+
+def test_range_bearing_and_pitch_are_recovered():
+    ranges, rows, angles = polar(np.random.default_rng(0))
+    points = np.concatenate([authors_points(r, b, p) for r, b, p in zip(ranges, rows, angles, strict=True)])
+    grid, bearings, pitch, miss = recover_polar(points)
+    assert grid.shape == (6, 701) and miss < 2e-6
+    np.testing.assert_allclose(np.degrees(bearings[[0, -1]]), [55, 125])
+    np.testing.assert_allclose(pitch, angles - np.pi / 2, atol=1e-6)
+    for line, (r, b) in enumerate(zip(ranges, rows, strict=True)):
+        seen = np.isfinite(grid[line])
+        np.testing.assert_allclose(np.degrees(bearings[seen]), 90 - b[::-1], atol=1e-9)  # ours ascend to the left
+        np.testing.assert_allclose(grid[line, seen], r[::-1], atol=1e-12)
+
+
+def test_two_scan_lines_at_one_pitch_stay_apart():
+    points = np.concatenate([authors_points(np.full(5, 1.5), np.arange(5) / 10, 1.2) for _ in range(2)])
+    assert recover_polar(points)[0].shape[0] == 2
+
+
+def test_points_of_another_rig_are_refused_with_the_number():
+    points = authors_points(np.full(50, 1.5), np.arange(50) / 10, 1.2)
+    with pytest.raises(SessionError, match=r"cloud 7: rebuilding the points misses by 0\.\d+ mm, more than 0\.01 mm"):
+        recover_polar(points + [0, 0, 0.0004], "cloud 7")
+
+
+def test_bearings_outside_the_sensor_are_refused():
+    with pytest.raises(SessionError, match=r"bearings reach 50\.0 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"):
+        recover_polar(authors_points(np.full(5, 1.5), 39.6 + np.arange(5) / 10, 1.2))
+
+
+def test_the_platform_is_the_authors_one():
+    ranges, bearing, p = np.array([1.2, 1.9]), np.array([-20.0, 13.0]), np.array([1.0, 1.4])
+    ours = lrf_to_platform(polar_to_points(ranges, np.radians(90 - bearing)), p - np.pi / 2, importers.LASERSETERO_HEAD)
+    cloud = importers.LASERSETERO_CLOUD.apply(ours)
+    np.testing.assert_allclose(cloud, [authors_points(*v) for v in zip(ranges, bearing, p, strict=True)], atol=1e-6)
+
+
+def test_import_makes_a_sound_session(source, tmp_path):
+    miss = import_lasersetero(source, tmp_path / "dst")
+    session = open_session(tmp_path / "dst")
+    assert miss < 2e-6 and session.problems == () and session.name == "dst" and session.placements == (1, 2)
+    assert [c.mount for c in session.cameras.values()] == ["platform", "platform"]
+    assert all(c.model is None for c in session.cameras.values())
+    assert session.board.pattern.columns == 8 and session.board.corners is None
+    for record in session.images():
+        assert record.purpose == "board" and np.isnan(record.pitch)
+        original = source / f"{record.camera}_{record.placement:02d}.png"
+        assert record.file.read_bytes() == original.read_bytes()
+
+
+def test_published_intrinsics(source, tmp_path):
+    import_lasersetero(source, tmp_path / "dst", intrinsics="published")
+    session = open_session(tmp_path / "dst")
+    model = session.cameras["left"].model
+    assert (model.fx, model.fy, model.cx, model.cy) == (700.5, 701.5, 15.25, 11.75)
+    np.testing.assert_allclose(np.sqrt(np.diag(model.covariance))[:5], [1, 2, 0.1, 0.2, 0.001])
+    pose = transform_from_json(session.reference["cameras"]["left"]["T_camera_board"]["1"])
+    np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
+    np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
+
+
+def test_wrong_option(source, tmp_path):
+    with pytest.raises(SessionError, match="'own' or 'published', got 'best'"):
+        import_lasersetero(source, tmp_path / "dst", intrinsics="best")
+
+
+@pytest.mark.parametrize("pattern", ["plane_*", "left_*", "Calib_Results_right.m"])
+def test_missing_files(source, tmp_path, pattern):
+    for file in source.glob(pattern):
+        file.unlink()
+    with pytest.raises(SessionError, match=pattern.replace("*", ".*")):
+        import_lasersetero(source, tmp_path / "dst")
+    assert not (tmp_path / "dst").exists()
+
+
+def test_an_existing_session_is_left_alone(source, tmp_path):
+    import_lasersetero(source, tmp_path / "dst")
+    with pytest.raises(SessionError, match="exists already"):
+        import_lasersetero(source, tmp_path / "dst")
+
+
+PCD = {
+    "truncated": lambda text: text[: len(text) // 2].rpartition("\n")[0],
+    "could not convert": lambda text: text.replace("0.", "0,", 40),
+    "ASCII PCD file with the fields x y z": lambda text: text.replace("x y z", "x y z rgb"),
+    "expected an ASCII PCD": lambda text: text.replace("DATA ascii", "DATA binary"),
+}
+
+
+@pytest.mark.parametrize("message", PCD)
+def test_damaged_clouds(source, message):
+    file = source / "plane_01.pcd"
+    file.write_text(PCD[message](file.read_text()))
+    with pytest.raises(SessionError, match=message):
+        read_pcd(file)
+
+
+def test_missing_cloud_and_calibration(tmp_path):
+    with pytest.raises(SessionError, match=r"a\.pcd: No such file"):
+        read_pcd(tmp_path / "a.pcd")
+    (tmp_path / "c.m").write_text("fc = [ 1 ; 2 ];\n")
+    with pytest.raises(SessionError, match=r"c\.m: no value of cc, kc"):
+        read_bouguet(tmp_path / "c.m")
+
+
+# ---------------------------------------------------------------------------------------------- command line
+
+
+def test_command_line(source, tmp_path, capsys):
+    target = str(tmp_path / "dst")
+    assert main(["import", "lasersetero", str(source), target, "--intrinsics", "published"]) == 0
+    assert "rebuild to 0.00" in capsys.readouterr().out
+    assert main(["check", target]) == 0
+    (tmp_path / "dst" / "images" / "left" / "0001.png").unlink()
+    assert main(["check", target]) == 1
+    assert "0001.png" in capsys.readouterr().out
+    assert main(["import", "lasersetero", str(source), target]) == 1
+    assert "error: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [[], ["fly"], ["check"], ["check", "a", "--fast"], ["import", "lasersetero", "a"]])
+def test_wrong_commands(words, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert "usage:" in capsys.readouterr().err
+
+
+def test_help_needs_no_heavy_library():
+    code = "import sys; from lrfcal_lib.__main__ import parser; parser(); print('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+
+
+# ---------------------------------------------------------------------------------------------- the real recording
+
+
+def test_the_recording_rebuilds_the_independent_recovery(lms400_session, real_data):
+    session = open_session(lms400_session)
+    assert session.placements == tuple(range(1, 21)) and session.problems == ()
+    for placement in session.placements:
+        sweep = session.sweep(placement)
+        line, beam = np.nonzero(np.isfinite(sweep.ranges[:, ::-1]))  # acquired from left to right of the grid
+        p_lrf = polar_to_points(sweep.ranges[:, ::-1][line, beam], sweep.bearings[::-1][beam])
+        cloud = importers.LASERSETERO_CLOUD.apply(lrf_to_platform(p_lrf, sweep.pitch[line], session.T_head_lrf))
+        raw = np.load(real_data / "lms400_zed" / "raw" / f"pose_{placement:02d}.npz")
+        rays = polar_to_points(raw["range_m"], np.radians(90 - raw["bearing_deg"]))
+        theirs = lrf_to_platform(rays, raw["pitch_rad"] - np.pi / 2, importers.LASERSETERO_HEAD)
+        assert np.linalg.norm(cloud - importers.LASERSETERO_CLOUD.apply(theirs), axis=1).max() < 1e-6
+        published = read_pcd(real_data / "lms400_zed" / f"plane_{placement:02d}.pcd")
+        assert np.linalg.norm(cloud - published, axis=1).max() < 1.5e-6
+
+
+def test_the_recording_alternates_its_sweep_direction(lms400_session):
+    session = open_session(lms400_session)
+    assert [session.sweep_direction(p) for p in session.placements] == [1, -1] * 10

@@ -1,0 +1,276 @@
+"""The least-squares core: convergence, batches, losses, covariances, what is unobservable."""
+
+import time
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_observations, random_board_poses, random_rig
+
+from lrfcal_lib.geometry import DegenerateGeometry
+from lrfcal_lib.solvers.camera import line_block, solve_lines_batch
+from lrfcal_lib.solvers.least_squares import Block, minimise, robust_rho, robust_weights, solve, whiten
+from lrfcal_lib.solvers.observability import null_space, placement_covariance, unobservable_motions
+from lrfcal_lib.solvers.pose import apply_pose, exp_rotation, motion_words, move_pose, pose_array, pose_transform
+
+
+def line_problem(x, y, sigma=1.0):
+    """Straight line y = a x + b for one or many trials, unknowns (a, b)."""
+
+    def evaluate(state):
+        r = state[..., :1] * x + state[..., 1:] - y
+        J = np.broadcast_to(np.stack([x, np.ones_like(x)], -1), r.shape + (2,))
+        return Block(r, J, np.full(r.shape, 1.0 / sigma))
+
+    return evaluate
+
+
+def fit(evaluate, start, **options):
+    settings = dict(names=("slope", "offset"), method="straight line", read=lambda s: (None, s), required=False)
+    return solve(evaluate, start, np.add, **(settings | options))
+
+
+@pytest.fixture
+def data():
+    rng = np.random.default_rng(1)
+    x = np.linspace(-1, 1, 40)
+    return x, 2 * x + 0.5 + rng.normal(0, 0.1, 40)
+
+
+def test_linear_problem_matches_the_normal_equations(data):
+    x, y = data
+    found = fit(line_problem(x, y, 0.1), np.zeros(2))
+    A = np.stack([x, np.ones_like(x)], 1)
+    np.testing.assert_allclose(found.parameters, np.linalg.lstsq(A, y, rcond=None)[0], atol=1e-12)
+    np.testing.assert_allclose(found.covariance, 0.01 * np.linalg.inv(A.T @ A), rtol=1e-9, atol=1e-15)
+    assert found.converged and found.inflation == 1.0
+    assert len(found.cost_history) == found.iterations + 1
+    assert np.all(np.diff(found.cost_history) <= 1e-9)
+
+
+def test_too_small_stated_noise_inflates_the_covariance(data):
+    x, y = data
+    honest, boastful = fit(line_problem(x, y, 0.1), np.zeros(2)), fit(line_problem(x, y, 0.01), np.zeros(2))
+    assert boastful.inflation > 50
+    np.testing.assert_allclose(boastful.sigma, honest.sigma, rtol=0.3)
+
+
+def test_larger_stated_noise_never_shrinks_the_covariance(data):
+    x, y = data
+    assert fit(line_problem(x, y, 1.0), np.zeros(2)).inflation == 1.0
+
+
+def test_batch_equals_single():
+    rng = np.random.default_rng(2)
+    x, y = np.linspace(0, 1, 20), rng.normal(size=(7, 20))
+    batch = fit(line_problem(x, y), np.zeros((7, 2)))
+    for i in range(7):
+        single = fit(line_problem(x, y[i]), np.zeros(2))
+        np.testing.assert_allclose(batch.parameters[i], single.parameters, atol=1e-10)
+        np.testing.assert_allclose(batch.covariance[i], single.covariance, rtol=1e-9)
+    assert batch.converged.shape == (7,) and batch.converged.all()
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_losses_resist_outliers(data, loss):
+    x, y = data
+    y = y.copy()
+    y[::8] += 5.0
+    plain = fit(line_problem(x, y, 0.1), np.zeros(2))
+    robust = fit(line_problem(x, y, 0.1), np.zeros(2), loss=loss, scale="auto")
+    assert abs(plain.parameters[1] - 0.5) > 0.4
+    assert np.abs(robust.parameters - [2, 0.5]).max() < 0.1
+    assert robust.weights[::8].max() < 0.2
+
+
+@pytest.mark.parametrize("loss", [None, "huber", "cauchy"])
+def test_weights_are_the_slope_of_the_loss(loss):
+    z = np.array([0.01, 0.5, 1.0, 1.4, 3.0, 20.0])
+    slope = (robust_rho(z + 1e-6, loss) - robust_rho(z - 1e-6, loss)) / 2e-6
+    np.testing.assert_allclose(robust_weights(z, loss), slope / (2 * z), rtol=1e-6)
+
+
+def test_robust_result_matches_scipy(data):
+    x, y = data
+    y = y + 3.0 * (np.arange(40) % 9 == 0)
+    ours = fit(line_problem(x, y, 0.1), np.zeros(2), loss="cauchy")
+
+    def residual(p):
+        return (p[0] * x + p[1] - y) / 0.1
+
+    theirs = scipy.optimize.least_squares(residual, [0, 0], loss="cauchy", f_scale=2.385, xtol=1e-15, gtol=1e-15)
+    np.testing.assert_allclose(ours.parameters, theirs.x, atol=1e-6)
+
+
+def test_unknown_loss_is_refused(data):
+    with pytest.raises(ValueError, match="unknown loss 'tukey'"):
+        fit(line_problem(*data), np.zeros(2), loss="tukey")
+
+
+def test_start_that_is_not_finite_is_refused(data):
+    with pytest.raises(ValueError, match="not finite"):
+        fit(line_problem(*data), np.array([np.nan, 0.0]))
+
+
+def test_not_converging_is_a_result(data):
+    x, y = data
+
+    def crawling(state):
+        block = line_problem(x, y)(state)
+        return Block(block.residuals, 100 * block.jacobian, block.whitener)
+
+    found = fit(crawling, np.zeros(2), max_iterations=3)
+    assert found.converged is False and found.iterations == 3
+
+
+def test_correlated_whitener_is_generalised_least_squares():
+    rng = np.random.default_rng(3)
+    A, y = rng.normal(size=(12, 2)), rng.normal(size=12)
+    roots = rng.normal(size=(4, 3, 3)) + 2 * np.eye(3)
+    whole = np.zeros((12, 12))
+    for i in range(4):
+        whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = roots[i] @ roots[i].T
+    found = fit(
+        lambda s: Block(A @ s - y, A, np.linalg.inv(np.linalg.cholesky(roots @ roots.swapaxes(1, 2)))), np.zeros(2)
+    )
+    inverse = np.linalg.inv(whole)
+    np.testing.assert_allclose(found.parameters, np.linalg.solve(A.T @ inverse @ A, A.T @ inverse @ y), atol=1e-11)
+
+
+def test_schur_complement_equals_the_dense_solution():
+    rng = np.random.default_rng(4)
+    shared, own, y = rng.normal(size=(5, 9, 2)), rng.normal(size=(5, 9, 3)), rng.normal(size=(5, 9))
+    J = np.concatenate([shared, own], axis=-1)
+
+    def evaluate(state):
+        common, local = state
+        r = shared @ common + (own @ local[..., None])[..., 0] - y
+        return Block(r, J, np.ones_like(r))
+
+    start = (np.zeros(2), np.zeros((5, 3)))
+    options = dict(shared=2, read=lambda s: (None, s[0]))
+    found = solve(evaluate, start, lambda s, d: (s[0] + d[0], s[1] + d[1]), names="ab", method="arrow", **options)
+    dense = np.zeros((45, 17))
+    dense[:, :2] = shared.reshape(45, 2)
+    for i in range(5):
+        dense[9 * i : 9 * i + 9, 2 + 3 * i : 5 + 3 * i] = own[i]
+    np.testing.assert_allclose(found.parameters, np.linalg.lstsq(dense, y.ravel(), rcond=None)[0][:2], atol=1e-11)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(dense.T @ dense)[:2, :2] * found.inflation, rtol=1e-9)
+
+
+def test_placement_covariance_is_the_jackknife():
+    rng = np.random.default_rng(5)
+    A, y, groups = rng.normal(size=(60, 3)), rng.normal(size=60), np.repeat(np.arange(12), 5)
+    estimate = np.linalg.lstsq(A, y, rcond=None)[0]
+    r = A @ estimate - y
+    parts = [(A[groups == g].T @ A[groups == g], A[groups == g].T @ r[groups == g]) for g in range(12)]
+    covariance, shifts = placement_covariance(*(np.array(x) for x in zip(*parts, strict=True)))
+    left_out = [np.linalg.lstsq(A[groups != g], y[groups != g], rcond=None)[0] - estimate for g in range(12)]
+    np.testing.assert_allclose(shifts, left_out, atol=1e-12)
+    np.testing.assert_allclose(covariance, 11 / 12 * sum(np.outer(d, d) for d in left_out), atol=1e-12)
+
+
+def test_placement_covariance_sees_common_errors():
+    rng = np.random.default_rng(6)
+    x, groups = np.linspace(-1, 1, 200), np.repeat(np.arange(20), 10)
+    y = x + np.repeat(rng.normal(0, 1.0, (300, 20)), 10, axis=1)
+    found = fit(line_problem(x, y), np.zeros((300, 2)), groups=groups)
+    true = found.parameters.std(axis=0)
+    assert np.all(true > 2.5 * found.sigma.mean(axis=0))
+    np.testing.assert_allclose(np.sqrt((found.sigma_placements**2).mean(axis=0)), true, rtol=0.2)
+
+
+@pytest.mark.parametrize("groups", [np.zeros(40, int), np.arange(40) // 20])
+def test_no_placement_covariance_from_too_few_placements(data, groups):
+    found = fit(line_problem(*data), np.zeros(2), groups=groups)
+    assert found.covariance_placements is None and found.sigma_placements is None
+
+
+def test_null_space_names_the_lost_direction():
+    rng = np.random.default_rng(7)
+    A = rng.normal(size=(30, 6))
+    A[:, 3] = 0.0
+    directions, values = null_space(A.T @ A, np.ones(6))
+    np.testing.assert_allclose(directions, [[0, 0, 0, 1, 0, 0]], atol=1e-12)
+    assert values[0] < 1e-6
+    words = unobservable_motions(A.T @ A, np.ones(6), lambda d: motion_words(d, "left"), 1.0)
+    assert words == ("translation along x of the left frame",)
+
+
+def test_required_observability_raises_in_words():
+    def evaluate(state):
+        r = np.array([state[0] - 1.0, 2 * state[0]])
+        return Block(r, np.array([[1.0, 0.0], [2.0, 0.0]]), np.ones(2))
+
+    with pytest.raises(DegenerateGeometry, match="do not determine offset"):
+        fit(evaluate, np.zeros(2), required=True)
+    assert fit(evaluate, np.zeros(2)).unobservable == ("offset",)
+
+
+def test_large_residual_problem_converges_where_gauss_newton_diverges():
+    """Dennis and Schnabel's example: at its minimum 0 the curvature is four times what Gauss-Newton sees."""
+
+    def evaluate(state):
+        x = state[0]
+        return Block(np.array([x + 1, -3 * x**2 + x - 1]), np.array([[1.0], [-6 * x + 1]]), np.ones(2))
+
+    state, converged, _, history = minimise(evaluate, np.array([0.1]), np.add, max_iterations=200)
+    assert converged and np.all(np.diff(history) <= 1e-12)
+    assert state[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_thousand_trials_take_less_than_half_a_second():
+    rng = np.random.default_rng(8)
+    rig = random_rig(rng)
+    obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig))
+    points = obs.crossing_points[None] + rng.normal(0, 0.003, (1000, *obs.crossing_points.shape))
+    arguments = (obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model, rig.T_camera_lrf)
+    assert points.shape[1] >= 36
+    best = np.inf
+    for _ in range(3):
+        start = time.perf_counter()
+        found = solve_lines_batch(points, *arguments)
+        best = min(best, time.perf_counter() - start)
+    assert found.converged.all() and best < 0.5
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-7])
+def test_pose_moves_compose_like_transforms(scale):
+    rng = np.random.default_rng(9)
+    T = RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
+    delta = scale * rng.normal(size=6)
+    moved = pose_transform(move_pose(pose_array(T), delta))
+    expected = RigidTransform.from_components(T.translation + delta[3:], Rotation.from_rotvec(delta[:3]) * T.rotation)
+    np.testing.assert_allclose(moved.as_matrix(), expected.as_matrix(), atol=1e-15)
+    p = rng.normal(size=(5, 3))
+    np.testing.assert_allclose(apply_pose(pose_array(T), p), T.apply(p), atol=1e-14)
+    np.testing.assert_allclose(exp_rotation(delta[:3]), Rotation.from_rotvec(delta[:3]).as_matrix(), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "delta, words",
+    [
+        ([0, 0, 0, 0, 0, -1], "translation along z of the right frame"),
+        ([0, 1, 0, 0, 0, 0], "rotation about y of the right frame"),
+        ([0, 0, 0, 1, 1, 0], "translation along (0.71, 0.71, 0.00) of the right frame"),
+        ([1, 0, 0, 0, 1, 0], "rotation about x of the right frame with translation along y"),
+    ],
+)
+def test_motions_in_words(delta, words):
+    assert motion_words(delta, "right") == words
+
+
+def test_corrected_jacobian_is_the_derivative_of_whitened_residuals():
+    rng = np.random.default_rng(10)
+    rig = random_rig(rng)
+    obs = camera_observations(rng, rig, random_board_poses(rng, 6, rig), noise=1.0)
+    pose = pose_array(rig.T_camera_lrf)
+    data = (obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
+    _, J = whiten(line_block(pose, *data))
+    steps = 1e-6 * np.eye(6)
+    numeric = [
+        (whiten(line_block(move_pose(pose, s), *data))[0] - whiten(line_block(move_pose(pose, -s), *data))[0]) / 2e-6
+        for s in steps
+    ]
+    np.testing.assert_allclose(J, np.stack(numeric, -1), atol=1e-5 * np.abs(J).max())

@@ -1,0 +1,399 @@
+"""The tilt axis: the paper's projected fits, the weighted 3D estimate, priors; and errors of the recorded pitch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import (
+    CORNERS,
+    TRIANGLE,
+    camera_observations,
+    edge_sweeps,
+    meet,
+    random_board_poses,
+    random_rig,
+    sweep_boards,
+)
+
+from lrfcal_lib.geometry import (
+    DegenerateGeometry,
+    TiltAxis,
+    axis_difference,
+    axis_of,
+    head_from_axis,
+    head_from_paper,
+    lrf_to_platform,
+    tilt,
+)
+from lrfcal_lib.solvers.least_squares import whiten
+from lrfcal_lib.solvers.pitch_blocks import gather, move_pitch_state, pitch_blocks, pitch_of
+from lrfcal_lib.solvers.pitch_errors import SweepPoints, estimate_pitch_errors
+from lrfcal_lib.solvers.platform import GAUGE, PlatformObservations, PlatformPrior, solve_platform
+from lrfcal_lib.solvers.platform_blocks import (
+    move_head,
+    move_platform,
+    platform_blocks,
+    prepare_boards,
+    prior_terms,
+)
+from lrfcal_lib.solvers.pose import pose_array
+from lrfcal_lib.solvers.projected import projected_block, solve_projected
+
+AXIS = TiltAxis(
+    np.array([0.9993, 0.02, -0.0317]) / np.linalg.norm([0.9993, 0.02, -0.0317]), np.array([0.0, -0.05, -0.12])
+)
+
+TRUTH = head_from_axis(AXIS)
+AXIS = axis_of(TRUTH)
+ROUGH = RigidTransform.from_components([0.0, 0.03, 0.10], Rotation.identity())
+SIDES = (0, 2)
+
+
+def make(seed=0, count=20, turn=0.7, **options):
+    rng = np.random.default_rng(seed)
+    boards = sweep_boards(rng, count, turn)
+    return PlatformObservations(**edge_sweeps(rng, TRUTH, boards, TRIANGLE, edges=SIDES, **options)), boards
+
+
+def chart_error(T):
+    """Error in the chart (w_y, w_z, v_y, v_z)."""
+    turn = (T * TRUTH.inv()).rotation.as_rotvec()
+    return np.r_[turn[1:], (T.translation - TRUTH.translation)[1:]]
+
+
+def test_synthetic_sweeps_lie_on_the_boards():
+    obs, boards = make(1)
+    p = lrf_to_platform(obs.points, obs.pitch, TRUTH)
+    for index, board in enumerate(boards):
+        on_board = board.inv().apply(p[obs.placement == index + 1])
+        assert np.abs(on_board[:, 2]).max() < 1e-12
+    assert np.abs(obs.points[:, 2]).max() < 1e-12
+
+
+@pytest.mark.parametrize("use_face", [True, False])
+@pytest.mark.parametrize("T0", [None, ROUGH])
+def test_3d_fits_recover_exact_data(use_face, T0):
+    obs, _ = make(2)
+    found = solve_platform(obs, T0, use_face=use_face)
+    angle, offset = axis_difference(found.axis, AXIS)
+    assert found.converged and angle < 1e-9 and offset < 1e-9
+    assert np.abs(found.skew).max() < 1e-9 and np.abs(found.gap).max() < 1e-9
+    assert found.gauge == GAUGE and found.unobservable == () and found.skipped == {}
+
+
+def test_projected_fits_recover_exact_data():
+    obs, _ = make(3)
+    found = solve_projected(obs, ROUGH)
+    angle, offset = axis_difference(found.axis, AXIS)
+    assert found.converged and angle < 1e-9 and offset < 1e-9
+
+
+@pytest.mark.parametrize("solve", [solve_platform, solve_projected])
+def test_the_paper_parameters_give_back_the_axis(solve):
+    found = solve(make(4)[0], ROUGH)
+    angle, offset = axis_difference(axis_of(head_from_paper(found.phi, found.ty)), AXIS)
+    assert angle < 1e-9 and offset < 1e-9
+
+
+@pytest.mark.parametrize("solve", [solve_platform, solve_projected])
+def test_the_gauge_of_the_start_changes_nothing(solve):
+    obs, _ = make(5, noise=0.3)
+    turned = RigidTransform.from_components([0.4, 0, 0], Rotation.from_rotvec([0.3, 0, 0])) * ROUGH
+    a, b = solve(obs, ROUGH), solve(obs, turned)
+    np.testing.assert_allclose(a.T_head_lrf.as_matrix(), b.T_head_lrf.as_matrix(), atol=1e-7)
+
+
+def test_projected_jacobian_against_a_numeric_one():
+    obs, _ = make(6, noise=1.0)
+    head = pose_array(ROUGH)
+    groups = [(p, *(np.flatnonzero((obs.placement == p) & (obs.edge == e)) for e in (1, 2))) for p in range(1, 21)]
+    block = projected_block(head, obs, groups)
+    for k, step in enumerate(1e-6 * np.eye(4)):
+        high, low = (projected_block(move_head(head, s), obs, groups).residuals for s in (step, -step))
+        np.testing.assert_allclose(block.jacobian[:, k], (high - low) / 2e-6, rtol=1e-5, atol=1e-6)
+
+
+def test_level_edges_are_reported_not_divided_by_zero():
+    rng = np.random.default_rng(7)
+    upright = Rotation.from_euler("x", 90, degrees=True)
+    boards = sweep_boards(rng, 8) + [RigidTransform.from_components([0.0, 1.5, 0.0], upright)]
+    obs = PlatformObservations(**edge_sweeps(rng, TRUTH, boards, TRIANGLE, edges=SIDES))
+    found = solve_projected(obs, TRUTH)
+    assert "parallel to the x" in found.skipped[9]
+    assert axis_difference(found.axis, AXIS)[1] < 1e-9
+    level = PlatformObservations(**edge_sweeps(rng, TRUTH, boards[-1:], TRIANGLE, edges=SIDES))
+    with pytest.raises(DegenerateGeometry, match="projected fits: no placement can be used.*parallel to the x"):
+        solve_projected(level, TRUTH)
+
+
+def blocks_at(state, data, prior):
+    return platform_blocks(state, data, (0.01, 0.005, 1e-3), prior)
+
+
+def test_platform_jacobians_against_numeric_ones():
+    obs, _ = make(8, count=4, noise=1.0)
+    data, boards, _ = prepare_boards(obs, ROUGH, True)
+    prior = PlatformPrior(TRUTH, 0.01, 0.02)
+    state = (pose_array(ROUGH), boards, np.full((4, 2), 0.02))
+    base = blocks_at(state, data, prior)
+    for k in range(12):
+        step = np.zeros(12)
+        step[k] = 1e-6
+        high, low = (
+            blocks_at(move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), data, prior) for s in (step, -step)
+        )
+        for b, h, lo in zip(base, high, low, strict=True):
+            used = np.broadcast_to(b.whitener != 0 if b.size == 1 else True, b.residuals.shape)
+            numeric = (h.residuals - lo.residuals) / 2e-6
+            np.testing.assert_allclose(b.jacobian[..., k][used], numeric[used], atol=2e-6)
+
+
+def test_platform_gradient_includes_the_noise():
+    obs, _ = make(9, count=3, noise=1.0)
+    data, boards, _ = prepare_boards(obs, TRUTH, True)
+    state = (pose_array(TRUTH), boards, np.zeros((3, 2)))
+
+    def cost(step):
+        blocks = platform_blocks(move_platform(state, (step, np.zeros((3, 8)))), data, (0.01, 0.005, 0.0), None)
+        return 0.5 * sum(np.sum(whiten(b)[0] ** 2) for b in blocks)
+
+    blocks = platform_blocks(state, data, (0.01, 0.005, 0.0), None)
+    gradient = sum(np.einsum("pn,pnk->k", *whiten(b))[:4] for b in blocks)
+    numeric = [(cost(s) - cost(-s)) / 2e-6 for s in 1e-6 * np.eye(4)]
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_prior_jacobian_against_a_numeric_one():
+    prior, head = PlatformPrior(TRUTH, 0.01, 0.02), pose_array(ROUGH)
+    _, J = prior_terms(head, prior)
+    for k, step in enumerate(1e-6 * np.eye(4)):
+        numeric = (prior_terms(move_head(head, step), prior)[0] - prior_terms(move_head(head, -step), prior)[0]) / 2e-6
+        np.testing.assert_allclose(J[:, k], numeric, atol=1e-8)
+
+
+def test_projected_fits_agree_with_scipy():
+    obs, _ = make(10, noise=0.5)
+    groups = [(p, *(np.flatnonzero((obs.placement == p) & (obs.edge == e)) for e in (1, 2))) for p in range(1, 21)]
+    found = solve_projected(obs, ROUGH)
+    groups = [g for g in groups if g[0] in found.placements]
+    start = pose_array(found.T_head_lrf)
+    theirs = scipy.optimize.least_squares(
+        lambda d: projected_block(move_head(start, d), obs, groups).residuals, np.zeros(4), xtol=1e-15, gtol=1e-15
+    )
+    np.testing.assert_allclose(theirs.x, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("use_face", [True, False])
+def test_error_agrees_with_the_predicted_covariance(use_face):
+    rng = np.random.default_rng(11)
+    boards, scores, errors = sweep_boards(rng, 20), [], []
+    for _ in range(60):
+        obs = PlatformObservations(**edge_sweeps(rng, TRUTH, boards, TRIANGLE, edges=SIDES, noise=1.0))
+        found = solve_platform(obs, ROUGH, use_face=use_face, sigma_skew=1e-4, sigma_gap=1e-4)
+        e = chart_error(found.T_head_lrf)
+        scores.append(e @ np.linalg.solve(found.covariance, e) / 4)
+        errors.append(e / np.sqrt(np.diag(found.covariance)))
+    assert 0.7 < np.mean(scores) < 1.35
+    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(60)
+
+
+def test_weighted_3d_fits_beat_projected_ones():
+    rng, errors = np.random.default_rng(12), {solve_platform: [], solve_projected: []}
+    boards = sweep_boards(rng, 20)
+    for _ in range(12):
+        obs = PlatformObservations(**edge_sweeps(rng, TRUTH, boards, TRIANGLE, edges=SIDES, noise=1.0))
+        for solve in errors:
+            errors[solve].append(chart_error(solve(obs, ROUGH).T_head_lrf))
+    rms = {solve: np.sqrt(np.mean(np.square(e), axis=0)) for solve, e in errors.items()}
+    assert np.all(rms[solve_platform] < 0.75 * rms[solve_projected])
+
+
+def test_a_prior_pulls_with_its_weight():
+    obs, _ = make(13, count=4, noise=1.0)
+    off = RigidTransform.from_components([0, 0.01, -0.01], Rotation.from_rotvec([0, 0.01, 0.01])) * TRUTH
+    tight = solve_platform(obs, prior=PlatformPrior(off, 1e-7, 1e-7))
+    assert axis_difference(tight.axis, axis_of(off))[1] < 1e-6
+    loose = solve_platform(obs, prior=PlatformPrior(off, 1e3, 1e3))
+    free = solve_platform(obs, ROUGH)
+    np.testing.assert_allclose(loose.T_head_lrf.as_matrix(), free.T_head_lrf.as_matrix(), atol=1e-6)
+    assert tight.sigma_offset < 1e-6 < solve_platform(obs, prior=PlatformPrior(TRUTH, 0.01, 0.01)).sigma_offset
+
+
+def test_one_edge_with_a_face_serves_too():
+    obs, _ = make(14)
+    keep = (obs.edge == 1) | (obs.placement > 10)
+    parts = {f: getattr(obs, f)[keep] for f in ("points", "covariance", "pitch", "placement", "edge")}
+    lone = replace(obs, **parts)
+    found = solve_platform(lone, ROUGH)
+    assert len(found.placements) == 20 and axis_difference(found.axis, AXIS)[1] < 1e-9
+    without = solve_platform(lone, ROUGH, use_face=False)
+    assert set(without.skipped) == set(range(1, 11)) and "no points on the face" in without.skipped[1]
+
+
+def test_parallel_edges_are_skipped_with_the_reason():
+    rng = np.random.default_rng(15)
+    obs = PlatformObservations(**edge_sweeps(rng, TRUTH, sweep_boards(rng, 3), CORNERS, edges=(1, 3)))
+    with pytest.raises(DegenerateGeometry, match="nearly parallel"):
+        solve_platform(obs, ROUGH)
+
+
+def test_pitch_that_never_changes_leaves_the_axis_open():
+    obs, _ = make(16)
+    flat = replace(obs, pitch=0 * obs.pitch, face_pitch=0 * obs.face_pitch)
+    with pytest.raises(DegenerateGeometry, match="do not determine .*the axis"):
+        solve_platform(flat, ROUGH)
+    found = solve_platform(flat, ROUGH, required=False)
+    assert any("offset of the axis" in words for words in found.unobservable)
+
+
+def test_one_placement_leaves_the_axis_open_or_uncertain():
+    obs, _ = make(17, count=1, noise=1.0)
+    found = solve_platform(obs, ROUGH, required=False)
+    assert found.covariance_placements is None
+    assert found.unobservable or found.sigma_offset > 0.02
+
+
+@pytest.mark.parametrize("field", ["points", "pitch", "face_points"])
+def test_values_that_are_not_finite_are_refused(field):
+    obs, _ = make(18, count=2)
+    values = getattr(obs, field).copy()
+    values[0] = np.nan
+    with pytest.raises(ValueError, match=f"{field} holds . values that are not finite"):
+        replace(obs, **{field: values})
+
+
+def test_unknown_edges_are_refused():
+    obs, _ = make(19, count=2)
+    with pytest.raises(ValueError, match="edge must be 1 or 2"):
+        replace(obs, edge=obs.edge + 1)
+
+
+# Errors of the recorded pitch
+
+
+def pitched(seed, offset, stretch, *, count=24, noise=0.0, cameras=("left",)):
+    """Sweeps whose recorded pitch is the true one minus an error, and cameras on the base."""
+    rng = np.random.default_rng(seed)
+    rig = random_rig(rng)
+    poses = random_board_poses(rng, count, rig, spread=0.7)
+    obs = camera_observations(rng, rig, poses, noise=0.0, source="platform", face=80)
+    points, pitch = meet(obs.plane_points, TRUTH)
+    middle = np.array([pitch[obs.plane_placement == p].mean() for p in range(1, count + 1)])
+
+    def recorded(true, placement):
+        m, o, s = (np.broadcast_to(x, count)[placement - 1] for x in (middle, offset, stretch))
+        return m + (true - m - o) / (1 + s)
+
+    def ranged(p):
+        return p + noise * rng.normal(size=(len(p), 1)) * p / np.linalg.norm(p, axis=1, keepdims=True)
+
+    crossings, at = meet(obs.crossing_points, TRUTH)
+    crossings = lrf_to_platform(ranged(crossings), recorded(at, obs.crossing_placement), TRUTH)
+    direction = {p: 1 if p % 2 else -1 for p in range(1, count + 1)}
+    middles = dict(enumerate(middle, start=1))
+    pitch = recorded(pitch, obs.plane_placement)
+    sweeps = SweepPoints(ranged(points), pitch, obs.plane_placement, TRUTH, direction, middles)
+    return rig, sweeps, {name: replace(obs, crossing_points=crossings) for name in cameras}
+
+
+def test_pitch_of_platform_points():
+    obs, _ = make(30, count=6)
+    p = lrf_to_platform(obs.points, obs.pitch, TRUTH)
+    np.testing.assert_allclose(pitch_of(p, TRUTH, obs.pitch + 0.2), obs.pitch, atol=1e-12)
+    assert np.isnan(pitch_of(np.array([[0.0, 0.001, 0.0]]), TRUTH, np.zeros(1))).all()
+
+
+@pytest.mark.parametrize("use_edges", [True, False])
+def test_direction_offset_is_recovered_and_asked_for(use_edges):
+    sign = np.where(np.arange(1, 25) % 2 == 1, 1.0, -1.0)
+    _, sweeps, cameras = pitched(20, np.radians(0.3) * sign, 0.0, noise=0.003)
+    found = estimate_pitch_errors(sweeps, cameras, use_edges=use_edges)
+    assert np.degrees(found.direction_offset) == pytest.approx(0.3, abs=0.03)
+    assert np.isnan(found.models["none"].edge_rms["left"]) != use_edges
+    assert abs(found.direction_offset - np.radians(0.3)) < 4 * found.direction_sigma
+    assert found.wanted == "direction" and found.models["direction"].p_value < 1e-6
+    assert found.models["direction"].misfit < found.models["none"].misfit
+
+
+def test_an_honest_platform_asks_for_nothing():
+    wanted, scores = [], []
+    for seed in range(100, 120):
+        _, sweeps, cameras = pitched(seed, 0.0, 0.0, noise=0.003)
+        found = estimate_pitch_errors(sweeps, cameras)
+        wanted.append(found.wanted)
+        scores.append(found.direction_offset / found.direction_sigma)
+    assert wanted.count("none") >= 18
+    assert 0.4 < np.std(scores) < 1.6
+
+
+def test_a_common_offset_cannot_be_seen():
+    """It turns the platform frame; the cameras' poses take it up."""
+    rig, sweeps, cameras = pitched(22, np.radians(1.0), 0.0)
+    found = estimate_pitch_errors(sweeps, cameras)
+    assert abs(found.direction_offset) < 1e-8
+    T = found.models["none"].transforms["left"]
+    turned = rig.T_camera_lrf * RigidTransform.from_rotation(Rotation.from_rotvec([np.radians(1.0), 0, 0]))
+    np.testing.assert_allclose(T.as_matrix(), turned.as_matrix(), atol=1e-7)
+
+
+def test_offsets_and_stretches_of_single_sweeps_are_recovered():
+    rng = np.random.default_rng(23)
+    offset, stretch = np.radians(rng.normal(0, 0.3, 24)), rng.normal(0, 0.03, 24)
+    _, sweeps, cameras = pitched(24, offset - offset.mean(), stretch, cameras=("left", "right"))
+    found = estimate_pitch_errors(sweeps, cameras)
+    model = found.models["sweep_stretch"]
+    assert found.wanted == "sweep_stretch" and model.converged
+    assert np.degrees(np.abs(model.offset - offset + offset.mean())).max() < 0.02
+    assert np.abs(model.stretch - stretch).max() < 0.003
+
+
+@pytest.mark.parametrize("name", ["none", "direction", "sweep", "sweep_stretch"])
+def test_pitch_jacobians_against_numeric_ones(name):
+    _, sweeps, cameras = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))
+    data = gather(sweeps, cameras, 20)
+    pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
+    state = (np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03))
+    base = pitch_blocks(state, data, name, 0.003, 0.003)
+    own = {"sweep": 1, "sweep_stretch": 2}.get(name, 0)
+    shared = base[0].jacobian.shape[-1] - own
+    for k in range(shared + own):
+        step = np.zeros(shared + own)
+        step[k] = 1e-6
+        high, low = (
+            pitch_blocks(
+                move_pitch_state(state, (s[:shared], np.tile(s[shared:], (5, 1))), name), data, name, 0.003, 0.003
+            )
+            for s in (step, -step)
+        )
+        for b, h, lo in zip(base, high, low, strict=True):
+            np.testing.assert_allclose(b.jacobian[..., k], (h.residuals - lo.residuals) / 2e-6, atol=1e-7)
+
+
+def test_corrected_pitch_makes_the_scans_fit():
+    sign = np.where(np.arange(1, 25) % 2 == 1, 1.0, -1.0)
+    rig, sweeps, cameras = pitched(26, np.radians(0.3) * sign, 0.0)
+    found = estimate_pitch_errors(sweeps, cameras)
+    change = np.degrees(found.models["direction"].offset)[sweeps.placement - 1]
+    p = tilt(sweeps.T_head_lrf.apply(sweeps.points), sweeps.pitch + np.radians(change))
+    boards = cameras["left"].board_poses[sweeps.placement - 1]
+    q = found.models["direction"].transforms["left"].apply(p)
+    assert np.abs(np.sum(boards[:, :3, 2] * (q - boards[:, :3, 3]), axis=1)).max() < 1e-9
+
+
+def test_sweeps_all_one_way_have_no_direction_offset():
+    _, sweeps, cameras = pitched(27, 0.0, 0.0)
+    found = estimate_pitch_errors(replace(sweeps, direction=dict.fromkeys(sweeps.direction, 1)), cameras)
+    assert np.isnan(found.direction_offset) and "direction" not in found.models
+
+
+def test_pitch_errors_need_cameras_on_the_base():
+    _, sweeps, cameras = pitched(28, 0.0, 0.0)
+    with pytest.raises(ValueError, match="source 'lrf'"):
+        estimate_pitch_errors(sweeps, {"left": replace(cameras["left"], source="lrf")})
+    with pytest.raises(DegenerateGeometry, match="3 placements seen by the LRF"):
+        estimate_pitch_errors(sweeps, {"left": cameras["left"].select([1, 2, 3])})
+    broken = replace(sweeps, pitch=np.where(np.arange(len(sweeps.pitch)) == 3, np.nan, sweeps.pitch))
+    with pytest.raises(ValueError, match="not finite"):
+        estimate_pitch_errors(broken, cameras)

@@ -1,0 +1,61 @@
+"""TiM561 with a camera: three lines on a target, scanned in 23 poses; the pure point-on-line constraint."""
+
+import numpy as np
+import pytest
+import scipy.io
+from synthetic import bare_observations
+
+from lrfcal_lib.camera import CameraModel, line_through
+from lrfcal_lib.solvers import edge_residuals_px, find_outlying_placements, solve_lines, solve_wasielewski_strauss
+from lrfcal_lib.solvers.start import start_from_lines
+
+
+@pytest.fixture(scope="module")
+def obs(real_data):
+    folder = real_data / "tim561_lines"
+    points, lines = [], []
+    for frame in range(23):
+        ends = scipy.io.loadmat(folder / "image_data" / f"calibrationImage{frame:04d}.mat")["imgLines"]
+        hits = scipy.io.loadmat(folder / "scan_data" / f"scan{frame}.mat")["scanPoints"]
+        for n in range(3):  # column n belongs to row 4 - n (both from 1); x, 0, z turns into our x, y, 0
+            points.append([hits[0, n], hits[2, n], 0.0])
+            lines.append(line_through(ends[2 - n, :2], ends[2 - n, 2:]))
+    return bare_observations(
+        CameraModel(1280, 1024, 726.928, 780.887, 641.600, 476.630),
+        crossing_points=np.array(points),
+        crossing_covariance=np.tile(np.diag([1e-4, 1e-4, 0.0]), (69, 1, 1)),
+        crossing_lines=np.array(lines),
+        crossing_line_sigma=np.ones(69),
+        crossing_placement=np.repeat(np.arange(23), 3),
+        crossing_edge=np.tile(["1", "2", "3"], 23),
+        crossing_across=np.zeros(69, bool),
+    )
+
+
+def rms_px(obs, solution):
+    return np.sqrt(np.mean(edge_residuals_px(obs, solution.transform) ** 2))
+
+
+@pytest.mark.parametrize("frames, expected", [(20, 3.528), (23, 3.845)])
+def test_line_constraint_reaches_the_reference(obs, frames, expected):
+    some = obs.select(range(frames))
+    found = solve_lines(some, weighted=False)
+    assert found.converged and rms_px(some, found) == pytest.approx(expected, abs=1e-3)
+
+
+def test_it_starts_without_a_guess(obs):
+    some = obs.select(range(20))
+    start = start_from_lines(some)
+    assert np.linalg.norm(start.translation - [0.106, 0.0, -0.032]) < 0.05
+
+
+def test_weighted_and_spatial_variants_stay_near(obs):
+    some = obs.select(range(20))
+    assert rms_px(some, solve_lines(some)) < 4.1
+    assert rms_px(some, solve_wasielewski_strauss(some)) < 4.1
+
+
+def test_frame_21_is_flagged(obs):
+    report = find_outlying_placements(obs, "lines")
+    assert report.outlying == (21,)
+    assert report.rms[21] == report.rms.max()

@@ -1,0 +1,517 @@
+"""The board in a sweep and its edges, against scans made by intersecting rays with planes."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from matplotlib.path import Path as Polygon
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.board import Board, triangle_board
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.board_scan import fit_lines
+from lrfcal_lib.preprocess.sides import straight_runs
+from lrfcal_lib.session import Sweep, open_session
+
+HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
+SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
+               ("left", "top"))  # fmt: skip
+
+
+def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):
+    """``T_platform_board`` of a board that faces the sensor (its y axis down), turned about two axes."""
+    upright = Rotation.from_matrix(np.array([[1, 0, 0], [0, 0, 1.0], [0, -1, 0]]))
+    rotation = upright * Rotation.from_euler("ZX", [roll, tilt], degrees=True)
+    return RigidTransform.from_components(np.array([x, distance, 0.0]) - rotation.apply([*centre, 0]), rotation)
+
+
+@dataclass
+class Scene:
+    """What one sweep sees; `on` is the truth about every beam."""
+
+    sweep: Sweep
+    on: np.ndarray
+    pose: RigidTransform
+    board: Board
+
+    def edge_errors(self, edges):
+        """Distance of the edge points from the nearest true edge (outwards positive), and which edge that is."""
+        p = self.pose.inv().apply(lrf_to_platform(edges.points, edges.pitch, HEAD))
+        lines = self.board.lines()
+        distance = p[:, :2] @ lines[:, :2].T + lines[:, 2]
+        nearest = np.abs(distance).argmin(axis=1)
+        return distance[np.arange(len(p)), nearest], nearest
+
+    def in_lrf(self, vectors, pitch):
+        """Directions given in the board frame as the LRF sees them at a pitch."""
+        at_head = Rotation.from_euler("x", -pitch[:, None]).apply(self.pose.rotation.apply(vectors))
+        return HEAD.rotation.inv().apply(at_head)
+
+    def normals(self, edge, pitch):
+        """Outward normals of edges in the LRF frame at a pitch."""
+        return self.in_lrf(np.column_stack([self.board.lines()[edge, :2], 0 * pitch]), pitch)
+
+
+def scene(
+    board=SQUARE, pose=None, step=0.25, view=(55, 125), pitch=(-20, 20), pitch_step=0.25, wall=3.5, sigma=0.0, seed=0
+):  # fmt: skip
+    """Rays against a board in front of a wall (None: nothing behind it)."""
+    pose = facing() if pose is None else pose
+    bearings = np.radians(np.arange(view[0], view[1] + step / 2, step))
+    pitches = np.radians(np.arange(pitch[0], pitch[1] + 1e-9, pitch_step)) if np.ndim(pitch) else np.radians([pitch])
+    grid = np.repeat(pitches[:, None], len(bearings), axis=1)
+    origin = lrf_to_platform(np.zeros(grid.shape + (3,)), grid, HEAD)
+    rays = lrf_to_platform(polar_to_points(np.ones(grid.shape), bearings), grid, HEAD) - origin
+    normal, offset = pose.rotation.apply([0, 0, 1.0]), pose.rotation.apply([0, 0, 1.0]) @ pose.translation
+    ranges = (offset - origin @ normal) / (rays @ normal)
+    hits = pose.inv().apply((origin + ranges[..., None] * rays).reshape(-1, 3))[:, :2]
+    on = (Polygon(board.corners).contains_points(hits).reshape(grid.shape)) & (ranges > 0)
+    behind = np.full(grid.shape, np.nan) if wall is None else (wall - origin[..., 1]) / rays[..., 1]
+    ranges = np.where(on, ranges, behind) + sigma * np.random.default_rng(seed).standard_normal(grid.shape)
+    return Scene(Sweep(1, ranges, bearings, pitches, np.full(len(pitches), np.nan)), on, pose, board)
+
+
+def spoiled(s, ranges):
+    return replace(s, sweep=replace(s.sweep, ranges=ranges))
+
+
+def found(s, **options):
+    return scan.find_board(s.sweep, s.board, HEAD, **options)
+
+
+# ---------------------------------------------------------------------------------------------- finding the board
+
+
+@pytest.mark.parametrize("wall", [None, 3.5, 1.9])
+def test_the_board_and_nothing_else_is_found(wall):
+    s = scene(wall=wall, sigma=0.004)
+    b = found(s)
+    assert np.mean(b.mask != s.on) < 1e-4
+    normal = s.pose.rotation.apply([0, 0, 1.0])
+    assert abs(b.normal @ normal) > np.cos(1e-3)
+    assert b.sigma_range == pytest.approx(0.004, rel=0.05)
+
+
+def test_nothing_need_be_known_about_board_or_platform():
+    s = scene(sigma=0.004)
+    assert np.mean(scan.find_board(s.sweep).mask != s.on) < 1e-3
+
+
+def test_the_nearest_of_two_boards_is_taken():
+    near, far = scene(), scene(pose=facing(2.6), wall=None)
+    apart = scene(pose=facing(1.2, x=-0.5), wall=None)
+    assert np.mean(found(spoiled(near, np.fmin(near.sweep.ranges, far.sweep.ranges))).mask != near.on) < 0.01
+    both = np.fmin(near.sweep.ranges, apart.sweep.ranges)
+    assert np.mean(found(spoiled(apart, both)).mask != apart.on) < 1e-3
+
+
+def test_a_small_thing_in_front_of_the_board_is_not_the_board():
+    s = scene()
+    ranges = s.sweep.ranges.copy()
+    ranges[10:16, 100:110] = 0.6
+    assert np.mean(found(spoiled(s, ranges)).mask != s.on) < 0.01
+
+
+def test_a_board_that_stands_on_the_floor_is_cut_out_of_it():
+    s = scene(pose=facing(roll=0.0, tilt=10.0), wall=None, sigma=0.003)
+    down = np.radians(np.arange(-20, 20.1, 0.25))[:, None]
+    lowest = (s.pose.apply([[0.4, 0.7, 0.0]]))[0, 2]
+    origin = lrf_to_platform(np.zeros((len(down), 1, 3)), down, HEAD)
+    rays = lrf_to_platform(polar_to_points(np.ones((len(down), 1)), s.sweep.bearings), down, HEAD) - origin
+    with np.errstate(divide="ignore"):
+        floor = (lowest - origin[..., 2]) / rays[..., 2]
+    ranges = np.fmin(s.sweep.ranges, np.where((floor > 0) & (floor < 6), floor, np.nan))
+    b = found(spoiled(s, ranges))
+    assert np.mean(b.mask & ~s.on) < 0.01 and np.mean(s.on & ~b.mask) < 0.005
+
+
+MISSING = {
+    "no return in 161 scan lines": lambda s: np.full_like(s.sweep.ranges, np.nan),
+    r"no flat surface of the board's size; seen: .* m2": lambda s: np.where(s.on, np.nan, s.sweep.ranges),
+    "no flat surface of the board's size; seen: no flat": lambda s: np.random.default_rng(0).uniform(1, 90, s.on.shape),
+}
+
+
+@pytest.mark.parametrize("message", MISSING)
+def test_no_board_is_said_with_what_was_seen(message):
+    s = scene(wall=3.5)
+    ranges = MISSING[message](s)
+    with pytest.raises(scan.BoardNotFound, match="placement 1: " + message):
+        found(spoiled(s, ranges))
+
+
+def test_a_board_of_another_size_is_not_taken():
+    with pytest.raises(scan.BoardNotFound, match=r"seen: 0\.5\d m2"):
+        scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
+
+
+# ---------------------------------------------------------------------------------------------- filter and fit
+
+
+def test_pieces_end_at_jumps_gaps_and_lines():
+    ranges = np.array([[1.0, 1.01, 2.0, 2.0, np.nan, 2.0], [2.0, np.nan, np.nan, 2.0, 2.5, 2.5]])
+    assert scan.segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
+    assert scan.segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
+    assert (scan.segments(np.full((2, 3), np.nan)) == -1).all()
+
+
+def test_median_filter_is_the_median_of_what_exists():
+    rng = np.random.default_rng(0)
+    ranges = rng.random((7, 30))
+    ranges[rng.random(ranges.shape) < 0.2] = np.nan
+    mask = rng.random(ranges.shape) < 0.8
+    out = scan.median_filter(ranges, mask, 5)
+    taken = np.where(mask, ranges, np.nan)
+    for line, beam in np.ndindex(ranges.shape):
+        if np.isfinite(taken[line, beam]):
+            assert out[line, beam] == np.nanmedian(taken[line, max(beam - 2, 0) : beam + 3])
+        else:
+            assert np.isnan(out[line, beam])
+    np.testing.assert_array_equal(scan.median_filter(ranges, width=1), ranges)
+    assert np.isnan(scan.median_filter(np.full((2, 3), np.nan))).all()
+
+
+@pytest.mark.parametrize("width", [0, 4, -1])
+def test_median_filter_needs_an_odd_width(width):
+    with pytest.raises(ValueError, match=f"odd and positive, got {width}"):
+        scan.median_filter(np.ones((1, 5)), width=width)
+
+
+def test_lines_are_fitted_exactly_and_outliers_do_not_count():
+    bearings = np.radians(np.arange(60, 121, 0.5))
+    truth = np.array([[0.1, 0.5], [-0.3, 0.7], [0.0, 0.4]])
+    ranges = 1 / (truth @ np.stack([np.cos(bearings), np.sin(bearings)]))
+    lines, _ = fit_lines(ranges, bearings)
+    np.testing.assert_allclose(lines, truth, atol=1e-12)
+    ranges[:, ::9] += 0.3
+    np.testing.assert_allclose(fit_lines(ranges, bearings)[0], truth, atol=1e-6)
+    ranges[1, 3:] = np.nan
+    assert np.isnan(fit_lines(ranges, bearings)[0][1]).all()
+
+
+def test_the_covariance_of_a_fitted_line_is_what_it_scatters():
+    bearings, rng = np.radians(np.arange(80, 101, 1.0)), np.random.default_rng(0)
+    exact = 1 / (np.array([0.1, 0.5]) @ np.stack([np.cos(bearings), np.sin(bearings)]))
+    lines, information = fit_lines(exact + 0.01 * rng.standard_normal((4000, len(bearings))), bearings)
+    predicted = np.median(np.linalg.inv(information), axis=0) * 0.01**2
+    np.testing.assert_allclose(np.cov(lines.T), predicted, rtol=0.2, atol=0.02 * predicted.max())
+
+
+def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
+    s = scene(sigma=0.004)
+    ranges = s.sweep.ranges.copy()
+    rows = np.flatnonzero(s.on.any(axis=1))
+    last = ranges.shape[1] - 1 - s.on[rows, ::-1].argmax(axis=1)
+    ranges[rows, last + 1] = 0.5 * (ranges[rows, last] + ranges[rows, last + 2])
+    b = found(spoiled(s, ranges))
+    assert len(rows) * 0.95 <= b.n_jump_points <= len(rows) * 1.1
+    before, after = scan.count_jump_points(b)
+    assert before == b.n_jump_points and after < 0.05 * before
+    profile = scan.edge_profile(b, rows[30], +1, 10)
+    assert len(profile.bearings) == 21
+    assert np.isfinite(profile.fitted[:11]).all() and np.isnan(profile.fitted[11:]).all()
+    assert abs(profile.original[11] - profile.original[10]) > 0.3
+    assert np.abs(profile.filtered[:11] - profile.fitted[:11]).max() < 0.02
+    with pytest.raises(ValueError, match="scan line 0 of placement 1 does not hit the board"):
+        scan.edge_profile(b, 0)
+
+
+# ---------------------------------------------------------------------------------------------- edges
+
+
+def outward(s, variant, function=scan.edge_points):
+    """Errors of the edge points of the sides that were found, in millimetres across the edge, and the edges."""
+    e = function(found(s), variant)
+    error, edge = s.edge_errors(e)
+    good = e.side >= 0
+    return 1000 * error[good], edge[good], e
+
+
+def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside():
+    errors = {"half_step": [], "last_beam": []}
+    for roll in np.linspace(5, 14, 7):
+        s = scene(pose=facing(roll=roll))
+        for variant, found_errors in errors.items():
+            found_errors.append(outward(s, variant)[0])
+    half, last = (np.concatenate(errors[v]) for v in ("half_step", "last_beam"))
+    spacing = 1000 * 1.65 * np.radians(0.25)
+    assert abs(half.mean()) < 0.05 * spacing
+    assert -0.6 * spacing < last.mean() < -0.4 * spacing
+    assert np.abs(half).max() < 0.7 * spacing and last.max() < 0.05 * spacing
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.006])
+def test_the_covariance_of_edge_points_is_realistic(sigma):
+    ratios = []
+    for seed, roll in enumerate(np.linspace(5, 14, 6)):
+        s = scene(pose=facing(roll=roll), sigma=sigma, seed=seed)
+        e = scan.edge_points(found(s))
+        error, edge = s.edge_errors(e)
+        n = s.normals(edge, e.pitch)
+        variance = np.einsum("ni,nij,nj->n", n, e.covariance, n)
+        ratios.append((error**2 / variance)[e.side >= 0])
+    assert 0.7 < np.concatenate(ratios).mean() < 1.4
+
+
+def test_ranges_of_edge_points_are_as_good_as_their_covariance_says():
+    ratios = []
+    for seed in range(6):
+        s = scene(sigma=0.01, seed=seed)
+        e = scan.edge_points(found(s))
+        p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))
+        normal = s.in_lrf([0, 0, 1.0], e.pitch)
+        ratios.append(p[:, 2] ** 2 / np.einsum("ni,nij,nj->n", normal, e.covariance, normal))
+    assert 0.6 < np.concatenate(ratios).mean() < 1.6
+
+
+def test_four_sides_are_found_and_named_alike_by_lines_and_columns():
+    s = scene(pose=facing(roll=32.0), sigma=0.004)
+    b = found(s)
+    lines, columns = scan.edge_points(b), scan.sweep_edges(b)
+    assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {x.side for x in columns.sides}
+    names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
+    assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3]
+    assert np.abs(s.edge_errors(lines)[0][lines.side >= 0]).max() < 0.008
+
+
+def test_both_variants_number_the_sides_alike():
+    b = found(scene(sigma=0.004))
+    half, last = (scan.edge_points(b, v) for v in ("half_step", "last_beam"))
+    np.testing.assert_array_equal(half.side, last.side)
+    np.testing.assert_array_equal(half.line, last.line)
+
+
+def test_columns_see_the_edges_that_lie_along_the_scan_lines():
+    s = scene(pose=facing(roll=3.0))
+    error, edge, e = outward(s, "half_step", scan.sweep_edges)
+    assert {x.end for x in e.sides} == {-1, 1} and np.mean(np.isin(edge, [0, 2])) > 0.97
+    spacing = 1000 * 1.6 * np.radians(0.25)
+    assert abs(error.mean()) < 0.1 * spacing and np.abs(error).max() < 0.75 * spacing
+    last = outward(s, "last_beam", scan.sweep_edges)[0]
+    assert -0.65 * spacing < last.mean() < -0.35 * spacing
+    n = s.normals(s.edge_errors(e)[1], e.pitch)
+    ratio = s.edge_errors(e)[0] ** 2 / np.einsum("ni,nij,nj->n", n, e.covariance, n)
+    assert 0.6 < ratio[e.side >= 0].mean() < 1.5
+
+
+def test_a_triangle_has_three_sides():
+    s = scene(triangle_board(0.6, 0.7), facing(1.5, 20.0, 15.0, (0.2, 0.23)), sigma=0.004)
+    b = found(s)
+    error, edge = s.edge_errors(scan.edge_points(b))
+    e = scan.edge_points(b)
+    assert set(edge[e.side >= 0]) == {0, 1, 2} and len(e.sides) == 3
+    assert np.mean(e.side >= 0) > 0.9
+
+
+def test_a_paper_like_scan_of_the_papers_board():
+    pose = facing(1.5, 25.0, 20.0, (0.1, 0.13))
+    s = scene(triangle_board(), pose, step=0.5, pitch_step=0.5, sigma=0.01)
+    e = scan.edge_points(found(s))
+    error = s.edge_errors(e)[0][e.side >= 0]
+    assert len(e.sides) >= 2 and np.abs(error).max() < 0.025
+
+
+@pytest.mark.parametrize("fill", [np.nan, 3.4, 0.5])
+def test_holes_do_not_make_edges(fill):
+    s = scene(sigma=0.003)
+    rng, ranges = np.random.default_rng(3), s.sweep.ranges.copy()
+    rows, first = np.flatnonzero(s.on.any(axis=1)), s.on.argmax(axis=1)
+    middle = first + s.on.sum(axis=1) // 2
+    for row in rows[5:-5:2]:
+        ranges[row, middle[row] + rng.integers(-25, 20) + np.arange(rng.integers(1, 8))] = fill
+    holed = scan.edge_points(found(spoiled(s, ranges)))
+    clean = scan.edge_points(found(s))
+    np.testing.assert_array_equal(holed.line, clean.line)
+    assert np.abs(s.edge_errors(holed)[0][holed.side >= 0]).max() < 0.008
+    assert np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
+
+
+def test_speckle_at_a_side_is_outvoted():
+    s = scene(sigma=0.003)
+    rng, ranges = np.random.default_rng(4), s.sweep.ranges.copy()
+    last = ranges.shape[1] - 1 - s.on[:, ::-1].argmax(axis=1)
+    for row in rng.choice(np.flatnonzero(s.on.any(axis=1)), 30, replace=False):
+        ranges[row, last[row] - rng.integers(3, 25) : last[row] + 1] = np.nan
+    e = scan.edge_points(found(spoiled(s, ranges)))
+    error, side = s.edge_errors(e)[0], e.side
+    assert np.abs(error[side >= 0]).max() < 0.012
+    assert np.sum(side >= 0) > np.sum(scan.edge_points(found(s)).side >= 0) - 40
+
+
+def test_the_border_of_the_view_is_no_edge():
+    s = scene(pose=facing(x=0.95), sigma=0.003)
+    e = scan.edge_points(found(s))
+    assert {x.end for x in e.sides} == {1} and np.abs(s.edge_errors(e)[0][e.side >= 0]).max() < 0.01
+
+
+def test_the_end_of_the_sweep_is_no_edge():
+    s = scene(pose=facing(roll=2.0), pitch=(-5, 20), sigma=0.003)
+    e = scan.sweep_edges(found(s))
+    assert {x.end for x in e.sides} == {1}
+    assert np.abs(s.edge_errors(e)[0][e.side >= 0]).max() < 0.012
+
+
+def test_what_hides_the_board_makes_no_edge():
+    s = scene(sigma=0.003)
+    ranges = s.sweep.ranges.copy()
+    post = (s.sweep.bearings > np.radians(97)) & (s.sweep.bearings < np.radians(107))
+    ranges[:, post] = 0.8
+    e = scan.edge_points(found(spoiled(s, ranges)))
+    assert np.abs(s.edge_errors(e)[0]).max() < 0.012
+    assert {x.end for x in e.sides} == {-1}
+
+
+def test_scans_at_one_pitch_give_their_ends():
+    s = scene(pitch=0.0)
+    s = spoiled(s, np.repeat(s.sweep.ranges, 3, axis=0))
+    s = replace(s, sweep=replace(s.sweep, pitch=np.zeros(3), time_s=np.zeros(3)))
+    e = scan.edge_points(found(s))
+    assert e.side.tolist() == [0, 0, 0, 1, 1, 1] and e.end.tolist() == [-1] * 3 + [1] * 3
+    assert np.abs(s.edge_errors(e)[0]).max() < 0.004
+    single = replace(s, sweep=replace(s.sweep, ranges=s.sweep.ranges[:1], pitch=np.zeros(1), time_s=np.zeros(1)))
+    np.testing.assert_allclose(scan.edge_points(found(single)).points, e.points[[0, 3]])
+
+
+def test_a_warped_board_moves_the_ends_where_the_board_is():
+    s = scene(wall=None, sigma=0.002)
+    count, beam = np.maximum(s.on.sum(axis=1, keepdims=True), 1), np.arange(s.on.shape[1])
+    centre = (s.on * beam).sum(axis=1, keepdims=True) / count
+    bend = 0.012 * ((beam - centre) / (count / 2)) ** 2
+    e = scan.edge_points(found(spoiled(s, s.sweep.ranges + np.where(s.on, bend, 0.0))))
+    p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))
+    along = polar_to_points(1.0, np.arctan2(e.points[:, 1], e.points[:, 0]))
+    flat = np.linalg.norm(e.points, axis=1) - 0.012  # where a flat board would be
+    q = s.pose.inv().apply(lrf_to_platform(flat[:, None] * along, e.pitch, HEAD))
+    assert np.median(np.abs(q[:, 2])) < 0.4 * np.median(np.abs(p[:, 2]))
+
+
+# ---------------------------------------------------------------------------------------------- invariances
+
+
+def key(e):
+    """Edge points without their order."""
+    order = np.lexsort((e.points[:, 0], e.pitch))
+    return np.column_stack([e.points, e.pitch])[order], e.side[order] >= 0
+
+
+def test_the_direction_of_the_sweep_does_not_matter():
+    s = scene(sigma=0.004)
+    turned = replace(s.sweep, ranges=s.sweep.ranges[::-1], pitch=s.sweep.pitch[::-1])
+    a, b = key(scan.edge_points(found(s))), key(scan.edge_points(scan.find_board(turned, s.board, HEAD)))
+    np.testing.assert_allclose(a[0], b[0], atol=1e-4)
+    assert np.mean(a[1] == b[1]) > 0.99
+    first, second = (scan.sweep_edges(scan.find_board(x, s.board, HEAD)) for x in (s.sweep, turned))
+    assert sorted(first.end) == sorted(second.end)
+
+
+def test_a_wider_view_without_returns_changes_nothing():
+    s = scene(wall=None, sigma=0.004)
+    more = np.radians(np.arange(40, 140.1, 0.25))
+    ranges = np.full((len(s.sweep.pitch), len(more)), np.nan)
+    ranges[:, 60 : 60 + len(s.sweep.bearings)] = s.sweep.ranges
+    wide = replace(s.sweep, ranges=ranges, bearings=more)
+    a, b = scan.edge_points(found(s)), scan.edge_points(scan.find_board(wide, s.board, HEAD))
+    np.testing.assert_allclose(a.points, b.points, atol=1e-9)
+    np.testing.assert_array_equal(a.side, b.side)
+
+
+def test_the_same_sweep_gives_the_same_result():
+    b = found(scene(sigma=0.004))
+    c = found(scene(sigma=0.004))
+    np.testing.assert_array_equal(scan.edge_points(b).points, scan.edge_points(c).points)
+    np.testing.assert_array_equal(scan.edge_points(b).side, scan.edge_points(c).side)
+
+
+@pytest.mark.parametrize("turn", np.radians([0, 33, 90, 200]))
+def test_straight_runs_do_not_depend_on_where_the_trace_lies(turn):
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 1, 60)
+    trace = np.concatenate([np.column_stack([t, 0 * t]), np.column_stack([1 + 0.7 * t, 0.7 * t])])
+    trace += 0.002 * rng.standard_normal(trace.shape)
+    trace[[20, 80]] += [0.1, -0.1]
+    c, s = np.cos(turn), np.sin(turn)
+    runs = straight_runs(trace @ np.array([[c, s], [-s, c]]) + [3, -2], np.arange(120), 0.01, 0.1)
+    assert sorted(len(r) for r in runs) == pytest.approx([59, 60], abs=2)
+    assert not {20, 80} & set(np.concatenate(runs))
+
+
+def test_too_short_or_too_few_is_no_side():
+    t = np.linspace(0, 0.05, 40)
+    assert straight_runs(np.column_stack([t, t]), np.arange(40), 0.01, 0.1) == []
+    assert straight_runs(np.zeros((3, 2)), np.arange(3), 0.01, 0.1) == []
+    assert straight_runs(np.zeros((0, 2)), np.arange(0), 0.01, 0.1) == []
+
+
+# ---------------------------------------------------------------------------------------------- faces, errors
+
+
+def test_face_points_lie_on_the_face_and_away_from_the_edges():
+    s = scene(sigma=0.005)
+    p_lrf, pitch, covariance = scan.face_points(found(s), 300)
+    assert p_lrf.shape == (300, 3) and pitch.shape == (300,) and covariance.shape == (300, 3, 3)
+    p = s.pose.inv().apply(lrf_to_platform(p_lrf, pitch, HEAD))
+    lines = s.board.lines()
+    assert (p[:, :2] @ lines[:, :2].T + lines[:, 2]).max() < -0.01
+    normal = s.in_lrf([0, 0, 1.0], pitch)
+    ratio = p[:, 2] ** 2 / np.einsum("ni,nij,nj->n", normal, covariance, normal)
+    assert 0.8 < ratio.mean() < 1.25
+    assert np.linalg.eigvalsh(covariance)[:, 1].min() > 0
+
+
+@pytest.mark.parametrize("function", [scan.edge_points, scan.sweep_edges])
+def test_another_variant_is_refused(function):
+    with pytest.raises(ValueError, match="variant is one of half_step, last_beam, got 'middle'"):
+        function(found(scene()), "middle")
+
+
+# ---------------------------------------------------------------------------------------------- the real recording
+
+
+@pytest.fixture(scope="module")
+def real(lms400_session):
+    session = open_session(lms400_session)
+    begin = time.perf_counter()
+    scans = {p: scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements}
+    edges = {p: scan.edge_points(b) for p, b in scans.items()}
+    return scans, edges, time.perf_counter() - begin
+
+
+def test_every_placement_of_the_recording_has_a_board(real):
+    scans, _, seconds = real
+    assert len(scans) == 20 and seconds < 15  # 3 s on an idle core
+    for placement, b in scans.items():
+        assert b.mask.sum() > 0.97 * np.isfinite(b.sweep.ranges).sum()
+        assert b.sigma_range < (0.011 if placement == 10 else 0.007)
+
+
+def test_the_recordings_sides_are_straight_and_long(real):
+    _, edges, _ = real
+    assert sum(len(e.sides) for e in edges.values()) >= 40
+    for placement, e in edges.items():
+        for side in e.sides:
+            assert side.rms < 0.0035
+        length = {end: max((x.length for x in e.sides if x.end == end), default=0.0) for end in (-1, 1)}
+        assert length[-1] > 0.6 or placement == 8  # cut by the right border of the view
+        assert length[1] > 0.6 or placement == 16  # cut by the left border
+    assert len(edges[7].sides) == 4  # stands on its corner
+    assert [x.end for x in edges[8].sides if x.length > 0.2] == [1, 1]
+
+
+def test_the_recordings_opposite_sides_are_as_far_apart_as_the_board_is_wide(real):
+    scans, edges, _ = real
+    widths = []
+    for placement, e in edges.items():
+        right, left = ([x for x in e.sides if x.end == end and x.angle > np.radians(40)] for end in (-1, 1))
+        if len(right) == len(left) == 1 and placement not in (8, 16):
+            across = np.cross(scans[placement].normal, np.diff(right[0].ends, axis=0)[0])
+            across /= np.linalg.norm(across)
+            widths.append(abs(across @ (left[0].ends.mean(axis=0) - right[0].ends.mean(axis=0))))
+    assert len(widths) >= 15
+    assert np.median(widths) == pytest.approx(0.858, abs=0.005)
+
+
+def test_the_cut_of_placement_7_is_no_edge(real):
+    columns = scan.sweep_edges(real[0][7])
+    assert all(np.radians(30) < x.angle < np.radians(60) for x in columns.sides) and len(columns.sides) == 4

@@ -1,0 +1,500 @@
+"""A session survives the disk, and every kind of damage is named."""
+
+import csv
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.board import Board, Chessboard, triangle_board
+from lrfcal_lib.camera import CameraModel
+from lrfcal_lib.session import (
+    CameraInfo,
+    LrfInfo,
+    SessionError,
+    SessionWriter,
+    board_from_json,
+    board_to_json,
+    finish,
+    image_size,
+    model_from_json,
+    model_to_json,
+    open_session,
+    transform_from_json,
+    transform_to_json,
+    validate,
+)
+
+BEARINGS = np.radians(np.arange(60.0, 121.0))
+LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)
+HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
+MODEL = CameraModel(32, 24, 30.0, 31.0, 15.5, 11.5, np.array([0.1, -0.02, 0.001, 0.002, 0.003]), np.eye(9), 0.25)
+CAMERAS = (CameraInfo("left", "head", 32, 24, MODEL, HEAD), CameraInfo("right", "platform", 32, 24))
+
+
+def pixels(seed=0):
+    return np.random.default_rng(seed).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+
+
+def wall(lines=3):
+    ranges = np.full((lines, 1), 2.0) / np.sin(BEARINGS)
+    ranges[1, 7] = np.nan
+    return ranges, BEARINGS, np.radians(np.linspace(-1, 1, lines))
+
+
+def write(path, **options):
+    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, licence="CC0", source="a test", **options) as writer:
+        writer.add_sweep(1, *wall())
+        writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
+        for camera in ("left", "right"):
+            writer.add_image(camera, pixels(1), 1, pitch=0.1)
+            writer.add_image(camera, pixels(2), 2, time_s=3.5)
+        writer.add_image("left", pixels(3), purpose="intrinsics")
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "trip")
+
+
+def edit(path, change):
+    """Apply a change to the object in session.json."""
+    file = path / "session.json"
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+
+
+def edit_scans(path, **arrays):
+    file = path / "lrf" / "scans.npz"
+    with np.load(file) as archive:
+        np.savez(file, **({k: archive[k] for k in archive.files} | arrays))
+
+
+def same(a, b):
+    np.testing.assert_allclose(a.as_matrix(), b.as_matrix(), atol=1e-15)
+
+
+# ---------------------------------------------------------------------------------------------- round trips
+
+
+def test_what_is_written_is_read(path):
+    session = open_session(path)
+    assert (session.name, session.licence, session.source, session.simulated) == ("trip", "CC0", "a test", False)
+    assert session.placements == (1, 2) and session.problems == () and session.picks == ()
+    assert validate(path) == []
+    assert session.lrf.field_of_view == pytest.approx(LRF.field_of_view, abs=1e-12)
+    assert session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12) and session.lrf.max_range == 8.0
+    same(session.T_head_lrf, HEAD)
+    same(session.cameras["left"].guess, HEAD)
+    np.testing.assert_array_equal(session.cameras["left"].model.parameters, MODEL.parameters)
+    assert session.cameras["right"].model is None and session.cameras["right"].guess is None
+
+
+def test_sweeps_keep_order_gaps_and_times(path):
+    first, second = (open_session(path).sweep(p) for p in (1, 2))
+    ranges, bearings, pitch = wall()
+    np.testing.assert_array_equal(first.ranges, ranges)
+    np.testing.assert_array_equal(first.bearings, bearings)
+    np.testing.assert_array_equal(first.pitch, pitch)
+    assert np.isnan(first.time_s).all() and second.time_s.tolist() == [0.5, 1.0, 1.5]
+
+
+def test_intensities_are_kept_where_all_sweeps_have_them(tmp_path):
+    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
+        writer.add_sweep(1, *wall(), intensities=np.full((3, len(BEARINGS)), 7.0))
+    assert (open_session(tmp_path / "s").sweep(1).intensities == 7).all()
+
+
+def test_images_are_found_by_camera_placement_and_purpose(path):
+    session = open_session(path)
+    assert len(session.images()) == 5 and len(session.images("left")) == 3 and len(session.images(placement=2)) == 2
+    (record,) = session.images("left", purpose="intrinsics")
+    assert record.placement == -1 and math.isnan(record.pitch)
+    (record,) = session.images("right", 1)
+    assert record.pitch == pytest.approx(0.1) and math.isnan(record.time_s)
+    np.testing.assert_array_equal(session.read_image(record), pixels(1))
+
+
+def test_image_files_are_copied_byte_for_byte(tmp_path):
+    source = tmp_path / "photo.jpg"
+    cv2.imwrite(str(source), pixels())
+    with SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS) as writer:
+        writer.add_sweep(1, *wall())
+        writer.add_image("left", source, 1)
+    (record,) = open_session(tmp_path / "s").images()
+    assert record.file.suffix == ".jpg" and record.file.read_bytes() == source.read_bytes()
+
+
+def test_the_direction_of_a_sweep(tmp_path):
+    ranges, bearings, pitch = wall(9)
+    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
+        for number, values in enumerate((pitch, pitch[::-1], 0 * pitch)):
+            writer.add_sweep(number, ranges, bearings, values)
+    session = open_session(tmp_path / "s")
+    assert [session.sweep_direction(p) for p in session.placements] == [1, -1, 0]
+
+
+def test_boards_models_and_transforms_survive_json():
+    board = Board("b", ("n", "e", "s", "w"), None, Chessboard(8, 6, 0.0775, (0.1, 0.2)), ("n", "w"))
+    assert board_from_json(json.loads(json.dumps(board_to_json(board)))) == board
+    triangle = board_from_json(json.loads(json.dumps(board_to_json(triangle_board()))))
+    np.testing.assert_array_equal(triangle.corners, triangle_board().corners)
+    model = model_from_json(json.loads(json.dumps(model_to_json(MODEL))), 32, 24)
+    np.testing.assert_array_equal(model.parameters, MODEL.parameters)
+    np.testing.assert_array_equal(model.covariance, MODEL.covariance)
+    assert transform_from_json(transform_to_json(None)) is None and model_from_json(None, 1, 1) is None
+    same(transform_from_json(json.loads(json.dumps(transform_to_json(HEAD)))), HEAD)
+
+
+def test_picks_override_by_camera_file_and_edge(path):
+    text = "camera,file,edge,u1,v1,u2,v2\nleft,images/left/0001.png,ab,1,2,20,3.5\n"
+    (path / "edges.csv").write_text(text)
+    session = open_session(path)
+    (pick,) = session.picks
+    assert pick.edge == "ab" and pick.file == session.images("left", 1)[0].file
+    assert pick.ends.tolist() == [[1, 2], [20, 3.5]]
+
+
+def test_zero_and_infinite_ranges_are_no_returns(path):
+    with np.load(path / "lrf" / "scans.npz") as archive:
+        ranges = archive["ranges"]
+    ranges[0, :2] = 0.0, np.inf
+    edit_scans(path, ranges=ranges)
+    assert np.isnan(open_session(path).sweep(1).ranges[0, :2]).all()
+
+
+# ---------------------------------------------------------------------------------------------- crashes
+
+
+def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
+    path = tmp_path / "s"
+    with pytest.raises(RuntimeError, match="power"), SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer:
+        writer.add_sweep(4, *wall())
+        writer.add_image("left", pixels(), 4)
+        raise RuntimeError("power cut")
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images/left/00")
+    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.finish"):
+        open_session(path)
+    finish(path)
+    session = open_session(path)
+    assert session.placements == (4,) and len(session.images("left", 4)) == 1
+    assert sorted(p.name for p in (path / "lrf").iterdir()) == ["scans.npz"]
+
+
+def test_finish_needs_sweeps(path):
+    with pytest.raises(SessionError, match="no sweep to finish"):
+        finish(path)
+
+
+def test_an_existing_target_is_refused(path):
+    before = (path / "session.json").read_text()
+    with pytest.raises(SessionError, match="exists already"):
+        SessionWriter(path, triangle_board(), LRF)
+    assert (path / "session.json").read_text() == before
+
+
+# ---------------------------------------------------------------------------------------------- missing parts
+
+
+def test_a_placement_without_data_is_listed_and_spoils_nothing(tmp_path):
+    session = open_session(write(tmp_path / "s", placements=[1, 2, 3]))
+    assert session.problems[0] == "placement 3: no scan line with a range"
+    assert "placement 3: no image of camera 'left'" in session.problems
+    assert session.sweep(1).ranges.shape == (3, len(BEARINGS))
+    with pytest.raises(SessionError, match="placement 3 has 0 scan lines"):
+        session.sweep(3)
+    with pytest.raises(SessionError, match="no placement 9; the session has 1, 2, 3"):
+        session.sweep(9)
+
+
+def test_a_placement_of_nan_is_listed(path):
+    with np.load(path / "lrf" / "scans.npz") as archive:
+        ranges, placement = archive["ranges"], archive["placement"]
+    ranges[placement == 2] = np.nan
+    edit_scans(path, ranges=ranges)
+    assert validate(path) == ["placement 2: no scan line with a range"]
+
+
+def test_scan_lines_of_an_unknown_placement_are_listed(path):
+    edit_scans(path, placement=np.array([1, 1, 1, 7, 7, 7]))
+    assert "placement 7: in the scan lines but not in session.json, ignored" in open_session(path).problems
+
+
+# ---------------------------------------------------------------------------------------------- session.json
+
+
+def test_no_session_at_all(tmp_path):
+    with pytest.raises(SessionError, match=r"session\.json: No such file"):
+        open_session(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"schema": "lrfcal', "\xff"])
+def test_bad_json(path, text):
+    (path / "session.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(SessionError, match="not JSON"):
+        open_session(path)
+
+
+def test_json_of_another_kind(path):
+    (path / "session.json").write_text("[1]")
+    with pytest.raises(SessionError, match="holds a list"):
+        open_session(path)
+
+
+def lens(data):
+    return data["rig"]["cameras"]["left"]["intrinsics"]
+
+
+CHANGES = {
+    "schema is 'lrfcal-session/9', this version reads": lambda d: d.update(schema="lrfcal-session/9"),
+    "schema is None": lambda d: d.pop("schema"),
+    "key 'board' is missing": lambda d: d.pop("board"),
+    "key 'cameras' is missing": lambda d: d["rig"].pop("cameras"),
+    "must stay inside the session's folder, got '../scans.npz'": lambda d: d["rig"]["lrf"].update(file="../scans.npz"),
+    "must stay inside the session's folder, got '/etc/passwd'": lambda d: d["rig"]["lrf"].update(file="/etc/passwd"),
+    r"must stay inside the session's folder, got 'C:\\a'": lambda d: d["rig"]["lrf"].update(file="C:\\a"),
+    "the LRF's file is one of": lambda d: d["rig"]["lrf"].update(file="lrf/scans.csv"),
+    "becomes a file name.* got '../up'": lambda d: d.update(name="../up"),
+    r"becomes a file name.* got 'a/\.\.'": lambda d: d["rig"]["cameras"].update({"a/..": {}}),
+    "placements are different numbers": lambda d: d.update(placements=[1, 1]),
+    "invalid literal": lambda d: d.update(placements="one"),
+    "translation_m is .*millimetres": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0, 157]),
+    "translation_m must be 3 finite": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0]),
+    "board is 380 m large: millimetres": lambda d: d["board"].update(corners_m=[[0, 0], [315, 0], [0, 380]]),
+    "corners_m must be 3 x 2": lambda d: d["board"].update(corners_m=[[0, 0], [1, 0]]),
+    "three or more edges": lambda d: d["board"].update(edges=["ab", "ab", "ca"]),
+    "features are two of the edges": lambda d: d["board"].update(features=["ab", "xy"]),
+    "square_m is 77.5: millimetres": lambda d: d["board"].update(
+        pattern={"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 77.5}
+    ),
+    "three or more inner corners": lambda d: d["board"].update(
+        pattern={"kind": "chessboard", "columns": 1, "rows": 6, "square_m": 0.1}
+    ),
+    "pattern kind is 'chessboard', got 'dots'": lambda d: d["board"].update(pattern={"kind": "dots"}),
+    "mount is one of head, platform, got 'wall'": lambda d: d["rig"]["cameras"]["left"].update(mount="wall"),
+    "width and height must be positive": lambda d: d["rig"]["cameras"]["left"].update(width=0),
+    "fx must be positive": lambda d: lens(d).update(fx=-1),
+    "distortion must be 5 finite": lambda d: lens(d).update(distortion=[0, 0]),
+    "covariance must be 9 x 9": lambda d: lens(d).update(covariance=[0.0]),
+    "field_of_view_deg is two ascending": lambda d: d["rig"]["lrf"].update(field_of_view_deg=[120, 60]),
+    "bearing_step_deg must be positive, got 0": lambda d: d["rig"]["lrf"].update(bearing_step_deg=0),
+    "sigma_range_m is 5: millimetres": lambda d: d["rig"]["lrf"].update(sigma_range_m=5),
+    "sigma_range_m must be one finite": lambda d: d["rig"]["lrf"].update(sigma_range_m=math.nan),
+}
+
+
+@pytest.mark.parametrize("message", CHANGES)
+def test_a_wrong_statement_is_named(path, message):
+    edit(path, CHANGES[message])
+    with pytest.raises(SessionError, match=message):
+        open_session(path)
+
+
+# ---------------------------------------------------------------------------------------------- scan lines
+
+
+def test_missing_scans(path):
+    (path / "lrf" / "scans.npz").unlink()
+    with pytest.raises(SessionError, match=r"scans\.npz: no such file"):
+        open_session(path)
+
+
+@pytest.mark.parametrize("part", [0, 10, 0.5, 0.98])
+def test_truncated_scans(path, part):
+    file = path / "lrf" / "scans.npz"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(part * len(data) if part < 1 else part)])
+    with pytest.raises(SessionError, match="cannot be read.*truncated"):
+        open_session(path)
+
+
+def test_damaged_scans(path):
+    file = path / "lrf" / "scans.npz"
+    data = bytearray(file.read_bytes())
+    data[100:160] = bytes(60)
+    file.write_bytes(data)
+    with pytest.raises(SessionError, match=r"scans\.npz: cannot be read"):
+        open_session(path)
+
+
+def test_pickles_are_not_read(path):
+    edit_scans(path, pitch=np.array([{}] * 6))
+    with pytest.raises(SessionError, match="cannot be read.*allow_pickle"):
+        open_session(path)
+
+
+def test_telegrams_need_their_index(path):
+    (path / "lrf" / "scans.npz").unlink()
+    (path / "lrf" / "telegrams.bin").write_bytes(b"\x02")
+    with pytest.raises(SessionError, match=r"index\.csv: No such file.*needs this file"):
+        open_session(path)
+
+
+ARRAYS = {
+    "median range is .* m: millimetres": {"ranges": np.full((6, 61), 2000.0)},
+    r"all NaN\): nothing was recorded": {"ranges": np.full((6, 61), np.nan)},
+    "negative ranges are no measurements": {"ranges": np.r_[[[-1.0] * 61], np.ones((5, 61))]},
+    "ranges must be scan lines x beams": {"ranges": np.ones(61)},
+    "a bearing is 120 rad: degrees": {"bearings": np.arange(60.0, 121.0)},
+    "a pitch is 20 rad: degrees": {"pitch": np.linspace(-20.0, 20.0, 6)},
+    "3 values of pitch are not finite": {"pitch": np.r_[np.full(3, np.nan), 0, 0, 0]},
+    "bearings must ascend": {"bearings": BEARINGS[::-1]},
+    r"time_s has shape \(2,\)": {"time_s": np.zeros(2)},
+}
+
+
+@pytest.mark.parametrize("message", ARRAYS)
+def test_wrong_arrays_are_named(path, message):
+    edit_scans(path, **ARRAYS[message])
+    with pytest.raises(SessionError, match=r"scans\.npz: .*" + message):
+        open_session(path)
+
+
+def test_a_missing_array_is_named(path):
+    np.savez(path / "lrf" / "scans.npz", ranges=np.ones((2, 61)), bearings=BEARINGS)
+    with pytest.raises(SessionError, match="key 'placement' is missing"):
+        open_session(path)
+
+
+def test_the_writer_refuses_what_the_reader_would(tmp_path):
+    writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
+    ranges, bearings, pitch = wall()
+    with pytest.raises(SessionError, match="placement 1: the median range .*millimetres"):
+        writer.add_sweep(1, 1000 * ranges, bearings, pitch)
+    with pytest.raises(SessionError, match="pitch has shape"):
+        writer.add_sweep(1, ranges, bearings, pitch[:2])
+    writer.add_sweep(1, ranges, bearings, pitch)
+    with pytest.raises(SessionError, match="one grid a session"):
+        writer.add_sweep(2, ranges, bearings + 0.1, pitch)
+    with pytest.raises(SessionError, match="camera 'up', purpose 'board': cameras are left, right"):
+        writer.add_image("up", pixels())
+    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
+        writer.add_image("left", pixels(), purpose="fun")
+    with pytest.raises(SessionError, match="31 x 24 pixels, but camera 'left' has 32 x 24"):
+        writer.add_image("left", pixels()[:, 1:])
+    with pytest.raises(SessionError, match="mount is one of"):
+        SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
+    assert not (tmp_path / "t").exists()
+
+
+# ---------------------------------------------------------------------------------------------- images and tables
+
+
+def rewrite(path, column, value, row=0, file="images.csv"):
+    with (path / file).open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    rows[row][column] = value
+    with (path / file).open("w", newline="") as stream:
+        table = csv.DictWriter(stream, rows[0].keys())
+        table.writeheader()
+        table.writerows(rows)
+
+
+ROWS = {
+    "must stay inside the session's folder, got '../trip/session.json'": ("file", "../trip/session.json"),
+    "must stay inside the session's folder, got '/etc/passwd'": ("file", "/etc/passwd"),
+    "must stay inside the session's folder, got ''": ("file", ""),
+    r"must stay inside the session's folder, got '\.\.\\": ("file", "..\\x.png"),
+    "0009.png: No such file": ("file", "images/left/0009.png"),
+    "neither PNG nor JPEG": ("file", "session.json"),
+    "no camera 'up' in session.json, which has left, right": ("camera", "up"),
+    "purpose is one of intrinsics, board, scene, got 'fun'": ("purpose", "fun"),
+    "placement 12 is not in session.json": ("placement", "12"),
+    "line 2: invalid literal": ("placement", "first"),
+    "line 2: could not convert string to float: 'up'": ("pitch_deg", "up"),
+}
+
+
+@pytest.mark.parametrize("message", ROWS)
+def test_wrong_rows_are_named(path, message):
+    rewrite(path, *ROWS[message])
+    with pytest.raises(SessionError, match=message):
+        open_session(path)
+
+
+def test_a_link_out_of_the_session_is_refused(path, tmp_path):
+    target = path / "images" / "left" / "0001.png"
+    outside = tmp_path / "secret.png"
+    target.rename(outside)
+    target.symlink_to(outside)
+    with pytest.raises(SessionError, match="must stay inside"):
+        open_session(path)
+
+
+def test_an_image_of_another_size(path):
+    cv2.imwrite(str(path / "images" / "left" / "0002.png"), pixels()[:20])
+    with pytest.raises(SessionError, match=r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"):
+        open_session(path)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+def test_truncated_images(tmp_path, kind):
+    file = tmp_path / f"a.{kind}"
+    cv2.imwrite(str(file), pixels())
+    assert image_size(file) == (32, 24)
+    data = file.read_bytes()
+    for part in (12, len(data) // 2, len(data) - 70):
+        file.write_bytes(data[:part])
+        with pytest.raises(SessionError, match="truncated after"):
+            image_size(file)
+
+
+def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
+    file = path / "images" / "left" / "0001.png"
+    data = bytearray(file.read_bytes())
+    data[60:200] = bytes(140)
+    file.write_bytes(data)
+    (problem,) = validate(path)
+    assert "0001.png: cannot be decoded" in problem
+
+
+def test_wrong_columns(path):
+    file = path / "images.csv"
+    file.write_text(file.read_text().replace("pitch_deg", "pitch"))
+    with pytest.raises(SessionError, match=r"images\.csv: columns must be t_s, .*; got t_s, .*, pitch, purpose"):
+        open_session(path)
+    file.write_text("")
+    with pytest.raises(SessionError, match="got an empty file"):
+        open_session(path)
+
+
+def test_a_short_row(path):
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images")
+    with pytest.raises(SessionError, match="line 7: 3 values for 6 columns; truncated"):
+        open_session(path)
+
+
+def test_a_table_in_another_encoding(path):
+    (path / "images.csv").write_bytes(b"\xff\xfe")
+    with pytest.raises(SessionError, match="not a CSV file in UTF-8"):
+        open_session(path)
+
+
+def test_missing_images_table(path):
+    (path / "images.csv").unlink()
+    with pytest.raises(SessionError, match=r"images\.csv: No such file"):
+        open_session(path)
+
+
+PICKS = {
+    "no 'images/left/0009.png' of camera 'left'": "left,images/left/0009.png,ab,1,2,20,3",
+    "must stay inside": "left,../0001.png,ab,1,2,20,3",
+    "edge is one of ab, bc, ca, got 'top'": "left,images/left/0001.png,top,1,2,20,3",
+    "too close for a direction": "left,images/left/0001.png,ab,1,2,2,3",
+    "u1, v1, u2, v2 must be 4 finite": "left,images/left/0001.png,ab,1,2,nan,3",
+    "could not convert": "left,images/left/0001.png,ab,1,2,x,3",
+}
+
+
+@pytest.mark.parametrize("message", PICKS)
+def test_wrong_picks_are_named(path, message):
+    (path / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + PICKS[message] + "\n")
+    with pytest.raises(SessionError, match=message):
+        open_session(path)

@@ -1,0 +1,188 @@
+"""The promises of the top-level files."""
+
+import os
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TOP_LEVEL = {
+    "notebooks", "lrfcal_lib", "data", "tests", "reports", "environment.txt", "README.md", "LICENSE", "CITATION.cff",
+    "Makefile", "pyproject.toml", ".ci", ".gitignore", ".gitattributes",
+}  # fmt: skip
+
+
+def requirements():
+    lines = [line.split("#")[0].strip() for line in (ROOT / "environment.txt").read_text().splitlines()]
+    return [line for line in lines if line]
+
+
+def git(*arguments):
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+
+
+def normal(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_package_is_pinned_exactly_and_once():
+    names = []
+    for line in requirements():
+        pin = re.fullmatch(r"([A-Za-z0-9._-]+)==\d[\w.]*", line)
+        assert pin, f"'{line}' is no exact pin"
+        names.append(normal(pin[1]))
+    assert len(names) == len(set(names)) and len(names) > 100
+
+
+def test_direct_packages_say_why():
+    direct = (ROOT / "environment.txt").read_text().split("# What those need in turn")[0]
+    lines = [line for line in direct.splitlines() if "==" in line]
+    assert len(lines) >= 15
+    assert all(re.search(r"==\S+\s+# \w+$", line) for line in lines)
+
+
+def test_what_the_package_needs_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    needs = project["project"]["dependencies"] + sum(project["project"]["optional-dependencies"].values(), [])
+    needs += project["build-system"]["requires"]
+    pinned = {normal(line.split("==")[0]) for line in requirements()}
+    assert {normal(re.match(r"[\w.-]+", need)[0]) for need in needs} <= pinned
+
+
+def test_pins_are_what_runs_here():
+    from importlib.metadata import version
+
+    pins = dict(line.split("==") for line in requirements())
+    for name in ("numpy", "scipy", "opencv-python-headless", "pandas", "matplotlib", "nbval", "pytest"):
+        assert version(name) == pins[name]
+
+
+def test_quick_start_is_exactly_two_commands():
+    section = (ROOT / "README.md").read_text().split("## Quick start")[1].split("\n## ")[0]
+    (block,) = re.findall(r"```sh\n(.*?)```", section, re.S)
+    assert block.split("\n") == ["make report", "make test", ""]
+
+
+def test_readme_lists_every_notebook_and_every_method():
+    from lrfcal_lib.solvers import METHODS
+
+    text = (ROOT / "README.md").read_text()
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        assert f"(notebooks/{path.name})" in text
+    for method in METHODS:
+        assert f"| `{method}` |" in text
+
+
+def test_files_the_readme_points_to_exist():
+    text = (ROOT / "README.md").read_text()
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (ROOT / target).is_file(), target
+
+
+def test_ci_runs_make_test_and_nothing_else():
+    script = ROOT / ".ci" / "run"
+    lines = [line for line in script.read_text().splitlines() if line and not line.startswith(("#", "set ", "cd "))]
+    assert lines == ["make test"]
+    assert os.access(script, os.X_OK)
+
+
+def test_nothing_else_lies_at_the_top():
+    done = git("ls-files", "-co", "--exclude-standard")
+    if done.returncode:
+        pytest.skip("no git checkout")
+    assert {line.split("/")[0] for line in done.stdout.splitlines()} <= TOP_LEVEL
+
+
+def test_reports_and_recordings_are_ignored_by_git():
+    ignored = ["reports/x/index.html", "reports/.sessions/x/session.json", ".venv/x"]
+    done = git("check-ignore", "--no-index", *ignored, "reports/README.md", "reports/readme.png")
+    if done.returncode > 1:
+        pytest.skip("no git checkout")
+    assert done.stdout.split() == ignored
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of what set-up needs, with stand-ins for the interpreter and the package managers."""
+    (tmp_path / ".ci").mkdir()
+    for name in ("environment.txt", ".ci/setup"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+def write_command(folder, name, script):
+    folder.mkdir(exist_ok=True)
+    path = folder / name
+    path.write_text("#!/bin/bash\n" + script)
+    path.chmod(0o755)
+
+
+def run_setup(checkout, path, **variables):
+    environment = {"PATH": f"{path}:/usr/bin:/bin", "HOME": str(checkout), **variables}
+    return subprocess.run([".ci/setup"], cwd=checkout, env=environment, capture_output=True, text=True)
+
+
+FAKE_PYTHON = """
+echo "python $*" >>calls
+case "$*" in
+    *'-m venv'*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
+    -) [ -z "$MISSING" ] || echo "$MISSING" ;;
+esac
+"""
+
+
+def test_setup_keeps_the_environment_until_environment_txt_changes(checkout):
+    write_command(checkout / "bin", "python3", FAKE_PYTHON)
+    calls = checkout / "calls"
+    assert run_setup(checkout, checkout / "bin").returncode == 0
+    assert calls.read_text().count("-m venv") == 1 and "-r environment.txt" in calls.read_text()
+    calls.write_text("")
+    assert run_setup(checkout, checkout / "bin").returncode == 0
+    assert "venv" not in calls.read_text() and "pip" not in calls.read_text()
+    with open(checkout / "environment.txt", "a") as file:
+        file.write("# changed\n")
+    run_setup(checkout, checkout / "bin")
+    assert calls.read_text().count("-m venv") == 1
+
+
+def test_setup_that_failed_is_done_again(checkout):
+    write_command(checkout / "bin", "python3", FAKE_PYTHON + 'case "$*" in *pip*) exit 3 ;; esac')
+    assert run_setup(checkout, checkout / "bin").returncode != 0
+    assert not (checkout / ".venv" / "stamp").exists()
+
+
+def test_setup_installs_missing_libraries_as_root(checkout):
+    write_command(checkout / "bin", "python3", FAKE_PYTHON)
+    write_command(checkout / "bin", "id", "echo 0")
+    write_command(checkout / "bin", "apt-get", 'echo "apt-get $*" >>calls')
+    done = run_setup(checkout, checkout / "bin", MISSING="libusb-1.0-0")
+    assert done.returncode == 0
+    assert re.search(r"apt-get install .*libusb-1.0-0", (checkout / "calls").read_text())
+
+
+def test_setup_tells_the_command_to_everyone_else_and_goes_on(checkout):
+    write_command(checkout / "bin", "python3", FAKE_PYTHON)
+    write_command(checkout / "bin", "id", "echo 1000")
+    done = run_setup(checkout, checkout / "bin", MISSING="libusb-1.0-0")
+    assert done.returncode == 0
+    assert "sudo apt-get install -y libusb-1.0-0" in done.stderr
+
+
+def test_setup_refuses_an_old_python(checkout):
+    write_command(checkout / "bin", "python3", 'case "$*" in *version_info*) exit 1 ;; -V) echo Python 3.9.2 ;; esac')
+    done = run_setup(checkout, checkout / "bin")
+    assert done.returncode == 1
+    assert "Python 3.11 or newer is needed, Python 3.9.2 was found" in done.stderr
+
+
+def test_setup_names_the_package_of_a_missing_venv(checkout):
+    script = 'case "$*" in *ensurepip*) exit 1 ;; *python%d*) echo python3.12-venv ;; esac'
+    write_command(checkout / "bin", "python3", script)
+    write_command(checkout / "bin", "id", "echo 1000")
+    done = run_setup(checkout, checkout / "bin")
+    assert done.returncode == 1
+    assert "sudo apt-get install -y python3.12-venv" in done.stderr

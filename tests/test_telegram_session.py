@@ -1,0 +1,321 @@
+"""A session of telegrams gives the sweeps that were sent, and tells about every telegram it could not use."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lrfcal_lib.board import triangle_board
+from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
+from lrfcal_lib.drivers.lms2xx_replies import Configuration, encode_configuration
+from lrfcal_lib.session import LrfInfo, SessionError, SessionWriter, finish, open_session, validate
+
+LRF = LrfInfo("made up", (np.radians(40), np.radians(140)), np.radians(0.25), 0.01, max_range=32.0)
+PITCH = np.radians([-0.5, -0.25, 0.0, 0.25])
+
+
+def configuration(mode=6):
+    return encode_configuration(Configuration().changed(measuring_mode=mode, unit="mm"))
+
+
+def room(lines=4, beams=401, seed=0):
+    """Ranges in whole millimetres with all kinds of gaps."""
+    ranges = np.random.default_rng(seed).integers(1000, 30_000, (lines, beams)) / 1000
+    ranges[0, 3], ranges[0, 5] = np.nan, np.inf
+    return ranges
+
+
+def record(path, *batches, lrf=LRF, first=None):
+    with SessionWriter(path, triangle_board(), lrf) as writer:
+        writer.add_telegrams(-1, [configuration() if first is None else first])
+        for batch in batches:
+            writer.add_telegrams(*batch)
+    return path
+
+
+def scans(ranges, mode=6, **options):
+    return [encode_scan(line, mode=mode, **options) for line in ranges]
+
+
+@pytest.fixture
+def path(tmp_path):
+    first, second = room(), room(seed=1)
+    return record(tmp_path / "trip", (1, scans(first), PITCH, [1.0, 2, 3, 4]), (2, scans(second), 0.1))
+
+
+def telegrams(path):
+    return path / "lrf" / "telegrams.bin"
+
+
+def edit_index(path, change):
+    """Apply a change to the rows of index.csv, the header being row 0."""
+    file = path / "lrf" / "index.csv"
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    change(rows)
+    file.write_text("".join(",".join(row) + "\n" for row in rows))
+
+
+def interlaced(dense, number=None):
+    """The four telegrams of a line of 721 beams; `number` is the telegram index of the first."""
+    indices = [None] * 4 if number is None else [(0, number + k) for k in range(4)]
+    return [encode_scan(dense[k::4], mode=6, partial=k, indices=indices[k]) for k in range(4)]
+
+
+# ---------------------------------------------------------------------------------------------- round trips
+
+
+def test_sweeps_are_what_the_device_measured(path):
+    session = open_session(path)
+    assert session.problems == () and validate(path) == [] and session.placements == (1, 2)
+    first, second = session.sweep(1), session.sweep(2)
+    expected = room()
+    expected[0, 5] = np.nan
+    np.testing.assert_allclose(first.ranges, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(first.pitch, PITCH, atol=1e-10)
+    assert first.time_s.tolist() == [1, 2, 3, 4] and np.isnan(second.time_s).all()
+    np.testing.assert_allclose(np.degrees(first.bearings), np.arange(40, 140.1, 0.25))
+    np.testing.assert_allclose(second.pitch, 0.1)
+
+
+def test_bytes_are_kept_as_they_came(path):
+    stored = telegrams(path).read_bytes()
+    assert stored == configuration() + b"".join(scans(room()) + scans(room(seed=1)))
+    rows = (path / "lrf" / "index.csv").read_text().splitlines()
+    assert rows[:3] == ["t_s,offset,length,placement,pitch_deg", ",0,42,,", "1.0,42,812,1,-0.5"]
+
+
+def test_special_values_are_counted_by_reason(path):
+    session = open_session(path)
+    report = session.telegram_report(1)
+    assert report["telegrams"] == report["outcomes"]["scan"] == 4 and report["wrong_crc_offsets"] == ()
+    counts = {k: v for k, v in report["values"].items() if v}
+    assert counts == {"valid": 4 * 401 - 2, "not valid": 1, "larger than maximum": 1}
+    assert session.telegram_report()["telegrams"] == 9 and session.telegram_report()["outcomes"]["other"] == 1
+
+
+@pytest.mark.parametrize("values, first, step", [(101, 40, 1), (201, 40, 0.5), (181, 0, 1), (361, 0, 0.5)])
+def test_the_field_of_view_is_that_of_the_telegrams(tmp_path, values, first, step):
+    session = open_session(record(tmp_path / "s", (1, scans(room(beams=values)), PITCH)))
+    bearings = np.degrees(session.sweep(1).bearings)
+    np.testing.assert_allclose(bearings, first + step * np.arange(values))
+    last = first + step * (values - 1)
+    (problem,) = session.problems
+    assert problem == (
+        f"the telegrams cover {first:g} to {last:g} deg in steps of {step:g} deg, session.json states 40 to 140 deg in "
+        "steps of 0.25 deg: the telegrams count"
+    )
+
+
+def test_interlaced_scans_become_dense_lines(tmp_path):
+    dense = room(3, 721)
+    sent = [raw for line in dense for raw in interlaced(line)]
+    pitch = np.repeat([0.0, 0.0, 0.1], 4)
+    sweep = open_session(record(tmp_path / "s", (1, sent, pitch, np.arange(12.0)))).sweep(1)
+    dense[np.isinf(dense)] = np.nan
+    np.testing.assert_allclose(sweep.ranges, dense, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.degrees(sweep.bearings), np.arange(0, 180.1, 0.25))
+    assert sweep.time_s.tolist() == [1.5, 5.5, 9.5]
+    np.testing.assert_allclose(sweep.pitch, [0, 0, 0.1])
+
+
+def test_half_degree_parts_make_half_degree_lines(tmp_path):
+    dense = room(2, 721)
+    sent = [raw for line in dense for raw in interlaced(line)[::2]]
+    sweep = open_session(record(tmp_path / "s", (1, sent, 0.2))).sweep(1)
+    assert sweep.ranges.shape == (2, 361) and np.degrees(sweep.bearings[1]) == pytest.approx(0.5)
+
+
+def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(tmp_path):
+    a, b, c = room(3, 721, seed=2)
+    a[3:6] = 5.0
+    sent = interlaced(a, 100)[:2] + interlaced(b, 104)[2:] + interlaced(c, 254)
+    sweep = open_session(record(tmp_path / "s", (1, sent, 0.0))).sweep(1)
+    found = [{int(k) for k in np.arange(721)[np.isfinite(line)] % 4} for line in sweep.ranges]
+    assert found == [{0, 1}, {2, 3}, {0, 1, 2, 3}]
+
+
+def test_parts_at_different_pitch_or_placement_are_not_merged(tmp_path):
+    four = interlaced(np.full(721, 3.0))
+    session = open_session(record(tmp_path / "s", (1, four, [0, 0, 0.1, 0.1]), (2, four[:2], 0), (3, four[2:], 0)))
+    assert [session.sweep(p).ranges.shape[0] for p in (1, 2, 3)] == [2, 1, 1]
+
+
+def test_the_measuring_mode_follows_the_device(tmp_path):
+    far, near = np.full((1, 361), 20.0), np.full((1, 361), 7.5)
+    batches = (1, scans(far), 0.0), (-1, [configuration(0)]), (2, scans(near, mode=0, flags=5), 0.0)
+    session = open_session(record(tmp_path / "s", *batches))
+    np.testing.assert_allclose([session.sweep(1).ranges, session.sweep(2).ranges], [far, near])
+
+
+def test_without_configuration_the_factory_mode_is_assumed_and_told(tmp_path):
+    near = np.full((2, 401), 7.5)
+    session = open_session(record(tmp_path / "s", (1, scans(near, mode=0, flags=1), 0.0), first=scans(near, mode=0)[0]))
+    np.testing.assert_allclose(session.sweep(1).ranges, near)
+    (problem,) = session.problems
+    assert "telegrams.bin: no status or configuration telegram: measuring mode 00 (factory) assumed" in problem
+
+
+def test_other_telegrams_and_scans_of_no_placement_are_ignored(tmp_path):
+    a0 = encode_telegram(0xA0, b"\0", status=0x10)
+    short_f4 = encode_telegram(0xF4, b"\0", status=0x10)
+    batches = (-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0)
+    session = open_session(record(tmp_path / "s", *batches))
+    assert session.sweep(1).ranges.shape == (4, 401)
+    (problem,) = session.problems
+    assert "line 4, offset 51, length 9: reply F4 has 1 bytes of data, needs 7; ignored" in problem
+
+
+def test_sessions_of_scan_lines_have_no_telegrams(tmp_path):
+    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
+        writer.add_sweep(1, np.full((1, 3), 2.0), [1.0, 1.5, 2.0], [0.0])
+    with pytest.raises(SessionError, match="only lrf/telegrams.bin tells"):
+        open_session(tmp_path / "s").telegram_report()
+
+
+def test_a_report_of_an_unknown_placement_is_refused(path):
+    with pytest.raises(SessionError, match="no placement 7; the session has 1, 2"):
+        open_session(path).telegram_report(7)
+
+
+# --------------------------------------------------------------------------------------------------- damage
+
+
+def test_wrong_crcs_are_left_out_counted_and_named(path):
+    data = bytearray(telegrams(path).read_bytes())
+    data[42 + 812 + 100] ^= 4
+    data[42 + 4 * 812] = 3  # no start byte
+    telegrams(path).write_bytes(data)
+    session = open_session(path)
+    assert session.sweep(1).ranges.shape == (3, 401) and session.sweep(2).ranges.shape == (3, 401)
+    assert session.telegram_report()["wrong_crc_offsets"] == (854, 3290)
+    assert session.telegram_report(1)["outcomes"] == {"scan": 3, "other": 0, "wrong CRC": 1, "truncated": 0}
+    (problem,) = session.problems
+    assert "2 of 9 telegrams have a wrong CRC, left out, at 854, 3290" in problem
+
+
+@pytest.mark.parametrize("cut", [1, 400, 811, 812])
+def test_a_truncated_last_telegram_is_left_out_and_told(path, cut):
+    data = telegrams(path).read_bytes()
+    telegrams(path).write_bytes(data[:-cut])
+    session = open_session(path)
+    assert len(session.sweep(2).ranges) == 3 and session.telegram_report(2)["outcomes"]["truncated"] == 1
+    assert any(f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text for text in session.problems)
+
+
+def test_a_crash_between_data_and_index_loses_nothing_else(path):
+    with telegrams(path).open("ab") as stream:
+        stream.write(scans(room(1))[0])
+    session = open_session(path)
+    assert len(session.sweep(2).ranges) == 4
+    assert any("812 bytes after the last telegram in index.csv are not used" in text for text in session.problems)
+
+
+def test_a_row_cut_off_by_a_crash_is_left_out_until_finish_removes_it(path):
+    file = path / "lrf" / "index.csv"
+    whole = file.read_text()
+    file.write_text(whole[:-3])
+    session = open_session(path)
+    assert len(session.sweep(2).ranges) == 3
+    assert any("the last row is cut off" in text for text in session.problems)
+    finish(path)
+    assert file.read_text() == whole[: whole[:-1].rindex("\n") + 1]
+
+
+def set_cell(row, column, value):
+    return lambda rows: rows[row].__setitem__(column, value)
+
+
+MISMATCHES = {
+    r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore": set_cell(3, 1, "853"),
+    r"index\.csv: line 3, offset 42, length 6: telegrams of 7 or more bytes": set_cell(2, 2, "6"),
+    r"index\.csv: line 2, offset -1, length 42": set_cell(1, 1, ""),
+    r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing": set_cell(2, 4, ""),
+    r"index\.csv: .*invalid literal.*'x'": set_cell(2, 1, "x"),
+    r"index\.csv: no telegram in the index, 6538 bytes": lambda rows: rows.__delitem__(slice(1, None)),
+    r"a pitch is .* rad: degrees": set_cell(2, 4, "400"),
+}
+
+
+@pytest.mark.parametrize("message", MISMATCHES)
+def test_an_index_that_does_not_fit_is_refused(path, message):
+    edit_index(path, MISMATCHES[message])
+    with pytest.raises(SessionError, match=message):
+        open_session(path)
+
+
+def test_data_that_do_not_fit_the_index_are_refused(path):
+    data = telegrams(path).read_bytes()
+    telegrams(path).write_bytes(data[:2000])
+    message = r"line 5, offset 1666, length 812, but telegrams.bin has 2000 bytes: restore it, or remove the rows from"
+    with pytest.raises(SessionError, match=message):
+        open_session(path)
+    telegrams(path).write_bytes(b"\x06" + data)
+    with pytest.raises(SessionError, match="9 of 9 telegrams have a wrong CRC.*not of one recording"):
+        open_session(path)
+
+
+def test_mixed_variants_are_refused(tmp_path):
+    record(tmp_path / "s", (1, scans(room()), 0.0), (2, scans(room(beams=361)), 0.0))
+    with pytest.raises(SessionError, match="scans of 361, 401 values are mixed"):
+        open_session(tmp_path / "s")
+    record(tmp_path / "t", (1, scans(room(beams=361)), 0.0), (2, interlaced(np.ones(721)), 0.0))
+    with pytest.raises(SessionError, match="scans of 180, 181, 361 values are mixed"):
+        open_session(tmp_path / "t")
+
+
+def test_scans_of_a_sub_range_are_refused(tmp_path):
+    record(tmp_path / "s", (1, scans(room(beams=50)), 0.0))
+    with pytest.raises(SessionError, match=r"telegrams\.bin: a whole scan has .* values, got 50"):
+        open_session(tmp_path / "s")
+
+
+def test_modes_without_ranges_are_refused(tmp_path):
+    record(tmp_path / "s", (1, scans(room()), 0.0), first=configuration(0x3F))
+    with pytest.raises(SessionError, match=r"telegrams\.bin: measuring mode 0x3f is none of"):
+        open_session(tmp_path / "s")
+
+
+def test_a_recording_without_scans_is_refused(tmp_path):
+    record(tmp_path / "s", (-1, scans(room()), 0.0))
+    with pytest.raises(SessionError, match="no telegram with a scan belongs to a placement"):
+        open_session(tmp_path / "s")
+
+
+def test_the_writer_refuses_what_it_could_not_read_again(tmp_path):
+    one = scans(room(1))
+    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
+        for batch, message in (
+            ((1, one[0], 0.0), "one bytes each: put a single one into a list"),
+            ((1, [], 0.0), "got lengths none"),
+            ((1, [b"\x06"], 0.0), "7 or more bytes are needed, got lengths 1"),
+            ((1, one), "finite radians"),
+            ((1, one, 30.0), "a pitch is 30: finite radians"),
+            ((1, one, [0.0, 0.1]), "placement 1: .*shape"),
+        ):
+            with pytest.raises(SessionError, match=message):
+                writer.add_telegrams(*batch)
+        assert not telegrams(writer.path).exists()
+        writer.add_telegrams(1, one, 0.0)
+        with pytest.raises(SessionError, match="records telegrams: add_telegrams, or begin another"):
+            writer.add_sweep(2, np.ones((1, 3)), [1.0, 1.5, 2.0], [0.0])
+    with SessionWriter(tmp_path / "t", triangle_board(), LRF) as writer:
+        writer.add_sweep(1, np.ones((1, 3)), [1.0, 1.5, 2.0], [0.0])
+        with pytest.raises(SessionError, match="has scan lines: add_sweep, or begin another"):
+            writer.add_telegrams(1, one, 0.0)
+
+
+# ------------------------------------------------------------------------------------------- real recordings
+
+
+def test_a_real_recording_becomes_a_session(real_data, tmp_path):
+    file = real_data / "lms200_captures" / "2017_Aug_05__18-52-56.jsonl"
+    lines = [json.loads(line) for line in file.open()]
+    sent = [bytes.fromhex(line["hex"]) for line in lines if line["dir"] == "lms->host"]
+    half = LrfInfo("LMS200", (0.0, np.pi), np.radians(0.5), 0.005, max_range=16.0)
+    with SessionWriter(tmp_path / "s", triangle_board(), half) as writer:
+        writer.add_telegrams(1, sent, 0.0)
+    session = open_session(tmp_path / "s")
+    assert session.problems == () and session.sweep(1).ranges.shape == (165, 361)
+    outcomes = session.telegram_report(1)["outcomes"]
+    assert outcomes == {"scan": 165, "other": len(sent) - 165, "wrong CRC": 0, "truncated": 0}
+    assert 0.1 < np.nanmedian(session.sweep(1).ranges) < 16

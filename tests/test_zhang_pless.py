@@ -1,0 +1,245 @@
+"""Zhang-Pless: closed form, refinement, joint refinement with the intrinsics, degenerate boards."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_observations, random_board_poses, random_rig
+
+from lrfcal_lib.camera import project
+from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
+from lrfcal_lib.solvers import find_outlying_placements
+from lrfcal_lib.solvers.camera import plane_residuals_m
+from lrfcal_lib.solvers.planes import (
+    board_whitener,
+    compress,
+    correct_and_compress,
+    plane_block,
+    plane_sets,
+    plane_terms,
+    range_weights,
+)
+from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform
+from lrfcal_lib.solvers.zhang_pless import (
+    closed_form,
+    full_planes,
+    solve_zhang_pless,
+    solve_zhang_pless_batch,
+    solve_zhang_pless_joint,
+)
+
+OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
+
+
+def make(seed=0, count=12, spread=0.6, **options):
+    rng = np.random.default_rng(seed)
+    rig = random_rig(rng)
+    return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig, spread), **options)
+
+
+@pytest.mark.parametrize("source", ["lrf", "platform"])
+def test_closed_form_is_exact_on_exact_data(source):
+    rig, obs = make(1, source=source)
+    sets = plane_sets(obs)
+    triangles = compress(sets, 1.0)
+    assert full_planes(triangles) == (source == "platform")
+    found = pose_transform(closed_form(triangles, sets.boards, source == "platform"))
+    angle, distance = transform_difference(found, rig.T_camera_lrf)
+    assert angle < 1e-9 and distance < 1e-9
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_single_scan_lines_on_few_boards(count):
+    rig, obs = make(2, count)
+    found = solve_zhang_pless(obs)
+    assert np.abs(plane_residuals_m(obs, found.transform)).max() < 1e-9
+
+
+def test_compression_keeps_every_sum_of_squares():
+    rig, obs = make(3, noise=1.0, source="platform")
+    sets, rng = plane_sets(obs), np.random.default_rng(4)
+    triangles = compress(sets, 1.0)
+    for _ in range(5):
+        T = rig.T_camera_lrf * RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
+        full = np.sum(plane_residuals_m(obs, T) ** 2)
+        assert np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2) == pytest.approx(
+            full, rel=1e-12
+        )
+
+
+def test_plane_jacobians_against_numeric_ones():
+    rig, obs = make(5, noise=1.0)
+    sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
+    triangles = compress(sets, 100.0)
+    _, by_pose, by_board = plane_terms(pose, triangles, sets.boards)
+    for k, step in enumerate(1e-6 * np.eye(6)):
+        high, low = (plane_terms(move_pose(pose, s), triangles, sets.boards)[0] for s in (step, -step))
+        np.testing.assert_allclose(by_pose[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_pose).max())
+        high, low = (
+            plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0] for s in (step, -step)
+        )
+        np.testing.assert_allclose(by_board[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_board).max())
+
+
+def test_correlated_weighting_equals_the_full_covariance():
+    """Chi-square from four numbers a placement is that of all points with the board error common to them."""
+    rig, obs = make(6, noise=1.0)
+    sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf)
+    triangles, offset, rest = correct_and_compress(sets, pose)
+    whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
+    r = plane_block(pose, triangles, sets.boards, None, None, offset).residuals.reshape(12, 4)
+    compressed = np.sum((whitener @ r[..., None]) ** 2) + rest
+    sigma, expected = 1 / range_weights(sets, pose), 0.0
+    for g in range(12):
+        n, q = sets.boards[g][:, 2], sets.points[g] @ pose[:, :3].T + pose[:, 3]
+        lever = q - sets.boards[g][:, 3]
+        distance = lever @ n
+        slope = np.column_stack([np.cross(n, lever), np.tile(-n, (len(q), 1))])
+        C = np.diag(sigma[g] ** 2) + slope @ sets.board_covariance[g] @ slope.T
+        expected += distance @ np.linalg.solve(C, distance)
+    assert compressed == pytest.approx(expected, rel=1e-3)
+
+
+def test_plain_least_squares_agrees_with_scipy():
+    rig, obs = make(7, noise=1.0, source="platform")
+    start = pose_array(rig.T_camera_lrf)
+    theirs = scipy.optimize.least_squares(
+        lambda d: plane_residuals_m(obs, pose_transform(move_pose(start, d))),
+        np.zeros(6),
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
+    ours = solve_zhang_pless(obs, weighted=False)
+    np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=1e-7)
+    assert ours.n_observations == len(obs.plane_points)
+
+
+def test_batch_equals_single():
+    rig, obs = make(8, noise=1.0)
+    sets = plane_sets(obs)
+    rng = np.random.default_rng(9)
+    noise = rng.normal(0, 0.002, (3, *obs.plane_points.shape)) * [1, 1, 0]
+    stacked = [plane_sets(replace(obs, plane_points=obs.plane_points + e)) for e in noise]
+    batch = solve_zhang_pless_batch(replace(sets, points=np.array([s.points for s in stacked])), rig.T_camera_lrf)
+    for i, e in enumerate(noise):
+        single = solve_zhang_pless(replace(obs, plane_points=obs.plane_points + e), rig.T_camera_lrf)
+        np.testing.assert_allclose(batch.transform.as_matrix()[i], single.transform.as_matrix(), atol=1e-7)
+        np.testing.assert_allclose(batch.covariance[i], single.covariance, rtol=1e-3)
+
+
+def test_predicted_covariance_in_many_trials():
+    rig, obs = make(10, count=20, source="platform")
+    rng, sets = np.random.default_rng(11), plane_sets(obs)
+    trials = 300
+    root = np.linalg.cholesky(sets.covariance)
+    points = sets.points + (root @ rng.normal(size=(trials, *sets.points.shape, 1)))[..., 0]
+    moves = rng.normal(size=(trials, 20, 6)) * np.sqrt(np.diag(sets.board_covariance[0]))
+    boards = move_pose(np.broadcast_to(sets.boards, (trials, 20, 3, 4)), moves)
+    found = solve_zhang_pless_batch(replace(sets, points=points, boards=boards), rig.T_camera_lrf)
+    turn = found.transform.rotation * rig.T_camera_lrf.rotation.inv()
+    e = np.concatenate([turn.as_rotvec(), found.transform.translation - rig.T_camera_lrf.translation], axis=1)
+    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(found.covariance), e) / 6
+    assert 0.85 < nees.mean() < 1.15
+    assert np.abs(e.mean(axis=0) / (e.std(axis=0) / np.sqrt(trials))).max() < 4.5
+
+
+def test_robust_loss_resists_bad_board_poses():
+    rig, obs = make(12, count=16, noise=1.0)
+    poses = obs.board_poses.copy()
+    poses[[2, 7], :3, 3] += 0.15 * poses[[2, 7], :3, 2]
+    spoiled = replace(obs, board_poses=poses)
+    plain = transform_difference(solve_zhang_pless(spoiled).transform, rig.T_camera_lrf)[1]
+    robust = transform_difference(solve_zhang_pless(spoiled, loss="cauchy").transform, rig.T_camera_lrf)[1]
+    assert robust < 0.03 < plain
+    assert set(find_outlying_placements(spoiled).outlying) == {3, 8}
+
+
+def test_joint_refinement_repairs_the_intrinsics():
+    rig, obs = make(13, count=25, noise=0.3, sigma_px=0.05)
+    wrong = rig.model.with_parameters(rig.model.parameters + [8, -6, 5, -4, 0.02, -0.02, 0, 0, 0])
+    found = solve_zhang_pless_joint(replace(obs, model=wrong))
+    assert found.converged and found.names[6:8] == ("fx", "fy")
+    error = np.abs(found.model.parameters - rig.model.parameters)
+    assert np.all(error < 4.5 * np.sqrt(np.diag(found.model.covariance)))
+    assert error[:4].max() < 2.0
+    assert found.model.rms_px == pytest.approx(0.3 * 0.05 * np.sqrt(2), rel=0.15)
+
+
+def test_joint_solution_agrees_with_scipy():
+    rig, obs = make(14, count=4, noise=1.0, source="platform")
+    ours = solve_zhang_pless_joint(obs, sigma_plane=0.0)
+    sets = plane_sets(obs)
+    triangles, offset, _ = correct_and_compress(sets, pose_array(solve_zhang_pless(obs).transform))
+
+    def residuals(d):
+        pose = move_pose(pose_array(ours.transform), d[:6])
+        model = obs.model.with_parameters(ours.parameters[6:] + d[6:15] * 100)
+        boards = move_pose(obs.board_poses[:, :3], d[15:].reshape(-1, 6))
+        planes = plane_terms(pose, triangles, boards, offset)[0]
+        seen = project(obs.pattern_points @ boards[:, :, :3].swapaxes(1, 2) + boards[:, None, :, 3], model)
+        return np.concatenate([planes.ravel(), (seen - obs.pattern_pixels).ravel() / obs.pattern_sigma_px])
+
+    theirs = scipy.optimize.least_squares(residuals, np.zeros(15 + 24), xtol=1e-15, ftol=1e-15, x_scale="jac")
+    assert np.sum(ours.residuals**2) == pytest.approx(2 * theirs.cost, rel=1e-6)
+    np.testing.assert_allclose(theirs.x[:6], 0, atol=0.02 * ours.sigma[:6].max())
+
+
+def test_joint_refinement_skips_corners_that_were_not_seen():
+    rig, obs = make(15)
+    pixels = obs.pattern_pixels.copy()
+    pixels[::3, ::4] = np.nan
+    found = solve_zhang_pless_joint(replace(obs, pattern_pixels=pixels))
+    assert transform_difference(found.transform, rig.T_camera_lrf)[1] < 1e-9
+
+
+def test_joint_refinement_bears_errors_common_to_a_placement():
+    """Boards that bend by some millimetres must not bend the intrinsics."""
+    rig, obs = make(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
+    rng = np.random.default_rng(21)
+    shift = rng.normal(0, 0.008, 21)[obs.plane_placement]
+    along = obs.plane_points / np.linalg.norm(obs.plane_points, axis=1, keepdims=True)
+    bent = replace(obs, plane_points=obs.plane_points + shift[:, None] * along)
+    errors = [
+        np.abs(solve_zhang_pless_joint(bent, sigma_plane=s).model.parameters[:2] - rig.model.parameters[:2]).max()
+        for s in (0.0, None)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    found = solve_zhang_pless_joint(bent)
+    own = plane_residuals_m(bent, found.transform, found.board_poses)
+    assert found.board_poses.shape == (20, 4, 4) and np.sqrt(np.mean(own**2)) < 0.013
+
+
+def test_joint_refinement_needs_a_pattern():
+    _, obs = make(16, pattern=False)
+    with pytest.raises(ValueError, match="0 pattern corners"):
+        solve_zhang_pless_joint(obs)
+
+
+@pytest.mark.parametrize("solve", [solve_zhang_pless, solve_zhang_pless_joint])
+@pytest.mark.parametrize("source", ["lrf", "platform"])
+def test_parallel_boards_are_refused(solve, source):
+    rig, obs = make(17, spread=1e-4, source=source)
+    with pytest.raises(DegenerateGeometry, match="all 12 boards are parallel: the rotation about their normal"):
+        solve(obs, rig.T_camera_lrf)
+
+
+def test_boards_turned_about_one_axis_are_refused():
+    rng = np.random.default_rng(18)
+    rig = random_rig(rng)
+    poses = random_board_poses(rng, 8, rig, spread=1e-6)
+    poses = [
+        RigidTransform.from_components(p.translation, Rotation.from_rotvec([0, a, 0]) * p.rotation)
+        for p, a in zip(poses, np.linspace(-0.6, 0.6, 8), strict=True)
+    ]
+    obs = camera_observations(rng, rig, poses, source="platform")
+    with pytest.raises(DegenerateGeometry, match=r"turn about one axis only: the translation along \(.*1.00.*\)"):
+        solve_zhang_pless(obs)
+
+
+def test_too_few_placements_are_refused():
+    _, obs = make(19)
+    with pytest.raises(DegenerateGeometry, match="2 placements with a board pose"):
+        solve_zhang_pless(obs.select([1, 2]))
