@@ -2,17 +2,20 @@
 SESSION ?=
 PYTHON ?= python3
 RUN := .venv/bin/python
+SIMULATED := sim_lms221 sim_quick
 # one thread a process: two notebooks run side by side, and sums come out the same on every machine
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup report test notebooks lab clean
+.PHONY: help setup report test notebooks lab data bench clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
 	@echo "make test                    lint and run all tests, the notebooks included"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
+	@echo "make bench                   compare speed with scipy and OpenCV"
 	@echo "make lab [SESSION=path]      open JupyterLab"
+	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
 	@echo "make clean                   remove the environment, reports and caches"
 
 setup:
@@ -30,6 +33,18 @@ notebooks: setup
 
 lab: setup
 	$(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab notebooks
+
+bench: setup
+	@PYTHONPATH=tests $(RUN) tests/bench.py
+
+data: setup
+	rm -rf data/.new
+	mkdir data/.new
+	for name in $(SIMULATED); do $(RUN) -m lrfcal_lib simulate $$name data/.new/$$name || exit 1; done
+	rm -rf $(addprefix data/,$(SIMULATED))
+	mv $(addprefix data/.new/,$(SIMULATED)) data
+	rmdir data/.new
+	$(RUN) -c "from lrfcal_lib.simulate.card import write_card; write_card('data', '$(SIMULATED)'.split())"
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions

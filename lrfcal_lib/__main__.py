@@ -27,6 +27,16 @@ def _calibrate(args):
     return calibrate_session(args.session)
 
 
+def _simulate(args):
+    from lrfcal_lib.simulate.record import simulate
+    from lrfcal_lib.simulate.setups import SETUPS
+
+    if args.setup not in SETUPS:
+        raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")
+    simulate(args.dst, SETUPS[args.setup](), workers=args.workers)
+    print(f"{args.dst}: simulated")
+
+
 def _report(args):
     from lrfcal_lib.report import main
 
@@ -53,6 +63,11 @@ def parser():
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
     check.set_defaults(run=_check)
+    simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
+    simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
+    simulate.add_argument("dst", help="folder of the new session")
+    simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
+    simulate.set_defaults(run=_simulate)
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
     calibrate.set_defaults(run=_calibrate)

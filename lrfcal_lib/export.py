@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.evaluate import plane_residuals_of, rms, trusted_sigma
+from lrfcal_lib.evaluate import best_method, method_comparison, plane_residuals_of, rms, trusted_sigma
 from lrfcal_lib.pipeline import calibrate, color_cloud
 from lrfcal_lib.reconstruct import write_ply
 from lrfcal_lib.session import open_session
@@ -146,10 +146,14 @@ def calibrate_session(path, out=None):
         print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
     for key, why in (found.prepared.problems | found.problems).items():
         print(f"{key}: {why}")
-    if not any(method == "line" for _, method in found.solutions):
+    try:
+        method = best_method(method_comparison(found.observations, found.solutions))
+    except ValueError as error:
+        print(f"nothing written: {error}")
         return 1
-    record = calibration_record(found.prepared, found.platform, found.observations, found.solutions, "line")
+    print(f"handed over: {method}, the best on placements left out of the calibration")
+    record = calibration_record(found.prepared, found.platform, found.observations, found.solutions, method)
     write_calibration(folder / "calibration.json", record)
-    write_ply(folder / "cloud.ply", color_cloud(found))
+    write_ply(folder / "cloud.ply", color_cloud(found, method))
     print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")
     return 0

@@ -14,6 +14,7 @@ from lrfcal_lib.prepared import VARIANTS, Prepared
 from lrfcal_lib.preprocess import scan
 from lrfcal_lib.preprocess.observations import CameraObservations
 from lrfcal_lib.reconstruct import MeasuredBoard, measure_board
+from lrfcal_lib.solvers.outliers import find_outlying_placements
 from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
 
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
@@ -210,13 +211,7 @@ def name_sides(prepared, variant="half_step"):
     dict of int to dict of int to str
         Edge name by placement and side number. Sides farther than 8 cm from every edge stay unnamed.
     """
-    rough = {}
-    for camera in prepared.views:
-        obs = observe(prepared, camera, variant)
-        try:
-            rough[camera] = solve_zhang_pless(obs).transform
-        except DegenerateGeometry as error:
-            prepared.problems[f"camera {camera}"] = str(error)
+    rough = rough_poses(prepared, variant)
     names = {}
     for placement, along in prepared.edges[variant].items():
         to_board = _to_board(prepared, placement, rough)
@@ -232,6 +227,35 @@ def name_sides(prepared, variant="half_step"):
             {f"{placement} {side}": f"placement {placement}: {why}" for side, why in crooked.items()}
         )
     return names
+
+
+def rough_poses(prepared, variant="half_step"):
+    """Poses of the cameras from the planes alone, and which placements disagree with all others.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Its `problems` gain an entry for each outlying placement, and each camera without a pose.
+    variant : str
+
+    Returns
+    -------
+    dict of str to RigidTransform
+        ``T_camera_source`` by camera.
+    """
+    rough = {}
+    for camera in prepared.views:
+        obs = observe(prepared, camera, variant)
+        try:
+            judged = find_outlying_placements(obs, "planes")
+            rough[camera] = solve_zhang_pless(obs.select(judged.inliers)).transform
+        except DegenerateGeometry as error:
+            prepared.problems[f"camera {camera}"] = str(error)
+            continue
+        for placement in judged.outlying:
+            miss = 1000 * judged.rms[judged.placements == placement][0]
+            prepared.problems[placement] = f"camera {camera}: its plane is {miss:.0f} mm rms off the scan; left out"
+    return rough
 
 
 def _to_board(prepared, placement, rough):
@@ -253,12 +277,12 @@ def _nearest_edges(board, sides):
     numbers = list(sides)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number, edge = numbers[row], board.edges[column]
-        turned = _angle_to_line(sides[number], lines[column])
+        turned, allowed = _angle_to_line(sides[number], lines[column])
         if cost[row, column] > NAME_DISTANCE:
             problems[number] = (
                 f"a side of the scan is {1000 * cost[row, column]:.0f} mm from the edge '{edge}': not used"
             )
-        elif turned > NAME_ANGLE:
+        elif turned > allowed:
             problems[number] = (
                 f"the scan's side '{edge}' is turned by {np.rad2deg(turned):.1f} deg against the board: not used"
             )
@@ -268,11 +292,13 @@ def _nearest_edges(board, sides):
 
 
 def _angle_to_line(points, line):
-    """Angle between the line through board-frame points and a board line, radians; 0 for fewer than 3 points."""
+    """Angle between the line through board-frame points and a board line, and how large noise lets it be, radians."""
     if len(points) < 3:
-        return 0.0
-    direction = fit_line(points)[1]
-    return float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
+        return 0.0, NAME_ANGLE
+    _, direction, rms = fit_line(points)
+    angle = float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
+    length = np.ptp(points @ direction)
+    return angle, float(np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / length))
 
 
 def _stretch(found, side):

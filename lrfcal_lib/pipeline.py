@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -48,8 +47,20 @@ def prepare(session):
         Placements that cannot be used are in `problems` with their reason.
     """
     ready = prepare_images(prepare_scans(session))
-    ready = replace(ready, names=name_sides(ready))
+    ready = without(replace(ready, names=name_sides(ready)))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
+
+
+def without(prepared):
+    """Drop the placements that are named in `problems` from everything but the images."""
+    bad = {key for key in prepared.problems if key in prepared.scans}
+
+    def kept(found):
+        return {key: value for key, value in found.items() if key not in bad}
+
+    edges = {variant: kept(found) for variant, found in prepared.edges.items()}
+    swept = {variant: kept(found) for variant, found in prepared.swept.items()}
+    return replace(prepared, scans=kept(prepared.scans), edges=edges, swept=swept, names=kept(prepared.names))
 
 
 def find_pitch_errors(prepared):
@@ -331,8 +342,8 @@ def stereo_reference(prepared):
     return (first, second), T_second_first, covariance
 
 
-def color_cloud(calibration, method="line", every=1):
-    """All sweeps of a session as one coloured cloud in the platform frame.
+def color_cloud(calibration, method="line", every=1, scene=False):
+    """Sweeps of a session as one coloured cloud in the platform frame.
 
     Parameters
     ----------
@@ -341,36 +352,42 @@ def color_cloud(calibration, method="line", every=1):
         Whose camera poses colour the cloud.
     every : int
         Take every n-th point of a sweep.
+    scene : bool
+        The sweeps of scenes, with all their returns, instead of the boards.
 
     Returns
     -------
     Cloud
         Each sweep takes its colours from the images of its own placement, of all cameras that see the point.
+
+    Raises
+    ------
+    ValueError
+        If there is no such sweep.
     """
-    prepared, clouds = calibration.prepared, []
-    for placement, board in prepared.scans.items():
-        line, beam = (index[::every] for index in np.nonzero(board.mask))
-        p_lrf = polar_to_points(board.sweep.ranges[line, beam], board.sweep.bearings[beam])
-        pitch = board.sweep.pitch[line]
-        points = lrf_to_platform(p_lrf, pitch, calibration.platform.T_head_lrf)
-        layers = [_layer(calibration, method, camera, placement, p_lrf, pitch) for camera in prepared.views]
-        colors, seen = blend([layer for layer in layers if layer is not None] or [np.full(points.shape, np.nan)])
-        clouds.append(Cloud(points, colors, seen, np.full(len(points), placement)))
-    return join(clouds)
+    session, scans = calibration.prepared.session, calibration.prepared.scans
+    masks = {p: np.isfinite(session.sweep(p).ranges) for p in session.scene_placements} if scene else {}
+    masks = masks if scene else {p: board.mask for p, board in scans.items()}
+    if not masks:
+        raise ValueError(f"{session.name}: no sweep of {'a scene' if scene else 'the board'} to colour")
+    return join([_color_sweep(calibration, method, placement, mask, every) for placement, mask in masks.items()])
 
 
-def _layer(calibration, method, camera, placement, p_lrf, pitch):
-    """Colours that one camera gives to the points of a placement, None without an image or a calibration."""
-    prepared, session = calibration.prepared, calibration.prepared.session
-    view = prepared.views[camera].get(placement)
-    if view is None or (camera, method) not in calibration.solutions:
-        return None
-    record = next(r for r in session.images(camera, placement=placement) if r.file.name == Path(view.file).name)
-    mount = session.cameras[camera].mount
-    image_pitch = view.pitch if mount == "head" else 0.0
-    points = lrf_to_source(p_lrf, pitch, calibration.platform.T_head_lrf, mount, image_pitch)
-    transform = calibration.solutions[camera, method].transform
-    return color_points(points, session.read_image(record), transform, prepared.models[camera])[0]
+def _color_sweep(calibration, method, placement, mask, every):
+    session, T_head_lrf = calibration.prepared.session, calibration.platform.T_head_lrf
+    sweep = session.sweep(placement)
+    line, beam = (index[::every] for index in np.nonzero(mask))
+    p_lrf, pitch = polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam]), sweep.pitch[line]
+    layers = [np.full(p_lrf.shape, np.nan)]
+    for record in session.images(placement=placement):
+        mount = session.cameras[record.camera].mount
+        if (record.camera, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
+            points = lrf_to_source(p_lrf, pitch, T_head_lrf, mount, 0.0 if mount == "platform" else record.pitch)
+            T_camera_source = calibration.solutions[record.camera, method].transform
+            model, image = calibration.prepared.models[record.camera], session.read_image(record)
+            layers.append(color_points(points, image, T_camera_source, model)[0])
+    colors, seen = blend(layers)
+    return Cloud(lrf_to_platform(p_lrf, pitch, T_head_lrf), colors, seen, np.full(len(pitch), placement))
 
 
 def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):

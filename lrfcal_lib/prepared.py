@@ -92,7 +92,7 @@ def prepare_scans(session):
     """
     scans, problems = {}, {}
     edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
-    for placement in session.placements:
+    for placement in session.board_placements:
         try:
             scans[placement] = scan.find_board(session.sweep(placement), session.board, session.T_head_lrf)
             for variant in VARIANTS:
@@ -116,7 +116,7 @@ def prepare_images(prepared):
     -------
     Prepared
     """
-    seen = image.views_of(prepared.session)
+    seen = image.views_of(prepared.session, one_per_placement=True)
     views = {camera: _main_views(found) for camera, found in seen.views.items()}
     return replace(
         prepared, board=seen.board, models=seen.models, views=views, outline=seen.outline, relief=seen.relief

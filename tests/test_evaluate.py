@@ -96,3 +96,11 @@ def test_summary_groups_by_source_ends_and_variant():
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "error_mm"]
     row = evaluate.edge_summary(pd.DataFrame(rows, columns=columns)).iloc[0]
     assert (row.n, row.mean_abs_error_mm, row.mean_error_mm) == (2, 2.0, 1.0)
+
+
+def test_the_method_handed_over_does_well_on_both_features():
+    columns = ["method", "left_out_edge_rms_px", "left_out_plane_rms_mm"]
+    rows = [("line", 4.7, 42.0), ("zhang_pless", 6.0, 8.9), ("bauermann", 0.1, 0.1)]
+    assert evaluate.best_method(pd.DataFrame(rows, columns=columns)) == "zhang_pless"
+    with pytest.raises(ValueError, match="left-out placements"):
+        evaluate.best_method(pd.DataFrame([("line", np.nan, 1.0)], columns=columns))

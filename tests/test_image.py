@@ -1,5 +1,6 @@
 """Corners, intrinsics, poses, straight edges and outlines from images whose truth is computed, and from real ones."""
 
+import json
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,10 +12,22 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
+from lrfcal_lib.notebook import ROOT
 from lrfcal_lib.preprocess import adjustment, image, wide
 from lrfcal_lib.preprocess.edges import ImageEdge, correlation_factor, picked_edge, refine_edge
-from lrfcal_lib.preprocess.pattern import estimate_relief, mirror_pattern, stereo_transform, turn_pattern
+from lrfcal_lib.preprocess.pattern import (
+    PatternFinder,
+    estimate_relief,
+    grid_noise,
+    mirror_pattern,
+    spread_views,
+    stereo_transform,
+    turn_pattern,
+)
 from lrfcal_lib.preprocess.silhouette import find_polygon
+from lrfcal_lib.preprocess.together import mirrored_pose, pose_with_edges
+from lrfcal_lib.preprocess.view import best_order
+from lrfcal_lib.session import open_session
 
 MODEL = CameraModel(640, 480, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
 PATTERN = Chessboard(6, 4, 0.05)
@@ -138,6 +151,41 @@ def test_corners_are_found_at_subpixel_level(roll, limit):
     exact = project(pose.apply(PATTERN.points()), MODEL)
     error = min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found)))
     assert error < limit
+
+
+def test_white_squares_on_a_dark_board_are_found():
+    finder = PatternFinder(PATTERN)
+    for pose in view_poses(3, seed=4):
+        found = finder(255 - render(pose))
+        exact = project(pose.apply(PATTERN.points()), MODEL)
+        assert min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found))) < 0.1
+    # a finder that has seen the negative still finds the positive
+    np.testing.assert_array_equal(finder(render(pose)), image.find_pattern(render(pose), PATTERN))
+
+
+def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
+    poses = view_poses(40, seed=2)
+    exact = [grid_noise(p, (6, 4)) for p in pixels_of(poses)]
+    assert max(exact) < 0.01
+    noisy = [grid_noise(p, (6, 4)) for p in pixels_of(poses, 0.2)]
+    # 28 of the 48 coordinates go into the homography and the polynomials, of which the lowest terms count twice
+    assert np.sqrt(np.mean(np.square(noisy))) == pytest.approx(0.2 * np.sqrt(2 * 28 / 48), rel=0.1)
+    pulled = pixels_of(poses[:1])[0]
+    pulled[8] += [1.0, 0.0]
+    assert grid_noise(pulled, (6, 4)) > 0.1
+    small = Chessboard(3, 3, 0.05)
+    assert grid_noise(pixels_of(poses[:1], points=small.points())[0], (3, 3)) < 0.05
+
+
+def test_views_that_differ_most_come_first():
+    groups = np.repeat(pixels_of(view_poses(5, seed=1)), 6, axis=0)
+    rng = np.random.default_rng(0)
+    views = groups + rng.normal(0, 0.1, groups.shape)
+    chosen = spread_views(views, 5)
+    assert sorted(i // 6 for i in chosen) == [0, 1, 2, 3, 4]
+    assert np.ptp(views, axis=1).prod(axis=1).argmax() == chosen[0]
+    assert sorted(spread_views(views[:3], 25)) == [0, 1, 2]
+    assert spread_views([], 25) == []
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
@@ -318,6 +366,71 @@ def test_edges_before_clutter():
     view = image.view_board(render(pose, background=clutter()), SHEET, MODEL)
     assert len(view.edges) == 4
     assert max(edge_errors(view, pose).values()) < 0.3
+
+
+@pytest.mark.parametrize("background", [170.0, None])
+def test_the_order_of_corners_follows_the_outline(background):
+    for i, pose in enumerate(view_poses(4, seed=6)):
+        picture = render(pose, background=clutter(i) if background is None else background)
+        exact = pixels_of([pose])[0]
+        mirrored = mirror_pattern(exact, PATTERN)
+        for start in (exact, turn_pattern(exact), mirrored, turn_pattern(mirrored)):
+            np.testing.assert_array_equal(best_order(picture, SHEET, MODEL, start), exact)
+
+
+FAR = pose_of(0.3, (0.14, -0.1), (0.1, 0.0, 3.0))
+
+
+def noisy_edges(pose, seed, sigma=0.1):
+    """All four edges as a detector with that error (of the two ends alike) would see them, and their covariances."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for i, name in enumerate(SHEET.edges):
+        ends = pinhole(pose.apply(np.column_stack([CORNERS[[i, (i + 1) % 4]], [0, 0]])), MODEL)
+        exact = true_line(name, pose)
+        edge = picked_edge(name, *(ends + rng.normal(0, sigma, (2, 1)) * exact[:2]), exact[:2], sigma)
+        out.append(replace(edge, picked=False))
+    return out
+
+
+def test_corners_and_edges_together_are_better_and_know_how_much():
+    chi2, alone, both = [], [], []
+    for seed in range(60):
+        pixels = pixels_of([FAR], 0.1, seed)[0]
+        start = image.board_pose(pixels, PATTERN, MODEL)
+        pose, covariance = pose_with_edges(*start, pixels, noisy_edges(FAR, 100 + seed), SHEET, MODEL)
+        error = small_turn(pose, FAR)
+        chi2.append(error @ np.linalg.solve(covariance, error) / 6)
+        alone.append(np.abs(small_turn(start[0], FAR)))
+        both.append(np.abs(error))
+        assert np.all(np.diag(covariance) < np.diag(start[1]) * (1 + 1e-9)) or (
+            start[0].rotation * pose.rotation.inv()
+        ).magnitude() > 0.05
+    assert 0.5 < np.mean(chi2) < 1.5
+    assert np.all(np.median(both, axis=0) < np.median(alone, axis=0))
+
+
+def test_edges_tell_a_pose_from_its_mirror_in_depth():
+    pixels = pixels_of([FAR], 0.05, 1)[0]
+    wrong = mirrored_pose(FAR, PATTERN)
+    assert (wrong.rotation * FAR.rotation.inv()).magnitude() > 0.2
+    np.testing.assert_allclose(mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12)
+    covariance = np.diag([1e-4] * 3 + [1e-6] * 3)
+    pose, _ = pose_with_edges(wrong, covariance, pixels, noisy_edges(FAR, 2), SHEET, MODEL)
+    assert (pose.rotation * FAR.rotation.inv()).magnitude() < 0.05
+
+
+def test_an_edge_that_contradicts_the_corners_is_left_out():
+    pixels = pixels_of([FAR], 0.05, 1)[0]
+    start = image.board_pose(pixels, PATTERN, MODEL)
+    edges = noisy_edges(FAR, 3, 0.05)
+    good, _ = pose_with_edges(*start, pixels, edges[:3], SHEET, MODEL)
+    moved = replace(edges[3], line=edges[3].line + [0, 0, 9.0])
+    same, _ = pose_with_edges(*start, pixels, [*edges[:3], moved], SHEET, MODEL)
+    np.testing.assert_allclose(same.as_matrix(), good.as_matrix(), atol=1e-9)
+    only, covariance = pose_with_edges(*start, pixels, [moved], SHEET, MODEL)
+    assert only is start[0] and covariance is start[1]
+    assert pose_with_edges(*start, pixels, [], SHEET, MODEL) == start
 
 
 def test_a_board_frame_whose_z_points_out_is_recognised_by_its_outline():
@@ -530,6 +643,56 @@ def test_images_for_the_intrinsics_make_no_views_and_blank_images_say_why(sessio
     assert "inner corners" in found.views["left"][-1].reason
 
 
+def at_three_pitches(read, blank=()):
+    """Every picture of the left camera as three records, some of them without a board."""
+    records = [
+        Record("left", Path(f"/s/left/{i}_{k}.png"), i, pitch)
+        for i in range(4)
+        for k, pitch in enumerate((-0.3, 0.4, 0.1))
+    ]
+    nothing = np.zeros((480, 640, 3), np.uint8)
+    base = {i: Record("left", Path("/"), i) for i in range(4)}
+    return records, lambda r: nothing if r.file.stem in blank else read(base[r.placement])
+
+
+def test_one_image_a_placement_is_the_middle_one_that_shows_the_board(session):
+    records, read = at_three_pitches(session[2], {"1_2", "2_0", "2_1", "2_2"})
+    found = image.survey(records, read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
+    assert [v.file for v in found] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png"]
+    assert [v.reason == "" for v in found] == [True, True, False, True]
+    everything = image.survey(records, read, SHEET, {"left": MODEL}).views["left"]
+    assert len(everything) == 12
+    unknown = [replace(r, pitch=np.nan) for r in records]
+    found = image.survey(unknown[:3], read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
+    assert [v.file for v in found] == ["0_0.png"]
+
+
+def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
+    picture = render(triangle_pose(), TRIANGLE)
+    records, read = at_three_pitches(lambda r: picture, {"1_2"})
+    loose = [replace(r, placement=-1, file=Path(f"/s/left/x{i}.png")) for i, r in enumerate(records[:2])]
+    found = image.survey(
+        records + loose,
+        lambda r: picture if r.placement < 0 else read(r),
+        TRIANGLE,
+        {"left": MODEL},
+        one_per_placement=True,
+    )
+    shown = found.views["left"]
+    assert [v.file for v in shown] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png", "x0.png", "x1.png"]
+    assert all(v.reason == "" for v in shown)
+
+
+def test_intrinsics_use_a_spread_of_the_images():
+    pixels = list(pixels_of(view_poses(40)))
+    group = [Record("left", Path("a"), i, purpose="intrinsics" if i < 20 else "board") for i in range(40)]
+    chosen = image._for_intrinsics(["no board", *pixels[1:]], group)
+    assert len(chosen) == image.VIEWS_FOR_INTRINSICS
+    mine = {id(p) for p in pixels[1:20]}
+    assert mine <= {id(p) for p in chosen}
+    assert len(image._for_intrinsics(pixels, [replace(r, purpose="board") for r in group])) == 40
+
+
 def test_picks_reach_their_image_in_a_survey(session):
     poses, records, read = session
     corners = project(poses["left", 1].apply(np.column_stack([CORNERS, np.zeros(4)])), MODEL)
@@ -681,6 +844,31 @@ def test_plain_boards_in_a_survey():
     found = image.survey([Record("left", Path("/s/0.png"), 0)], lambda r: picture, TRIANGLE, {"left": MODEL})
     assert found.outline is None and found.board is TRIANGLE
     assert len(found.views["left"][0].edges) == 3
+
+
+# --- a simulated session -------------------------------------------------------------------------------------------
+
+
+def test_poses_in_a_simulated_session_are_as_good_as_they_say():
+    session = open_session(ROOT / "data" / "sim_quick")
+    truth = json.loads((session.path / "truth.json").read_text())
+    models = {}
+    for name, info in session.cameras.items():
+        stated = truth["cameras"][name]["intrinsics"]
+        lens = [stated[key] for key in ("fx", "fy", "cx", "cy")]
+        models[name] = CameraModel(info.width, info.height, *lens, np.array(stated["distortion"]))
+    found = image.views_of(session, models, one_per_placement=True)
+    chi2 = []
+    for view in (v for group in found.views.values() for v in group):
+        stated = truth["images"][f"images/{view.camera}/{view.file}"]["T_camera_board"]
+        exact = RigidTransform.from_components(
+            stated["translation_m"], Rotation.from_rotvec(stated["rotation_vector_rad"])
+        )
+        error = small_turn(view.T_camera_board, exact)
+        chi2.append(error @ np.linalg.solve(view.covariance, error) / 6)
+        assert len(view.edges) == 3
+    assert len(chi2) == len(session.cameras) * len(session.board_placements)
+    assert 0.2 < np.mean(chi2) < 2.0
 
 
 # --- real recordings -----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib import pairing, pipeline
 from lrfcal_lib.board import triangle_board
 from lrfcal_lib.geometry import axis_difference, axis_of
-from lrfcal_lib.prepared import PitchNoise
+from lrfcal_lib.prepared import PitchNoise, Prepared
 from lrfcal_lib.solvers.platform import chart_parameters
 from lrfcal_lib.solvers.pose import pose_array
 
@@ -94,3 +94,12 @@ def test_thinning_keeps_the_ends():
     kept = pairing.thin(rows, 24)
     assert len(kept) == 24 and kept[0] == 5 and kept[-1] == 204
     assert (pairing.thin(rows[:7], 24) == rows[:7]).all()
+
+
+def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
+    parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
+    ready = Prepared(None, None, {1: "a", 2: "b"}, parts, parts, names={1: {}, 2: {}}, views={"left": {1: "v", 2: "v"}})
+    ready.problems.update({2: "off", "2 0": "a side, not a placement"})
+    left = pipeline.without(ready)
+    assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]
+    assert list(left.views["left"]) == [1, 2]

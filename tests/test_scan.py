@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from matplotlib.path import Path as Polygon
+from scipy import ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.board import Board, triangle_board
@@ -147,6 +148,95 @@ def test_a_board_of_another_size_is_not_taken():
         scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
 
 
+def behind(s, centre, width, length, depth):
+    """Ranges of a scene with a strip `depth` behind the board, its axis down from `centre` (board frame), mixed."""
+    pitch = np.repeat(s.sweep.pitch[:, None], len(s.sweep.bearings), axis=1)
+    origin = lrf_to_platform(np.zeros(pitch.shape + (3,)), pitch, HEAD)
+    rays = lrf_to_platform(polar_to_points(np.ones(pitch.shape), s.sweep.bearings), pitch, HEAD) - origin
+    normal = s.pose.rotation.apply([0, 0, 1.0])
+    normal = normal * np.sign(normal[1])
+    r = (normal @ s.pose.translation + depth - origin @ normal) / (rays @ normal)
+    at = s.pose.inv().apply((origin + r[..., None] * rays).reshape(-1, 3))[:, :2].reshape(pitch.shape + (2,)) - centre
+    strip = (np.abs(at[..., 0]) < width / 2) & (at[..., 1] > 0) & (at[..., 1] < length)
+    ranges = np.where(strip & ~s.on, np.minimum(r, s.sweep.ranges), s.sweep.ranges)
+    near = np.where(np.isfinite(ranges) & (s.on | strip), ranges, np.nan)
+    padded = np.pad(near, ((0, 0), (2, 2)), constant_values=np.nan)
+    windows = np.stack([padded[:, k : k + near.shape[1]] for k in range(5)])
+    full = np.isfinite(windows).sum(axis=0)
+    mean = np.nansum(windows, axis=0) / np.maximum(full, 1)
+    mixed = np.isfinite(near) & (ndimage.binary_dilation(strip & ~s.on, np.ones((5, 5))))
+    return np.where(mixed, mean, ranges), strip & ~s.on
+
+
+NOISY = {"step": 0.25, "pitch_step": 0.25, "sigma": 0.01}
+TRIANGLE = triangle_board()
+
+
+def noisy_triangle(seed=0, roll=25.0, distance=1.5, **options):
+    return scene(TRIANGLE, facing(distance, roll, 20.0, (0.1, 0.13)), seed=seed, **(NOISY | options))
+
+
+def test_the_returns_of_a_noisy_device_all_count():
+    s = noisy_triangle()
+    b = found(s)
+    assert np.sum(b.mask & s.on) > 0.99 * s.on.sum() and np.sum(b.mask & ~s.on) < 0.005 * s.on.sum()
+    assert b.sigma_range == pytest.approx(0.01, rel=0.06)
+
+
+def shelf(s, row, beams=(60, 100), near=0.95, deep=0.25):
+    """A shelf at the height of the sensor that a single scan line sees, triangular in the scan plane."""
+    ranges = s.sweep.ranges.copy()
+    ranges[row, slice(*beams)] = near + deep * np.abs(np.linspace(-1, 1, beams[1] - beams[0]))
+    return ranges
+
+
+def test_points_of_one_scan_line_are_no_board():
+    s = noisy_triangle()
+    ranges = shelf(s, 12)
+    assert np.mean(found(spoiled(s, ranges)).mask != s.on) < 2e-3
+    alone = np.where(s.on, np.nan, ranges)
+    with pytest.raises(scan.BoardNotFound, match="on 1 of 161 scan lines"):
+        found(spoiled(s, alone))
+
+
+@pytest.mark.parametrize("roll", [25.0, 70.0, 160.0, 250.0])
+def test_a_board_that_makes_one_plane_with_its_post_is_refused(roll):
+    s = noisy_triangle(roll=roll)
+    with pytest.raises(scan.BoardNotFound, match=r"no flat surface of the board's size; seen: 0\.\d+ m2"):
+        found(spoiled(s, behind(s, (0.08, 0.05), 0.06, 1.0, 0.01)[0]))
+
+
+def test_a_plane_seen_along_itself_is_no_board():
+    s = noisy_triangle(wall=None)
+    flat = np.abs(np.degrees(s.sweep.bearings)[None] - 70) < 0.6
+    ranges = np.full(s.on.shape, np.nan)
+    depth = 1.0 + 0.25 * np.random.default_rng(0).random(s.on.shape) ** 0.5
+    ranges[40:80] = np.where(flat, depth, np.nan)[40:80]
+    with pytest.raises(scan.BoardNotFound, match="seen along itself"):
+        found(spoiled(s, np.sort(ranges, axis=0)))
+
+
+def test_what_clutter_leaves_on_a_plane_is_no_board():
+    s = noisy_triangle(wall=None)
+    hidden = np.random.default_rng(1).random(s.on.shape) < 0.75
+    with pytest.raises(scan.BoardNotFound, match="filled to 2[0-9] %"):
+        found(spoiled(s, np.where(hidden, np.nan, s.sweep.ranges)))
+
+
+@pytest.mark.parametrize("roll", [25.0, 70.0, 160.0, 250.0])
+def test_a_post_behind_the_board_is_no_part_of_it(roll):
+    s = noisy_triangle(roll=roll)
+    ranges, post = behind(s, (0.08, 0.05), 0.06, 1.0, 0.2)
+    b = found(spoiled(s, ranges))
+    assert post.sum() > 50 and not np.any(b.mask & post)
+    for e in (scan.edge_points(b), scan.sweep_edges(b)):
+        assert 1 <= len(e.sides) <= 3
+        error = s.edge_errors(e)[0][e.side >= 0]
+        assert np.abs(error).max() < 0.025 and np.mean(np.abs(error)) < 0.006
+        for side, turned in directions(s, e):
+            assert turned < 4 * side.angle_sigma
+
+
 # ---------------------------------------------------------------------------------------------- filter and fit
 
 
@@ -274,6 +364,34 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns():
     names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
     assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3]
     assert np.abs(s.edge_errors(lines)[0][lines.side >= 0]).max() < 0.008
+
+
+def directions(s, e):
+    """Each side with the angle between it and the true edge nearest to its points, radians."""
+    edge, lines = s.edge_errors(e)[1], s.board.lines()
+    p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))[:, :2]
+    for side in e.sides:
+        mine = e.side == side.side
+        along = np.linalg.svd(p[mine] - p[mine].mean(axis=0))[2][0]
+        yield side, np.arcsin(min(abs(along @ lines[np.bincount(edge[mine]).argmax(), :2]), 1.0))
+
+
+def test_sides_are_turned_as_little_as_their_sigma_says():
+    turned = []
+    for seed in range(8):
+        b = found(s := noisy_triangle(seed, roll=10.0 + 40 * seed))
+        for e in (scan.edge_points(b), scan.sweep_edges(b)):
+            turned += [angle / side.angle_sigma for side, angle in directions(s, e)]
+    assert len(turned) > 30 and max(turned) < 1.5  # a spot of no size before an even wall does better than a real one
+
+
+def test_the_sigma_of_a_direction_is_that_of_neighbours_which_share_their_errors():
+    rng, t = np.random.default_rng(0), np.linspace(0, 0.4, 40)
+    noise = np.repeat(0.01 * rng.standard_normal((3000, 20)), 2, axis=1)
+    slopes = np.polyfit(t, noise.T, 1)[0]
+    side = scan.ScanSide(0, 1, 40, 0.4, 0.01, 1.0, np.zeros((2, 3)))
+    assert side.angle_sigma == pytest.approx(np.std(slopes), rel=0.15)
+    assert replace(side, rms=0.0).angle_sigma > 0
 
 
 def test_both_variants_number_the_sides_alike():

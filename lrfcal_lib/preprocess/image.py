@@ -18,11 +18,13 @@ from lrfcal_lib.preprocess.adjustment import Adjustment
 from lrfcal_lib.preprocess.edges import EdgeNotSeen, ImageEdge
 from lrfcal_lib.preprocess.outline import Outline, edge_lengths, measure_outline, rough_outline
 from lrfcal_lib.preprocess.pattern import (
+    PatternFinder,
     PatternNotFound,
     board_pose,
     estimate_intrinsics,
     estimate_relief,
     find_pattern,
+    spread_views,
     stereo_transform,
     turn_pattern,
 )
@@ -50,6 +52,7 @@ __all__ = [
     "views_of",
 ]
 LEAST_VIEWS_FOR_RELIEF = 8
+VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
 REMEMBERED_IMAGES = 128
 
 
@@ -77,7 +80,7 @@ class Survey:
     relief: np.ndarray | None = field(default=None, repr=False)
 
 
-def survey(records, read, board, models, picks=()):
+def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
 
     Parameters
@@ -90,6 +93,9 @@ def survey(records, read, board, models, picks=()):
     models : dict of str to (CameraModel or None)
         By camera; None asks for an estimate from these images.
     picks : sequence of EdgePick
+    one_per_placement : bool
+        Use one image of each camera and placement: of those that show the pattern the one whose pitch is nearest to
+        the middle of the placement's images. Images of no placement are all used.
 
     Returns
     -------
@@ -101,16 +107,16 @@ def survey(records, read, board, models, picks=()):
         If a camera has no intrinsics and the board no pattern, or too few images show it.
     """
     read = lru_cache(maxsize=REMEMBERED_IMAGES)(read)
-    cameras = {c: [r for r in records if r.camera == c] for c in models}
+    choices = {c: _choices([r for r in records if r.camera == c], one_per_placement) for c in models}
     if board.pattern is None:
-        return _survey_plain(cameras, read, board, models, picks)
-    found = {c: [_try_pattern(read(r), board) for r in group] for c, group in cameras.items()}
+        return _survey_plain(choices, read, board, models, picks)
+    cameras, found = _find_all(choices, read, PatternFinder(board.pattern))
     flat = {c: m or _intrinsics(c, found[c], board, cameras[c], read) for c, m in models.items()}
     if board.corners is not None:
         lines, ordered = None, _ordered_by_outline(cameras, read, board, flat, found)
     else:
         lines, ordered = _ordered_by_votes(cameras, read, board, flat, found)
-    models, relief = _with_relief(ordered, board, models, flat)
+    models, relief = _with_relief(ordered, cameras, board, models, flat)
     outline = None if lines is None else rough_outline(lines, board)
     for _ in range(1 if lines is None else 2):
         views = _view_all(cameras, read, board, models, outline, picks, ordered, relief)
@@ -118,16 +124,63 @@ def survey(records, read, board, models, picks=()):
     return Survey(views, models, outline, board if outline is None else outline.board, relief)
 
 
-def _survey_plain(cameras, read, board, models, picks):
+def _choices(group, one_per_placement):
+    """Records of one camera, in lists of those of which one is to be used, the best first."""
+    if not one_per_placement:
+        return [[r] for r in group]
+    out = {}
+    for i, record in enumerate(group):
+        alone = record.placement < 0 or record.purpose == "intrinsics"
+        out.setdefault(("image", i) if alone else ("placement", record.placement), []).append(record)
+    return [_from_the_middle(records) for records in out.values()]
+
+
+def _from_the_middle(records):
+    pitch = np.array([r.pitch for r in records], float)
+    if len(records) < 2 or not np.isfinite(pitch).any():
+        return records
+    middle = (np.nanmin(pitch) + np.nanmax(pitch)) / 2
+    return [records[i] for i in np.argsort(np.abs(pitch - middle), kind="stable")]
+
+
+def _first_usable(records, attempt, failed):
+    """The first record whose result is usable, and the result; those of the first record if none is."""
+    first = None
+    for record in records:
+        result = attempt(record)
+        if not failed(result):
+            return record, result
+        first = first or (record, result)
+    return first
+
+
+def _find_all(choices, read, finder):
+    """By camera: the records to use, and the corners in each (or the reason why there are none)."""
+    cameras, found = {}, {}
+    for camera, lists in choices.items():
+        pairs = [_first_usable(records, lambda r: _try_pattern(read(r), finder), _is_reason) for records in lists]
+        cameras[camera], found[camera] = [r for r, _ in pairs], [p for _, p in pairs]
+    return cameras, found
+
+
+def _is_reason(found):
+    return isinstance(found, str)
+
+
+def _survey_plain(choices, read, board, models, picks):
     unknown = [c for c, m in models.items() if m is None]
     if unknown:
         raise ValueError(
             f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
         )
-    views = {
-        camera: [view_board(read(r), board, models[camera], None, _of(r, picks), **_names(r)) for r in _shown(group)]
-        for camera, group in cameras.items()
-    }
+    views = {}
+    for camera, lists in choices.items():
+
+        def view(record, model=models[camera]):
+            return view_board(read(record), board, model, None, _of(record, picks), **_names(record))
+
+        shown = [records for records in map(_shown, lists) if records]
+        views[camera] = [_first_usable(records, view, lambda v: bool(v.reason))[1] for records in shown]
     return Survey(views, dict(models), None, board)
 
 
@@ -145,22 +198,31 @@ def _names(record):
     return {"camera": record.camera, "file": name, "placement": record.placement, "pitch": record.pitch}
 
 
-def _try_pattern(image, board):
+def _try_pattern(image, finder):
     """Corners, or the reason why there are none."""
     try:
-        return find_pattern(image, board.pattern)
+        return finder(image)
     except PatternNotFound as error:
         return str(error)
 
 
-def _seen(found):
-    return [p for p in found if not isinstance(p, str)]
+def _for_intrinsics(found, group):
+    """Corners to estimate intrinsics with: the images taken for that, and the most different others up to a number.
+
+    Without images taken for the intrinsics all are used.
+    """
+    seen = [(p, r.purpose == "intrinsics") for p, r in zip(found, group, strict=True) if not _is_reason(p)]
+    own, others = ([p for p, mine in seen if mine is wanted] for wanted in (True, False))
+    if not own:
+        return others
+    own = [own[i] for i in spread_views(own, VIEWS_FOR_INTRINSICS)]
+    return own + [others[i] for i in spread_views(others, VIEWS_FOR_INTRINSICS - len(own))]
 
 
 def _intrinsics(camera, found, board, group, read):
     try:
         size = read(group[0]).shape[1::-1] if group else (0, 0)
-        return estimate_intrinsics(_seen(found), board.pattern, size).model
+        return estimate_intrinsics(_for_intrinsics(found, group), board.pattern, size).model
     except ValueError as error:
         raise ValueError(f"camera '{camera}': {error}") from error
 
@@ -203,11 +265,11 @@ def _ordered_by_votes(cameras, read, board, models, found):
     return common_lines(votes, board), ordered
 
 
-def _with_relief(ordered, board, models, flat):
+def _with_relief(ordered, cameras, board, models, flat):
     """Intrinsics and the shape of the sheet, now that the corners of all images are in one order."""
     out, reliefs = {}, []
     for camera, found in ordered.items():
-        pixels = _seen(found)
+        pixels = _for_intrinsics(found, cameras[camera])
         if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
             out[camera] = flat[camera]
             continue
@@ -237,7 +299,7 @@ def _view_all(cameras, read, board, models, outline, picks, ordered, relief):
     return views
 
 
-def views_of(session, models=None):
+def views_of(session, models=None, *, one_per_placement=False):
     """The board in all images of a session: :func:`survey` of its records.
 
     Parameters
@@ -245,6 +307,8 @@ def views_of(session, models=None):
     session : Session
     models : dict of str to CameraModel, optional
         Replace the session's intrinsics. A camera without any gets an estimate from its images of the pattern.
+    one_per_placement : bool
+        See :func:`survey`.
 
     Returns
     -------
@@ -252,7 +316,7 @@ def views_of(session, models=None):
     """
     known = {name: info.model for name, info in session.cameras.items()} | dict(models or {})
     records = [r for r in session.images() if r.purpose in ("board", "intrinsics")]
-    return survey(records, session.read_image, session.board, known, session.picks)
+    return survey(records, session.read_image, session.board, known, session.picks, one_per_placement=one_per_placement)
 
 
 def stereo_check(first, second, pattern, models, *, relief=None, refine=False):

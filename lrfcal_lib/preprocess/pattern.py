@@ -11,6 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.camera import CameraModel
 from lrfcal_lib.preprocess.adjustment import SIGMA_FLOOR_PX, adjust_robust, better
 
+WINDOW_SHARE, WIDEST_WINDOW = 0.4, 15  # half window around a corner: of the shortest side of a square; pixels
+SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second detector
+
 
 class PatternNotFound(ValueError):
     """The image does not show the whole printed pattern."""
@@ -41,34 +44,107 @@ def find_pattern(image, pattern):
     Raises
     ------
     PatternNotFound
-        If neither of OpenCV's two detectors finds all corners.
+        If none of OpenCV's detectors finds all corners.
     ValueError
         If the image is not an 8-bit image.
 
     Notes
     -----
-    The sector-based detector (Duda and Frese 2018) is better than `cornerSubPix` (0.10 against 0.16 px on real prints)
-    and slower on a whole image; so the classic detector first tells where to look.
+    The classic detector tells where to look (it wants dark squares on a light ground: boards with white squares on a
+    dark ground are looked for in the negative). Two detectors then compete on that part of the image: the sector-based
+    one (Duda and Frese 2018; 0.14 px on real prints where `cornerSubPix` has 0.18 px, but 0.1 to 0.6 px on simulated
+    images where the other has 0.05 px) and `cornerSubPix` with a wide window. The smoother grid is taken; the
+    sector-based detector, which is slow, is not asked where the other's grid is as smooth as a print can be.
     """
-    picture = grey(image)
-    size = (pattern.columns, pattern.rows)
-    rough = _classic(picture, size)
-    corners = _sectors(picture, size) if rough is None else _sectors_near(picture, size, rough)
-    if corners is None and rough is not None:
-        corners = _sectors(picture, size)
-    if corners is None and rough is not None:
-        corners = _refined(picture, rough, size)
-    if corners is None:
-        raise PatternNotFound(
-            f"no chessboard with {size[0]} x {size[1]} inner corners in the image: it must be whole, and not glare"
-        )
-    return _clockwise(corners, size)
+    return PatternFinder(pattern)(image)
 
 
-def _classic(picture, size):
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+class PatternFinder:
+    """:func:`find_pattern` for many images of one board: remembers whether its squares are dark on light.
+
+    Parameters
+    ----------
+    pattern : Chessboard
+    """
+
+    def __init__(self, pattern):
+        self.pattern = pattern
+        self._negatives = (False, True)
+
+    def __call__(self, image):
+        """Corners in one image, see :func:`find_pattern`."""
+        picture = grey(image)
+        size = (self.pattern.columns, self.pattern.rows)
+        rough = self._rough(picture, size)
+        corners = _sectors(picture, size) if rough is None else _smoothest(picture, size, rough)
+        if corners is None:
+            raise PatternNotFound(
+                f"no chessboard with {size[0]} x {size[1]} inner corners in the image: it must be whole, and not glare"
+            )
+        return _clockwise(corners, size)
+
+    def _rough(self, picture, size):
+        for negative in self._negatives:
+            corners = _classic(picture, size, negative)
+            if corners is not None:
+                self._negatives = (negative, not negative)
+                return corners
+        return None
+
+
+def _classic(picture, size, negative=False):
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    # the quick check for a chessboard overlooks white squares on a dark board, and saves little time there
+    if negative:
+        found, corners = cv2.findChessboardCorners(255 - picture, size, flags=flags)
+    else:
+        found, corners = cv2.findChessboardCorners(picture, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
     return corners.reshape(-1, 2) if found else None
+
+
+def _smoothest(picture, size, rough):
+    """Of the corners of several sub-pixel detectors those whose grid has the least noise."""
+    refined = _refined(picture, rough, size)
+    noise = grid_noise(refined, size)
+    if noise < SMOOTH_ENOUGH_PX:
+        return refined
+    sectors = _sectors_near(picture, size, rough)
+    sectors = _sectors(picture, size) if sectors is None else sectors
+    if sectors is None:
+        return refined
+    found = [refined, sectors]
+    if noise > 2 * grid_noise(sectors, size):
+        # a rough corner was too far off for its window: the sectors are the better start
+        found.append(_refined(picture, sectors, size))
+    return min(found, key=lambda corners: grid_noise(corners, size))
+
+
+def grid_noise(corners, size):
+    """Root mean square distance of a chessboard's corners from a smooth grid, pixels.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (columns * rows, 2)
+        Row by row.
+    size : tuple of int
+        Inner corners in a row, and in a column.
+
+    Returns
+    -------
+    float
+
+    Notes
+    -----
+    A homography (perspective) and polynomials of third order of what it leaves (lens distortion, a bent sheet) are
+    taken out; of second order where there are less than 16 corners.
+    """
+    y, x = (np.mgrid[: size[1], : size[0]] / (max(size) - 1) * 2 - 1).reshape(2, -1)
+    order = 3 if len(x) >= 16 else 2
+    homography = cv2.findHomography(np.column_stack([x, y]), np.asarray(corners, float))[0]
+    left = corners - cv2.perspectiveTransform(np.column_stack([x, y])[None], homography)[0]
+    design = np.stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=1)
+    noise = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
+    return float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 
 
 def _sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
@@ -90,7 +166,7 @@ def _sectors_near(picture, size, rough):
 def _refined(picture, rough, size):
     grid = rough.reshape(size[1], size[0], 2)
     step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-    window = max(2, int(0.3 * step))
+    window = int(np.clip(WINDOW_SHARE * step, 2, WIDEST_WINDOW))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
     return cv2.cornerSubPix(picture, rough.astype(np.float32).copy(), (window, window), (-1, -1), stop).astype(float)
 
@@ -147,6 +223,33 @@ def estimate_intrinsics(pixels, pattern, size, *, relief=False):
         wavy = adjust_robust(pixels, pattern, best.models, best.poses, relief=True, fixed=(8,))
         best = better(wavy, pixels, pattern, relief=False, fixed=(8,))
     return better(best, pixels, pattern, relief=bool(np.any(best.relief)))
+
+
+def spread_views(pixels, count):
+    """Which views of a pattern differ most: by place, size and tilt in the image.
+
+    Parameters
+    ----------
+    pixels : sequence of ndarray, shape (k, 2)
+        Corners of every view.
+    count : int
+
+    Returns
+    -------
+    list of int
+        At most `count` places in `pixels`, the largest view first. Each of the others is the one whose corners lie
+        farthest from those of all views before it.
+    """
+    if not len(pixels):
+        return []
+    pixels = np.asarray(pixels, float)
+    flat, size = pixels.reshape(len(pixels), -1), np.ptp(pixels, axis=1).prod(axis=1)
+    chosen, nearest = [], np.full(len(flat), np.inf)
+    while len(chosen) < min(count, len(flat)):
+        chosen.append(int(np.argmax(nearest if chosen else size)))
+        nearest = np.minimum(nearest, np.linalg.norm(flat - flat[chosen[-1]], axis=1))
+        nearest[chosen[-1]] = -1.0
+    return chosen
 
 
 def estimate_relief(pixels, pattern, model):
@@ -220,15 +323,23 @@ def board_pose(pixels, pattern, model, *, relief=None):
     return pose_adjustment(pixels, pattern, model, relief)[:2]
 
 
-def pose_adjustment(pixels, pattern, model, relief=None):
-    """As :func:`board_pose`, and which corners were used (glaring ones are left out), shape (k,) bool."""
+def raised_points(pattern, relief=None):
+    """Corners of a pattern on a wavy sheet, board frame, metres; shape (k, 3)."""
+    height = 0.0 if relief is None else np.asarray(relief, float)[:, None]
+    return pattern.points() + height * np.array([0.0, 0.0, 1.0])
+
+
+def pose_adjustment(pixels, pattern, model, relief=None, start=None):
+    """As :func:`board_pose`, and which corners were used (glaring ones are left out), shape (k,) bool.
+
+    `start` replaces the start pose of OpenCV's solver.
+    """
     pixels = np.asarray(pixels, float)
-    points = pattern.points()
-    height = np.zeros(len(points)) if relief is None else np.asarray(relief, float)
+    points = raised_points(pattern, relief)
     if pixels.shape != (len(points), 2) or np.isfinite(pixels).all(axis=1).sum() < 4:
         raise ValueError(f"a pose needs four or more of the pattern's {len(points)} corners, got shape {pixels.shape}")
-    raised = _Raised(points + height[:, None] * [0, 0, 1.0])
-    start = first_pose(raised.points(), pixels, model)
+    raised = _Raised(points)
+    start = first_pose(points, pixels, model) if start is None else start
     result = adjust_robust(pixels[None, None], raised, [model], [start], intrinsics=False)
     residuals = result.residuals[0, 0]
     inflation = _correlation(residuals, pattern) * max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2

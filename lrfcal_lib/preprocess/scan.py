@@ -36,7 +36,9 @@ LEAST_ANGLE = np.radians(20)
 SHORTEST_SIDE = 0.1  # of the board's size
 UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of width 1
 EDGE_SCATTER = 0.006  # metres; about twice what the end points of a real board scatter about a straight edge
+EDGE_BEND = 0.001  # metres; error of edge points that no number of them averages out
 SAME_SIDE = 0.02  # metres; a side found by lines and by columns
+MIXING = 1.0  # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram listing)
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,16 @@ class ScanSide:
     rms: float
     angle: float
     ends: np.ndarray
+
+    @property
+    def angle_sigma(self):
+        """Standard deviation of the side's direction within the board's plane, radians.
+
+        That of a line through n points spread evenly over the length, ``sqrt(12 / n) rms / length``, where neighbours
+        share their errors in pairs, and with a millimetre that never averages out: what stands behind an edge changes
+        along it, and with it where a wide spot takes the edge to be.
+        """
+        return float(np.sqrt(12 * (2 * self.rms**2 / self.n_points + EDGE_BEND**2)) / self.length)
 
 
 @dataclass(frozen=True)
@@ -135,7 +147,8 @@ def edge_points(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
     bearings, pitch = scan.sweep.bearings, scan.sweep.pitch[row]
     shift, warp_sigma = _warp(scan, row, beam, end)
     points, along, line_sigma = _crossings(scan, row, (bearings[beam] + bearings[beam + end]) / 2, shift)
-    side, sides = _group(scan, points, pitch, row, end)
+    mixed = _mixes(scan, row, beam, 0 * end, end)
+    side, sides = _group(scan, points, pitch, row, end, mixed)
     sigma = np.abs(bearings[beam + end] - bearings[beam]) * UNIFORM
     sigma = sigma * _inflation(_to_platform(scan, along, pitch), sigma, side, sides)
     if variant == "last_beam":
@@ -232,23 +245,44 @@ def _inflation(along, sigma, side, sides):
     return out
 
 
-def _group(scan, p_lrf, pitch, order, end, known=()):
+def _mixes(scan, row, beam, down, right, beams=3):
+    """Whether something stands so close behind ends of the board that readings at the edge mix both."""
+    step, shape = np.arange(1, beams + 1), scan.mask.shape
+    rows = np.clip(row[:, None] + down[:, None] * step, 0, shape[0] - 1)
+    columns = np.clip(beam[:, None] + right[:, None] * step, 0, shape[1] - 1)
+    beyond = np.sort(np.nan_to_num(scan.sweep.ranges[rows, columns], nan=np.inf), axis=1)[:, beams // 2]
+    return beyond - scan.fitted[row, beam] < MIXING
+
+
+def _group(scan, p_lrf, pitch, order, end, mixed, known=()):
     """Assign points to straight sides in the board's plane; returns side numbers and the sides."""
     side, sides = np.full(len(p_lrf), -1), []
     if len(scan.sweep.pitch) == 1 or np.ptp(scan.sweep.pitch) < 1e-4:
         return (end + 1) // 2, ()  # scans at one pitch show one point a side
     axes = plane_axes(scan.normal)
     flat = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf) @ axes.T
-    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0)) if len(flat) else 0.0
-    for e in (-1, 1):
-        mine = np.flatnonzero(end == e)
-        for found in straight_runs(flat[mine], order[mine], max(_spacing(scan), EDGE_SCATTER), shortest):
-            rows = mine[found]
-            new = _describe(scan, flat[rows], axes, e, float(np.mean(pitch[rows])))
-            number = next((s.side for s in known if _is_same(s, new)), len(known) + len(sides))
-            side[rows] = number
-            sides.append(replace(new, side=number))
+    for rows in _straight_sides(flat, order, end, mixed, max(_spacing(scan), EDGE_SCATTER)):
+        new = _describe(scan, flat[rows], axes, int(end[rows[0]]), float(np.mean(pitch[rows])))
+        number = next((s.side for s in known if _is_same(s, new)), len(known) + len(sides))
+        side[rows] = number
+        sides.append(replace(new, side=number))
     return side, tuple(sides)
+
+
+def _straight_sides(flat, order, end, mixed, tolerance):
+    """Indices of the points of each straight side: the straight runs of either end.
+
+    Where a post or an easel stands close behind a board, its edge is bent: such points are left out, unless most of
+    the board's outline lies before something close (a wall), which moves all of it alike.
+    """
+    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0)) if len(flat) else 0.0
+    usable, found = ~mixed if np.mean(mixed) < 0.5 else np.ones(len(flat), bool), []
+    for e in (-1, 1):
+        mine = np.flatnonzero((end == e) & usable)
+        left_out = np.unique(order[(end == e) & ~usable])  # makes no gap
+        place = order[mine] - np.searchsorted(left_out, order[mine])
+        found += [mine[run] for run in straight_runs(flat[mine], place, tolerance, shortest)]
+    return found
 
 
 def _describe(scan, flat, axes, end, pitch):
@@ -309,7 +343,8 @@ def sweep_edges(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
     pitch = scan.sweep.pitch
     middle, step = (pitch[line] + pitch[beyond]) / 2, np.abs(np.diff(pitch))
     points, by_pitch = _at_pitch(scan, line, beam, middle)
-    side, sides = _group(scan, points, middle, beam, end, edge_points(scan, min_angle=0.0).sides)
+    mixed = _mixes(scan, line, beam, beyond - line, 0 * end)
+    side, sides = _group(scan, points, middle, beam, end, mixed, edge_points(scan, min_angle=0.0).sides)
     sigma = UNIFORM * np.maximum(np.abs(pitch[beyond] - pitch[line]), np.median(step) if len(step) else 0.0)
     sigma = sigma * _inflation(_to_platform(scan, by_pitch, middle), sigma, side, sides)
     chosen = middle if variant == "half_step" else pitch[line]

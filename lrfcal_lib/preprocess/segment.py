@@ -14,7 +14,10 @@ STEEPEST = np.tan(np.radians(80))  # a face seen at a flatter angle than 10 deg 
 DEPTH_NOISE = 0.03  # metres; what noise and dark print change between neighbouring beams of one face
 PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
 LONGEST_HOLE = 0.15  # metres; a gap without returns that does not end a surface (print, gloss)
+LARGEST_NOISE = 0.04  # metres; the farthest from its plane that a return of a noisy device still counts
 FEWEST_POINTS = 12
+LEAST_FILL = 0.5  # share of its convex hull that a board fills; what clutter leaves on a plane is patchy
+FEWEST_LINES = 4  # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
 RIGID_SIZES = (0.02, 4.0, 4.0)  # m2, m2, m: what may be a board when nothing is known about it
 
 
@@ -129,15 +132,50 @@ def planar_surface(sweep, T_head_lrf, board=None, rng=None):
         if best is not None and np.nanmin(sweep.ranges[surface]) > best[0]:
             break
         for mask, plane in _planes(sweep, points, surface, upright, rng):
+            if best is not None and np.nanmin(sweep.ranges[mask]) > best[0]:
+                continue
             reach = float(np.median(sweep.ranges[mask]))
             mask, size, fits = _judge(points, mask, plane, board, upright)
-            seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m")
-            if fits and (best is None or reach < best[0]):
+            fault = "" if upright is not None else _fault(sweep, T_head_lrf, points, mask, plane)
+            seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m{fault}")
+            if fits and not fault and (best is None or reach < best[0]):
                 best = (reach, mask, *plane)
     if best is None:
         found = "; ".join(seen[:4]) or "no flat surface"
         raise BoardNotFound(f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}")
-    return best[1:]
+    return _with_noisy_returns(points, *best[1:])
+
+
+def _fault(sweep, T_head_lrf, points, mask, plane):
+    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself, patchy. '' if it may be."""
+    lines = int(mask.any(axis=1).sum())
+    if lines < min(FEWEST_LINES, len(sweep.pitch)):
+        return f" on {lines} of {len(sweep.pitch)} scan lines"
+    row, beam = np.nonzero(mask)
+    rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[row])
+    slope = np.abs(rays @ plane[0]) / np.linalg.norm(rays, axis=1)
+    if np.median(slope) * STEEPEST < 1:
+        return " seen along itself"
+    fill = _fill(row, beam)
+    return f" filled to {100 * fill:.0f} %" if fill < LEAST_FILL else ""
+
+
+def _fill(row, beam):
+    """Share of the cells of the range image within the convex hull of some of them that these are (Pick's theorem)."""
+    try:
+        hull = ConvexHull(np.column_stack([row, beam]))
+    except QhullError:
+        return 1.0
+    corners = hull.points[hull.vertices].astype(int)
+    rim = np.gcd(*np.abs(np.roll(corners, -1, axis=0) - corners).T).sum()
+    return len(row) / (hull.volume + rim / 2 + 1)
+
+
+def _with_noisy_returns(points, mask, normal, distance):
+    """A surface with the returns in and beside it that only the noise of its own points takes off its plane."""
+    miss = np.abs(points @ normal - distance)
+    reach = np.clip(3 * 1.4826 * np.median(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
+    return mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)), normal, distance
 
 
 def _judge(points, mask, plane, board, upright):
@@ -179,7 +217,7 @@ def _by_distance(labels, ranges):
     return enough[np.argsort(nearest[enough])]
 
 
-def _planes(sweep, points, surface, upright, rng, most=6):
+def _planes(sweep, points, surface, upright, rng, most=25):
     """Flat connected parts of a surface: the largest plane first, then what is left."""
     left = surface.copy()
     for _ in range(most):

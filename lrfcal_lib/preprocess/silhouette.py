@@ -185,19 +185,21 @@ def _explains(pose, board, model, corners, chi2):
     return bool(frontal(pose) > 0 and (off < EXACT_PX or chi2 < 16 * len(corners)))
 
 
-def pose_from_edges(edges, board, model, start, rounds=15):
+def pose_from_edges(edges, board, model, start, rounds=15, covariance=None):
     """Pose of a board from its image lines by whitened Gauss-Newton.
 
     Parameters
     ----------
     edges : sequence of ImageEdge
-        Three or more, named.
+        Named; three or more, unless a covariance is given.
     board : Board
         With known corners.
     model : CameraModel
     start : RigidTransform
         ``T_camera_board``.
     rounds : int
+    covariance : ndarray, shape (6, 6), optional
+        Of ``[w, v]`` of `start`, where that is an observation of its own (the pattern's corners).
 
     Returns
     -------
@@ -207,18 +209,26 @@ def pose_from_edges(edges, board, model, start, rounds=15):
         Sum of the squared whitened residuals.
     """
     pose = start
+    white = np.zeros((0, 6)) if covariance is None else np.linalg.inv(np.linalg.cholesky(covariance))
     for _ in range(rounds):
-        residual, jacobian = _line_residuals(edges, board, model, pose)
+        residual, jacobian = _all_residuals(edges, board, model, pose, start, white)
         step = np.linalg.lstsq(jacobian, -residual, rcond=1e-12)[0]
         turn = Rotation.from_rotvec(step[:3])
         pose = RigidTransform.from_components(pose.translation + step[3:], turn * pose.rotation)
         if np.abs(step).max() < 1e-12:
             break
-    residual, jacobian = _line_residuals(edges, board, model, pose)
+    residual, jacobian = _all_residuals(edges, board, model, pose, start, white)
     return pose, np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), float(residual @ residual)
 
 
-def _line_residuals(edges, board, model, pose):
+def _all_residuals(edges, board, model, pose, start, white):
+    """Residuals of the lines, then those of the start pose."""
+    residual, jacobian = line_residuals(edges, board, model, pose)
+    moved = np.r_[(pose.rotation * start.rotation.inv()).as_rotvec(), pose.translation - start.translation]
+    return np.r_[residual, white @ moved], np.concatenate([jacobian, white])
+
+
+def line_residuals(edges, board, model, pose):
     """Whitened distances of every edge's two corners from its image line, and their derivatives by [w, v]."""
     corners = board.known_corners()
     residuals, rows = [], []

@@ -10,21 +10,34 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.board import corners_of_lines
 from lrfcal_lib.camera import pinhole, undistort
-from lrfcal_lib.preprocess.edges import EdgeNotSeen, ImageEdge, picked_edge, refine_edge
+from lrfcal_lib.preprocess.edges import (
+    FULL_CONTRAST,
+    EdgeNotSeen,
+    ImageEdge,
+    picked_edge,
+    refine_edge,
+    sample,
+    step_contrast,
+)
 from lrfcal_lib.preprocess.outline import board_line
 from lrfcal_lib.preprocess.pattern import (
     PatternNotFound,
     find_pattern,
+    first_pose,
     mirror_pattern,
     pose_adjustment,
     turn_pattern,
 )
 from lrfcal_lib.preprocess.silhouette import OutlineNotFound, board_poses, find_polygon, polygon_edges
+from lrfcal_lib.preprocess.together import pose_with_edges
 from lrfcal_lib.preprocess.wide import edge_votes, side_lines, widest_lines
 
 WINDOW = 0.010  # half width of the narrow search, metres: edges sit within 1-3 mm (sd) in the sheet's frame
 PREDICTION_SIGMA = 0.005  # of an edge on the board, metres
 CORNER_INSET = 0.03  # share of an edge left out at both ends: corners curl and are torn
+
+COARSE_PROFILES, COARSE_ACROSS = 24, 25  # samples along and across each edge when orders of corners are compared
+CLEAR_SHARE = 0.7  # an order with less than this share of the best score is ruled out
 
 
 @dataclass(frozen=True)
@@ -132,10 +145,11 @@ def view_board(
             return _view_plain(view, image, board, model, picks, guess)
         lines = _known_lines(board, outline)
         if pixels is not None:
-            return _view_pattern(view, image, board, model, lines, picks, pixels, relief)
+            return _joined(_view_pattern(view, image, board, model, lines, picks, pixels, relief), board, model, relief)
         orders = _orders(find_pattern(image, board.pattern), board, lines)
         views = [_view_pattern(view, image, board, model, lines, picks, p, relief) for p in orders]
-        return views[0] if lines is None else max(views, key=lambda v: _support(v, board, model, lines))
+        best = views[0] if lines is None else max(views, key=lambda v: _support(v, board, model, lines))
+        return _joined(best, board, model, relief)
     except (PatternNotFound, OutlineNotFound, EdgeNotSeen) as error:
         return replace(view, reason=str(error))
 
@@ -188,6 +202,14 @@ def _view_pattern(view, image, board, model, lines, picks, pixels, relief):
         lines = widest_lines(votes, board)
     edges, rejected = _search(image, board, model, pose, lines, picks, pixels)
     return replace(view, edges=tuple(edges), rejected=tuple(rejected), votes=votes)
+
+
+def _joined(view, board, model, relief):
+    """The view with the pose from corners and edges together, where the outline is stated."""
+    if board.corners is None:
+        return view
+    joined = pose_with_edges(view.T_camera_board, view.covariance, view.pixels, view.edges, board, model, relief)
+    return replace(view, T_camera_board=joined[0], covariance=joined[1])
 
 
 def _search(image, board, model, pose, lines, picks, pixels):
@@ -265,8 +287,38 @@ def _agrees(edges, picks, model, within=10.0):
 
 
 def best_order(image, board, model, pixels):
-    """The order of a pattern's corners for which the known outline of the board fits the image best."""
-    lines = _known_lines(board, None)
+    """The order of a pattern's corners for which the known outline of the board fits the image best.
+
+    Notes
+    -----
+    A few coarse profiles across the outline decide; orders that they cannot tell apart are compared by the edges
+    that the full search finds.
+    """
+    lines = board.lines()
+    orders = _orders(pixels, board, lines)
+    scores = np.array([_coarse_support(image, board, model, lines, p) for p in orders])
+    likely = [p for p, score in zip(orders, scores, strict=True) if score >= CLEAR_SHARE * scores.max()]
+    if len(likely) == 1:
+        return likely[0]
     empty = BoardView("", "", -1, np.nan)
-    views = [(_view_pattern(empty, image, board, model, lines, {}, p, None), p) for p in _orders(pixels, board, lines)]
-    return max(views, key=lambda item: _support(item[0], board, model, lines))[1]
+    views = [_view_pattern(empty, image, board, model, lines, {}, p, None) for p in likely]
+    return likely[int(np.argmax([_support(v, board, model, lines) for v in views]))]
+
+
+def _coarse_support(image, board, model, lines, pixels):
+    """Profiles with a step near the predicted outline, counted over all its edges."""
+    pose = first_pose(board.pattern.points(), pixels, model)
+    if pose.translation[2] <= 0:
+        return 0.0
+    corners = corners_of_lines(lines)
+    across = np.linspace(-2, 2, COARSE_ACROSS) * PREDICTION_SIGMA
+    along = np.linspace(CORNER_INSET, 1 - CORNER_INSET, COARSE_PROFILES)
+    score = 0.0
+    for line, start, end in zip(lines, corners, np.roll(corners, -1, axis=0), strict=True):
+        xy = start + along[:, None] * (end - start) + across[:, None, None] * line[:2]
+        points = np.concatenate([xy, np.zeros(xy.shape[:2] + (1,))], axis=-1).reshape(-1, 3)
+        uv = np.nan_to_num(pinhole(pose.apply(points), model), nan=-1e6).reshape(xy.shape)
+        height = step_contrast(sample(image, model, uv), 1.5, along=1)
+        weight = height / (height + FULL_CONTRAST) * np.exp(-0.5 * (across / PREDICTION_SIGMA) ** 2)[:, None]
+        score += np.median(weight.max(axis=0))
+    return score

@@ -159,6 +159,18 @@ class Session:
         check_image_size(record.file, image.shape[1::-1], self.cameras[record.camera])
         return image
 
+    @property
+    def scene_placements(self):
+        """Placements that show a scene to be rebuilt, not the board: their images have the purpose 'scene'."""
+        scenes = {record.placement for record in self.images(purpose="scene")}
+        return tuple(p for p in self.placements if p in scenes)
+
+    @property
+    def board_placements(self):
+        """All other placements."""
+        scenes = self.scene_placements
+        return tuple(p for p in self.placements if p not in scenes)
+
     def telegram_report(self, placement=None):
         """What became of the recorded telegrams: counts, CRC failures, special values by reason.
 

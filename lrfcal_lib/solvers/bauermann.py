@@ -5,16 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from lrfcal_lib.camera import pinhole_jacobian
-from lrfcal_lib.solvers.camera import read_pose
+from lrfcal_lib.solvers.camera import solve_pose
 from lrfcal_lib.solvers.checks import check_count, check_finite
-from lrfcal_lib.solvers.least_squares import Block, solve
+from lrfcal_lib.solvers.least_squares import Block
 from lrfcal_lib.solvers.pose import (
-    POSE_NAMES,
     gradient_by_pose,
-    motion_words,
-    move_pose,
     noise_correction,
-    pose_array,
     rotate_points,
 )
 from lrfcal_lib.solvers.start import starting_transform
@@ -88,17 +84,6 @@ def solve_bauermann(obs, T0=None, *, loss=None, scale=1.0, max_iterations=60, re
     check_count(len(obs.scene_points), 3, "scene points", obs.camera)
     T0 = starting_transform(obs, kinds=("scene", "planes", "lines")) if T0 is None else T0
     data = (obs.scene_points, obs.scene_covariance, obs.scene_pixels, obs.scene_sigma_px, obs.model)
-    return solve(
-        lambda pose: point_block(pose, *data),
-        pose_array(T0),
-        move_pose,
-        names=POSE_NAMES,
-        method="bauermann",
-        read=read_pose,
-        words=lambda d: motion_words(d, obs.camera),
-        groups=np.repeat(obs.scene_placement, 2),
-        loss=loss,
-        scale=scale,
-        max_iterations=max_iterations,
-        required=required,
-    )
+    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
+    about = {"camera": obs.camera, "groups": np.repeat(obs.scene_placement, 2), "method": "bauermann"}
+    return solve_pose(lambda pose: point_block(pose, *data), T0, **about, **options)

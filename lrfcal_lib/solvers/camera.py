@@ -104,24 +104,38 @@ def solve_lines(obs, T0=None, *, loss=None, scale=1.0, weighted=True, max_iterat
     def evaluate(pose):
         return line_block(pose, *data)
 
+    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
+    about = {"camera": obs.camera, "groups": obs.crossing_placement, "method": "line"}
+    return solve_pose(evaluate, T0, weighted=weighted, **about, **options)
+
+
+def solve_pose(evaluate, T0, *, camera, groups, method, weighted=True, required=True, **options):
+    """Solve for the pose of one camera: what the methods on edges and corners have in common.
+
+    Parameters
+    ----------
+    evaluate : callable
+        ``evaluate(pose array) -> Block``.
+    T0 : RigidTransform
+    camera, method : str
+        For messages and the report.
+    groups : ndarray of int
+        Placement of every residual.
+    weighted : bool
+        False: every residual counts the same.
+    required : bool
+    **options
+        ``loss``, ``scale`` and ``max_iterations`` of the least squares core.
+
+    Returns
+    -------
+    Solution
+    """
     pose, earlier = pose_array(T0), []
     if not weighted:
-        evaluate, pose, earlier = equal_weights(evaluate, pose, loss=loss, scale=scale, max_iterations=max_iterations)
-    return solve(
-        evaluate,
-        pose,
-        move_pose,
-        names=POSE_NAMES,
-        method="line",
-        read=read_pose,
-        words=lambda d: motion_words(d, obs.camera),
-        groups=obs.crossing_placement,
-        loss=loss,
-        scale=scale,
-        max_iterations=max_iterations,
-        required=required,
-        earlier=earlier,
-    )
+        evaluate, pose, earlier = equal_weights(evaluate, pose, **options)
+    about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, camera)}
+    return solve(evaluate, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
 
 
 def solve_paper_lines(obs, T0=None, **options):

@@ -352,25 +352,17 @@ def solve(
     covariance = np.linalg.pinv(hessian * unit, rcond=1e-14, hermitian=True) * unit * inflation[..., None, None]
     clustered, _ = placement_covariance(hessians, scores) if (groups is not None or shared) else (None, None)
     transform, parameters = read(state)
-    return Solution(
-        transform,
-        parameters,
-        tuple(names),
-        converged,
-        iterations + sum(len(h) - 1 for h in earlier),
-        np.concatenate([*(h[:-1] for h in earlier), history]),
-        r,
-        J,
-        weights,
-        covariance,
-        clustered,
-        lost,
-        method,
-        n_observations or r.shape[-1],
-        chi2,
-        inflation,
-        state=state,
-    )
+    iterations, history = _with_earlier(iterations, history, earlier)
+    fitted = {"residuals": r, "jacobian": J, "weights": weights, "chi2": chi2, "inflation": inflation, "state": state}
+    run = {"converged": converged, "iterations": iterations, "cost_history": history, "unobservable": lost}
+    spread = {"covariance": covariance, "covariance_placements": clustered}
+    about = {"names": tuple(names), "method": method, "n_observations": n_observations or r.shape[-1]}
+    return Solution(transform, parameters, **about, **run, **fitted, **spread)
+
+
+def _with_earlier(iterations, history, earlier):
+    """Iterations and cost history, with those of earlier rounds before them."""
+    return iterations + sum(len(h) - 1 for h in earlier), np.concatenate([*(h[:-1] for h in earlier), history])
 
 
 def _freedom(r, J, shared):

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lrfcal_lib.solvers.camera import equal_weights, read_pose
+from lrfcal_lib.solvers.camera import solve_pose
 from lrfcal_lib.solvers.checks import check_count, check_finite
-from lrfcal_lib.solvers.least_squares import Block, solve
+from lrfcal_lib.solvers.least_squares import Block
 from lrfcal_lib.solvers.pose import (
-    POSE_NAMES,
     gradient_by_pose,
-    motion_words,
-    move_pose,
     moved_noise,
     noise_correction,
-    pose_array,
     rotate_points,
 )
 from lrfcal_lib.solvers.start import sight_block, sight_normals, starting_transform
@@ -59,24 +55,9 @@ def solve_wasielewski_strauss(obs, T0=None, *, loss=None, scale=1.0, weighted=Fa
     def evaluate(pose):
         return distance_block(pose, obs, normals, length)
 
-    pose, earlier = pose_array(T0), []
-    if not weighted:
-        evaluate, pose, earlier = equal_weights(evaluate, pose, loss=loss, scale=scale, max_iterations=max_iterations)
-    return solve(
-        evaluate,
-        pose,
-        move_pose,
-        names=POSE_NAMES,
-        method="wasielewski_strauss",
-        read=read_pose,
-        words=lambda d: motion_words(d, obs.camera),
-        groups=obs.crossing_placement,
-        loss=loss,
-        scale=scale,
-        max_iterations=max_iterations,
-        required=required,
-        earlier=earlier,
-    )
+    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
+    about = {"camera": obs.camera, "groups": obs.crossing_placement, "method": "wasielewski_strauss"}
+    return solve_pose(evaluate, T0, weighted=weighted, **about, **options)
 
 
 def distance_block(pose, obs, normals, length):

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
 from lrfcal_lib.geometry import DegenerateGeometry, paper_parameters, transform_difference
 from lrfcal_lib.pairing import outline_of
 from lrfcal_lib.prepared import VARIANTS
@@ -28,7 +29,7 @@ def rms(values):
 
 
 def placements_table(prepared, observations):
-    """Every placement of the session: what is usable of it, and why not.
+    """Every placement of the board: what is usable of it, and why not.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ def placements_table(prepared, observations):
         edges of the board that a scan crosses and the camera sees.
     """
     rows = []
-    for placement in prepared.session.placements:
+    for placement in prepared.session.board_placements:
         scan = prepared.scans.get(placement)
         row = {
             "placement": placement,
@@ -146,7 +147,7 @@ def left_out_residuals(obs, judge, solve, full):
     return edge_px, plane_m
 
 
-def method_comparison(observations, solutions, left_out=True):
+def method_comparison(observations, solutions, left_out=True, truth=None):
     """Every method judged on the same crossings and face points, and on placements it has not seen.
 
     Parameters
@@ -158,12 +159,14 @@ def method_comparison(observations, solutions, left_out=True):
         By camera and method.
     left_out : bool
         Also leave out one placement after another (one more solve for each).
+    truth : Truth, optional
+        Of a simulated session.
 
     Returns
     -------
     DataFrame
         camera, method, n_placements, edge_median_px, edge_rms_px, plane_rms_mm, left_out_edge_rms_px,
-        left_out_plane_rms_mm.
+        left_out_plane_rms_mm; with truth also rotation_error_deg, translation_error_mm.
     """
     rows = []
     for (camera, name), solution in solutions.items():
@@ -177,8 +180,34 @@ def method_comparison(observations, solutions, left_out=True):
         row["edge_rms_px"] = rms(edge)
         row["plane_rms_mm"] = 1000 * rms(plane_residuals_of(judge, solution))
         row["left_out_edge_rms_px"], row["left_out_plane_rms_mm"] = rms(held_edge), 1000 * rms(held_plane)
-        rows.append(row)
+        rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
+
+
+def best_method(comparison, among=("line", "zhang_pless")):
+    """The method to hand over: the smallest product of its edge and plane errors on left-out placements.
+
+    Parameters
+    ----------
+    comparison : DataFrame
+        Of :func:`method_comparison`.
+    among : sequence of str
+        A method that fits its own feature and fails on the other one (lines bent by a wide laser spot, say) loses.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    ValueError
+        If none of them was judged on left-out placements.
+    """
+    mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
+    score = mean.reindex(list(among)).prod(axis=1, skipna=False).dropna()
+    if score.empty:
+        raise ValueError(f"none of {', '.join(among)} was judged on left-out placements; it takes more of them")
+    return score.idxmin()
 
 
 def camera_calibration_table(solutions):
@@ -204,17 +233,20 @@ def camera_calibration_table(solutions):
     return pd.DataFrame(rows, columns=["camera", "method", "parameter", "unit", "value", "sigma"])
 
 
-def platform_calibration_table(platform):
+def platform_calibration_table(platform, truth=None):
     """The tilt axis by every method with its standard deviations, and the paper's own parameters.
 
     Parameters
     ----------
     platform : PlatformCalibration
+    truth : Truth, optional
+        Of a simulated session.
 
     Returns
     -------
     DataFrame
-        method, parameter, unit, value, sigma. The four numbers of the axis are its angles out of and within the scan
+        method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and axis_offset_error_mm of the
+        method. The four numbers of the axis are its angles out of and within the scan
         plane and its offsets within and across it; phi and t_y are the same axis in the paper's chart.
     """
     factors = np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1000.0, 1000.0])
@@ -226,7 +258,12 @@ def platform_calibration_table(platform):
         for name, value in zip(("phi_x", "phi_y", "phi_z"), np.rad2deg(phi), strict=True):
             rows.append((method, name, "deg", value, np.nan))
         rows.append((method, "t_y", "mm", 1000 * ty, np.nan))
-    return pd.DataFrame(rows, columns=["method", "parameter", "unit", "value", "sigma"])
+    table = pd.DataFrame(rows, columns=["method", "parameter", "unit", "value", "sigma"])
+    if truth is None:
+        return table
+    errors = {method: axis_errors(platform.transform(method), truth) for method in platform.parameters()}
+    direction, offset = (table.method.map({m: e[i] for m, e in errors.items()}) for i in (0, 1))
+    return table.assign(axis_direction_error_deg=direction, axis_offset_error_mm=offset)
 
 
 def sweeps_table(session):
@@ -433,27 +470,35 @@ def edge_lengths(prepared, T_head_lrf=None):
     Returns
     -------
     DataFrame
-        source, placement, edge, ends, variant, true_mm, measured_mm, error_mm. `ends` is 'scan' where beams decide both
-        ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines). Only
-        edges that some camera sees in the same placement, and both ends of which are measured in the cloud.
+        source, placement, edge, ends, variant, true_mm, measured_mm, error_mm. One row for every edge that some camera
+        sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams decide both
+        ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines).
     """
-    true = {name: 1000 * value for name, value in prepared.board.lengths().items()}
     rows = []
     for variant in VARIANTS:
-        for placement in prepared.names:
-            try:
-                outline = outline_of(prepared, placement, variant, T_head_lrf)
-            except DegenerateGeometry:
-                continue
-            for name, length in outline.measured.lengths.items():
-                if not _seen_in_image(prepared, placement, name):
-                    continue
-                ends = "pitch" if _neighbours(prepared.board.edges, name) & outline.across else "scan"
-                rows.append((prepared.session.name, placement, name, ends, variant, true[name], 1000 * length))
+        for placement in prepared.session.board_placements:
+            rows += _placement_lengths(prepared, placement, variant, T_head_lrf)
     rows += [("paper", np.nan, name, "scan", "last_beam", *PAPER_EDGES_MM[name]) for name in PAPER_EDGES_MM]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
+
+
+def _placement_lengths(prepared, placement, variant, T_head_lrf):
+    """Rows of one placement: every edge that a camera sees, NaN where the cloud does not show both its ends."""
+    try:
+        outline = outline_of(prepared, placement, variant, T_head_lrf) if placement in prepared.names else None
+    except DegenerateGeometry:
+        outline = None
+    rows = []
+    for name, true in prepared.board.lengths().items():
+        length = np.nan if outline is None else outline.measured.lengths.get(name, np.nan)
+        ends = "not measured"
+        if np.isfinite(length):
+            ends = "pitch" if _neighbours(prepared.board.edges, name) & outline.across else "scan"
+        if _seen_in_image(prepared, placement, name):
+            rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
+    return rows
 
 
 def _neighbours(edges, name):
@@ -477,8 +522,9 @@ def edge_summary(table):
     Returns
     -------
     DataFrame
-        source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm.
+        source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm. Measured edges only.
     """
+    table = table[table.measured_mm.notna()]
     groups = table.assign(size=table.error_mm.abs()).groupby(["source", "ends", "variant"], sort=False)
     return groups.agg(
         n=("size", "size"),

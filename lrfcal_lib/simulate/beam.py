@@ -1,0 +1,335 @@
+"""A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and beams one after another."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lrfcal_lib.geometry import tilt
+
+MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
+NOT_VALID, DAZZLED, WEAK, TOO_FAR = 8191, 8190, 8187, 8183  # 13-bit words that are no ranges (listing, 10.8)
+LARGEST_WORD = 0x1FF6  # 8.182 m in mm, 81.82 m in cm
+WHOLE_SCANS = {(100, 100), (100, 50), (100, 25), (180, 100), (180, 50)}  # deg, 1/100 deg: variants of telegram 0x3B
+RAYS_AT_ONCE = 1 << 19
+
+
+@dataclass(frozen=True)
+class Beam:
+    """Settings of a laser range finder.
+
+    Attributes
+    ----------
+    name : str
+    angles : tuple of int
+        Fields of view that the device can be set to, degrees (technical description, chapter 12).
+    spot_exit : float
+        Diameter of the spot at the window, metres (technical description).
+    divergence : float
+        Growth of the diameter with distance, radians (technical description).
+    sigma_range : float
+        Statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200).
+    systematic : float
+        Constant error of this one device, metres.
+    systematic_bound : tuple of (float, float)
+        Largest systematic error that the maker admits, by unit, metres.
+    field_of_view, resolution : int
+        Variant in degrees and 1/100 degree, as telegram 0x3B sets them.
+    unit : float
+        Metres a count: 0.001 or 0.01.
+    pulse : float
+        Surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m).
+    least_energy : float
+        Weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there.
+    least_share : float
+        An echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the
+        strongest echo; the maker states nothing. It widens what stands before a brighter background.
+    rings : int
+        Of sub-rays over the spot, 1 + 3 rings (rings + 1) of them.
+
+    Raises
+    ------
+    ValueError
+        For settings that the device does not have.
+    """
+
+    name: str
+    angles: tuple[int, ...]
+    spot_exit: float
+    divergence: float
+    sigma_range: float
+    systematic: float
+    systematic_bound: tuple[tuple[float, float], ...]
+    field_of_view: int
+    resolution: int
+    unit: float = 0.001
+    pulse: float = 1.0
+    least_energy: float = 0.1 / 30.0**2
+    least_share: float = 0.25
+    rings: int = 4
+
+    def __post_init__(self):
+        variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
+        if self.field_of_view not in self.angles or (self.field_of_view, self.resolution) not in WHOLE_SCANS:
+            raise ValueError(f"{self.name} has no whole scans of {variant}; it can be set to {self._variants()}")
+        for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{self.name}: {name} is {getattr(self, name)}, it must be zero or positive")
+        bound = dict(self.systematic_bound).get(self.unit)
+        if bound is None:
+            raise ValueError(f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
+        if not abs(self.systematic) <= bound:
+            raise ValueError(f"{self.name}: a systematic error of {self.systematic} m is beyond the maker's {bound} m")
+        if not 0 <= self.least_share <= 1:
+            raise ValueError(f"{self.name}: least_share is {self.least_share}, a share lies between 0 and 1")
+        if self.rings < 0:
+            raise ValueError(f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
+
+    def _variants(self):
+        fits = sorted(v for v in WHOLE_SCANS if v[0] in self.angles)
+        return ", ".join(f"{angle}/{step / 100:g}" for angle, step in fits)
+
+    @property
+    def rays(self):
+        """Sub-rays of one spot."""
+        return 1 + 3 * self.rings * (self.rings + 1)
+
+    @property
+    def turns(self):
+        """Mirror turns of one whole scan."""
+        return 100 // self.resolution
+
+    def bearings(self):
+        """Bearings of a whole scan, shape (B,), radians; 0 right, pi/2 ahead (40 to 140 deg for 100 deg variants)."""
+        first = 90 - self.field_of_view / 2
+        count = self.field_of_view * 100 // self.resolution + 1
+        return np.radians(first + np.arange(count) * self.resolution / 100)
+
+    def beam_times(self):
+        """Time of every beam after the scan began, shape (B,), seconds.
+
+        Notes
+        -----
+        The mirror always turns in steps of 1 deg; turn k starts k times the resolution later, so neighbours of a fine
+        scan are one turn apart in time (telegram listing, 7.5).
+        """
+        bearings = self.bearings()
+        turn = np.arange(len(bearings)) % self.turns
+        return turn * MIRROR_TURN + bearings / (2 * np.pi) * MIRROR_TURN
+
+    def spot(self, distance):
+        """Diameter of the spot, metres."""
+        return self.spot_exit + self.divergence * np.asarray(distance, float)
+
+    def with_settings(self, **changes):
+        """The same device set otherwise."""
+        return Beam(**{**self.__dict__, **changes})
+
+
+_OUTDOOR = {
+    "spot_exit": 0.016,
+    "divergence": 0.0119,
+    "sigma_range": 0.010,
+    "systematic": 0.0,
+    "systematic_bound": ((0.001, 0.035), (0.01, 0.05)),
+    "resolution": 50,
+}
+LMS211 = Beam("LMS211-30206", (100,), field_of_view=100, **_OUTDOOR)
+LMS221 = Beam("LMS221-30206", (100, 180), field_of_view=180, **_OUTDOOR)
+_INDOOR = {"systematic_bound": ((0.001, 0.015), (0.01, 0.04)), "least_energy": 0.1 / 10.0**2}
+LMS200 = Beam("LMS200-30106", (100, 180), 0.012, 0.0044, 0.005, 0.0, field_of_view=180, resolution=50, **_INDOOR)
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Scan lines as the device sends them.
+
+    Attributes
+    ----------
+    words : ndarray of uint16, shape (L, B)
+        13-bit values in the device's unit, codes included.
+    ranges : ndarray, shape (L, B)
+        Metres; NaN for codes.
+    """
+
+    words: np.ndarray
+    ranges: np.ndarray
+
+
+def spot_pattern(rings):
+    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on the k-th ring.
+
+    Parameters
+    ----------
+    rings : int
+
+    Returns
+    -------
+    ndarray, shape (1 + 3 rings (rings + 1), 2)
+        Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those of the disc.
+    """
+    count = np.r_[1, 6 * np.arange(1, rings + 1)]
+    inside = np.cumsum(count)
+    radius = np.sqrt((inside - count / 2) / inside[-1])
+    radius[0] = 0.0
+    turn = np.concatenate([2 * np.pi * np.arange(n) / n for n in count])
+    return np.repeat(radius, count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+def sub_rays(beam, bearings, pitch, T_head_lrf):
+    """Rays that fill the spots of beams.
+
+    Parameters
+    ----------
+    beam : Beam
+    bearings : ndarray, shape (n,)
+        Radians.
+    pitch : ndarray, shape (n,)
+        Of the head while each beam is measured, radians.
+    T_head_lrf : RigidTransform
+
+    Returns
+    -------
+    origins, directions : ndarray, shape (n, K, 3)
+        Platform frame; they leave a disc of `spot_exit` about the mirror.
+    """
+    c, s = np.cos(bearings), np.sin(bearings)
+    zero = np.zeros_like(c)
+    across, up = np.stack([-s, c, zero], axis=-1), np.array([0.0, 0.0, 1.0])
+    disc = spot_pattern(beam.rings)
+    shift = disc[:, :1] * across[:, None] + disc[:, 1:] * up
+    directions = np.stack([c, s, zero], axis=-1)[:, None] + beam.divergence / 2 * shift
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rotation = T_head_lrf.rotation.as_matrix().T
+    origins = beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation
+    return tilt(origins, pitch[:, None]), tilt(directions @ rotation, pitch[:, None])
+
+
+def echo(beam, distance, energy):
+    """One reading out of the sub-rays of a spot.
+
+    Parameters
+    ----------
+    beam : Beam
+    distance : ndarray, shape (n, K)
+        Metres; inf where a sub-ray meets nothing.
+    energy : ndarray, shape (n, K)
+        What comes back along each sub-ray.
+
+    Returns
+    -------
+    reading : ndarray, shape (n,)
+        Metres; NaN where no echo is strong enough.
+    total : ndarray, shape (n,)
+        Energy of all echoes.
+
+    Notes
+    -----
+    Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy (a mixed pixel); what
+    is farther makes an echo of its own. The first echo above both thresholds is the reading.
+    """
+    left, best = np.where(np.isfinite(distance), distance, np.inf), np.zeros(len(distance))
+    echoes = []
+    while np.isfinite(left).any():
+        near = left.min(axis=1)
+        group = np.isfinite(left) & (left <= near[:, None] + beam.pulse)
+        part = np.where(group, energy, 0.0)
+        strength, mean = part.sum(axis=1), np.sum(part * np.where(group, distance, 0.0), axis=1)
+        echoes.append((np.divide(mean, strength, out=np.full(len(near), np.nan), where=strength > 0), strength))
+        best = np.maximum(best, strength)
+        left = np.where(group, np.inf, left)
+    reading = np.full(len(distance), np.nan)
+    for place, strength in reversed(echoes):
+        good = (strength >= np.maximum(beam.least_energy, beam.least_share * best)) & np.isfinite(place)
+        reading = np.where(good, place, reading)
+    return reading, sum((strength for _, strength in echoes), np.zeros(len(distance)))
+
+
+def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
+    """Readings without noise, offset and rounding.
+
+    Parameters
+    ----------
+    beam : Beam
+    world : World
+    bearings, pitch : ndarray, shape (n,)
+        Radians.
+    T_head_lrf : RigidTransform
+
+    Returns
+    -------
+    reading : ndarray, shape (n,)
+        Metres; NaN without an echo.
+    total : ndarray, shape (n,)
+        Returned energy.
+    dazzled : ndarray of bool, shape (n,)
+
+    Notes
+    -----
+    The energy of a sub-ray is reflectivity times cosine of incidence over squared distance (a Lambertian surface). The
+    nearer part of a spot on a slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
+    """
+    origins, directions = sub_rays(beam, bearings, pitch, T_head_lrf)
+    flat = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    hits = world.cast(*flat)
+    seen = hits.face >= 0
+    energy = np.zeros(len(seen))
+    points = flat[0][seen] + hits.distance[seen, None] * flat[1][seen]
+    cosine = np.abs(np.sum(world.normals[hits.face[seen]] * flat[1][seen], axis=1))
+    energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / hits.distance[seen] ** 2 / beam.rays
+    shape = origins.shape[:2]
+    reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
+    return reading, total, world.dazzling(hits.thing).reshape(shape).any(axis=1)
+
+
+def scan(beam, world, pitch, T_head_lrf, rng):
+    """Record scan lines.
+
+    Parameters
+    ----------
+    beam : Beam
+    world : World
+    pitch : ndarray, shape (L, 1) or (L, B)
+        True pitch of the head in each line, or while each beam is measured, radians.
+    T_head_lrf : RigidTransform
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Scan
+    """
+    bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
+    flat, step = (bearings.ravel(), pitch.ravel()), max(1, RAYS_AT_ONCE // beam.rays)
+    starts = range(0, bearings.size, step)
+    parts = [ideal_readings(beam, world, *(v[i : i + step] for v in flat), T_head_lrf) for i in starts]
+    reading, total, dazzled = (np.concatenate(p).reshape(bearings.shape) for p in zip(*parts, strict=True))
+    noisy = reading + beam.systematic + beam.sigma_range * rng.standard_normal(reading.shape)
+    return encode(beam, noisy, total, dazzled)
+
+
+def encode(beam, readings, total, dazzled):
+    """Round readings to the device's unit and put its codes where there is no range.
+
+    Parameters
+    ----------
+    beam : Beam
+    readings : ndarray
+        Metres, NaN without an echo.
+    total : ndarray
+        Returned energy.
+    dazzled : ndarray of bool
+
+    Returns
+    -------
+    Scan
+    """
+    counts = np.rint(np.nan_to_num(readings, nan=0.0) / beam.unit)
+    words = np.clip(counts, 0, LARGEST_WORD)
+    words = np.where(counts > LARGEST_WORD, TOO_FAR, words)
+    weak = np.where(total > 0, WEAK, NOT_VALID)
+    words = np.where(np.isfinite(readings), words, weak)
+    words = np.where(dazzled, DAZZLED, words).astype(np.uint16)
+    ranges = np.where(words <= LARGEST_WORD, words * beam.unit, np.nan)
+    return Scan(words, ranges)

@@ -1,0 +1,98 @@
+"""Speed, as ratios within one run: ours against scipy, OpenCV, or itself one by one. Run with ``make bench``."""
+
+import time
+
+import cv2
+import numpy as np
+import pandas as pd
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_observations, random_board_poses, random_rig
+
+from lrfcal_lib.camera import CameraModel, line_distance, pinhole, project
+from lrfcal_lib.drivers.lms2xx import decode_scans, encode_scan, split_stream
+from lrfcal_lib.reconstruct import color_points
+from lrfcal_lib.solvers.camera import solve_lines, solve_lines_batch
+
+REPEATS = 7
+
+
+def seconds(function):
+    """Median time of a call, after one to warm up."""
+    function()
+    times = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times))
+
+
+def solving():
+    """One line calibration: ours, scipy with a numeric Jacobian, and a thousand trials at once."""
+    rng = np.random.default_rng(0)
+    rig = random_rig(rng)
+    obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig), noise=1.0)
+    start = solve_lines(obs).transform
+
+    def residuals(x):
+        T = RigidTransform.from_components(x[3:], Rotation.from_rotvec(x[:3]))
+        return line_distance(pinhole(T.apply(obs.crossing_points), obs.model), obs.crossing_lines)
+
+    x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
+    T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
+    ours, theirs = seconds(lambda: solve_lines(obs, T0)), seconds(lambda: least_squares(residuals, x0, method="lm"))
+    points = np.broadcast_to(obs.crossing_points, (1000,) + obs.crossing_points.shape)
+    data = (points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
+    batch = seconds(lambda: solve_lines_batch(*data, T0)) / 1000
+    yield (
+        f"line calibration, {len(obs.crossing_points)} crossings",
+        1000 * ours,
+        "ms",
+        "scipy lm, numeric",
+        theirs / ours,
+    )
+    yield "the same in a batch of 1000", 1000 * batch, "ms", "one by one", ours / batch
+
+
+def projecting():
+    """A million points through the lens, and the colours of half a million."""
+    rng = np.random.default_rng(1)
+    model = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
+    points = rng.uniform([-1, -0.7, 1.5], [1, 0.7, 4], (1_000_000, 3))
+    image = rng.integers(0, 255, (768, 1024, 3), dtype=np.uint8)
+    zero = np.zeros(3)
+    ours = seconds(lambda: project(points, model))
+    theirs = seconds(lambda: cv2.projectPoints(points, zero, zero, model.matrix, model.distortion))
+    half = points[::2]
+    color = seconds(lambda: color_points(half, image, RigidTransform.identity(), model))
+    yield "projection", 1 / ours, "Mpoint/s", "cv2.projectPoints", theirs / ours
+    yield "projection, occlusion and colour", 0.5 / color, "Mpoint/s", "projection alone", ours / 2 / color
+
+
+def decoding():
+    """Telegrams of an LMS2xx: found, checked and decoded."""
+    data = b"".join(encode_scan(r) for r in np.random.default_rng(2).uniform(1, 8, (200, 361))) * 100
+
+    def whole():
+        stream = split_stream(data)
+        return decode_scans(data, stream.offset, stream.length)
+
+    taken = seconds(whole)
+    yield (
+        "telegrams with their checksums",
+        len(data) / 1e6 / taken,
+        "MB/s",
+        "the line at 500 kBd",
+        len(data) / 5e4 / taken,
+    )
+
+
+def main():
+    rows = [row for part in (solving, projecting, decoding) for row in part()]
+    table = pd.DataFrame(rows, columns=["what", "value", "unit", "against", "times_faster"])
+    print(table.round(2).to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()

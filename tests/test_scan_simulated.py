@@ -1,0 +1,81 @@
+"""The board and its sides in the shipped simulated sweeps (a wide spot, a post, a room), against their truth."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from lrfcal_lib import evaluate
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.notebook import ROOT
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.session import open_session
+
+PLACEMENTS = [("sim_quick", n) for n in range(1, 5)] + [("sim_lms221", n) for n in range(1, 25)]
+WIDEST = 0.025  # metres; half a spot at 3 m, by which an edge before nothing lies farther out
+
+
+@lru_cache
+def opened(name):
+    session = open_session(ROOT / "data" / name)
+    return session, evaluate.read_truth(session)
+
+
+@lru_cache
+def seen(name, placement):
+    """The board in a sweep, with the place of every beam on its true plane (board frame) and the true ranges."""
+    session, truth = opened(name)
+    sweep = session.sweep(placement)
+    pitch = np.repeat(truth.pitch[placement][:, None], len(sweep.bearings), axis=1)
+    origin = lrf_to_platform(np.zeros(pitch.shape + (3,)), pitch, truth.T_head_lrf)
+    rays = lrf_to_platform(polar_to_points(np.ones(pitch.shape), sweep.bearings), pitch, truth.T_head_lrf) - origin
+    pose = truth.boards[placement]
+    normal = pose.rotation.apply([0, 0, 1.0])
+    ranges = (normal @ pose.translation - origin @ normal) / (rays @ normal)
+    at = pose.inv().apply((origin + ranges[..., None] * rays).reshape(-1, 3))[:, :2]
+    beyond = (at @ truth.board.lines()[:, :2].T + truth.board.lines()[:, 2]).max(axis=1).reshape(pitch.shape)
+    return scan.find_board(sweep, session.board, session.T_head_lrf), np.where(ranges > 0, beyond, np.inf), ranges
+
+
+def on_board(name, placement, edges):
+    """Edge points in the true board frame, shape (n, 2)."""
+    _, truth = opened(name)
+    recorded = opened(name)[0].sweep(placement).pitch
+    order = np.argsort(recorded)
+    pitch = np.interp(edges.pitch, recorded[order], truth.pitch[placement][order])
+    p = lrf_to_platform(edges.points, pitch, truth.T_head_lrf)
+    return truth.boards[placement].inv().apply(p)[:, :2]
+
+
+@pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
+def test_the_board_and_hardly_anything_else_is_found(name, placement):
+    board, beyond, ranges = seen(name, placement)
+    assert np.mean(board.mask[beyond < 0]) > 0.91  # a post close behind takes a strip of some boards
+    assert np.mean(board.mask[(beyond < -0.04) & np.isfinite(board.sweep.ranges)]) > 0.97
+    assert np.mean(beyond[board.mask] > WIDEST) < 0.01
+    assert np.abs(board.sweep.ranges - ranges)[board.mask].max() < 0.07  # the post is 35 cm behind
+    assert board.sigma_range == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
+def test_each_edge_gives_one_side_with_its_direction(name, placement):
+    lines, number_of = opened(name)[1].board.lines(), {}
+    for edges in (scan.edge_points(seen(name, placement)[0]), scan.sweep_edges(seen(name, placement)[0])):
+        p, here = on_board(name, placement, edges), []
+        for side in edges.sides:
+            mine = p[edges.side == side.side]
+            along = np.linalg.svd(mine - mine.mean(axis=0))[2][0]
+            turned = np.arcsin(np.minimum(np.abs(lines[:, :2] @ along), 1.0))
+            edge = int(turned.argmin())
+            assert turned[edge] < 4 * side.angle_sigma
+            assert np.abs(np.median(mine @ lines[edge, :2] + lines[edge, 2])) < WIDEST
+            assert number_of.setdefault(edge, side.side) == side.side
+            here.append(edge)
+        assert len(here) == len(set(here)) >= 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
+    session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
+    board = scan.find_board(session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed))
+    assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()

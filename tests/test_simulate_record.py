@@ -1,0 +1,251 @@
+"""Simulated recordings: platform, placements, the shipped sessions, and everything that can go wrong."""
+
+import errno
+import hashlib
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.__main__ import main
+from lrfcal_lib.board import triangle_board
+from lrfcal_lib.geometry import lrf_to_platform
+from lrfcal_lib.session import open_session, transform_from_json, validate
+from lrfcal_lib.simulate import card, record
+from lrfcal_lib.simulate.placements import check_size, held_close, pairs
+from lrfcal_lib.simulate.platform import Platform, step_angles
+from lrfcal_lib.simulate.setups import SETUPS, sim_lms221, sim_quick
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+QUICK = DATA / "sim_quick"
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return sim_quick()
+
+
+@pytest.fixture(scope="module")
+def session():
+    return open_session(QUICK)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return json.loads((QUICK / "truth.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """Two placements, nothing else, small images."""
+    full = sim_quick()
+    cameras = tuple(replace(c, model=replace(c.model, width=640, height=480)) for c in full.rig.cameras[:1])
+    rig = replace(full.rig, cameras=cameras, beam=full.rig.beam.with_settings(rings=1))
+    return replace(full, rig=rig, pairs=1, step=np.radians(1.0), intrinsics_views=0, room_sweep=(), room_images=())
+
+
+def test_backlash_depends_on_the_direction():
+    platform, rng = Platform(backlash=0.002, stretch=0.01, encoder_step=0.001), np.random.default_rng(0)
+    commanded = np.array([-0.1, 0.0, 0.2])
+    up, measured = platform.stop(commanded, 1, rng)
+    down, _ = platform.stop(commanded, -1, rng)
+    np.testing.assert_allclose(down - up, 0.002)
+    np.testing.assert_allclose((up + down) / 2, 1.01 * commanded)
+    np.testing.assert_allclose(measured, commanded, atol=1e-12)
+
+
+def test_the_encoder_rounds_and_the_head_does_not_rest_exactly():
+    platform = Platform(noise=1e-4, encoder_step=2e-3)
+    true, measured = platform.stop(np.full(4000, 0.1234), 1, np.random.default_rng(0))
+    assert np.std(true) == pytest.approx(1e-4, rel=0.05)
+    np.testing.assert_allclose(measured / 2e-3, np.round(measured / 2e-3), atol=1e-9)
+
+
+def test_the_measured_pitch_of_a_moving_head_lags():
+    platform = Platform(latency=0.1, speed=0.2, backlash=0.01)
+    time = np.array([0.0, 0.5, 1.0, 9.0])
+    true, measured = platform.sweep(0.3, -0.1, time)
+    np.testing.assert_allclose(true, [0.305, 0.205, 0.105, -0.095])
+    np.testing.assert_allclose(measured, [0.3, 0.22, 0.12, -0.1])
+
+
+def test_stops_are_multiples_of_the_step():
+    np.testing.assert_allclose(step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
+    with pytest.raises(ValueError, match="a pitch step must be positive, got 0.0"):
+        step_angles(0, 1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": -1e-4}, "platform: noise is -0.0001"),
+        ({"backlash": float("inf")}, "backlash is inf"),
+        ({"speed": 0.0}, "speed is 0.0"),
+        ({"stretch": 2.0}, "stretch is 2.0"),
+    ],
+)
+def test_impossible_platforms(change, message):
+    with pytest.raises(ValueError, match=message):
+        Platform(**change)
+    with pytest.raises(ValueError, match="pitch -10.0 to 80.0 deg is asked for"):
+        Platform().stop(np.radians([-10, 80]), 1, np.random.default_rng(0))
+
+
+def test_the_scan_plane_meets_a_point_at_the_sweep_pitch(setup):
+    points = np.array([[0.3, 1.8, 0.2], [-0.4, 2.0, -0.5]])
+    pitch, bearing = setup.rig.sweep_pitch(points)
+    for p, phi, b in zip(points, pitch, bearing, strict=True):
+        direction = np.array([[np.cos(b), np.sin(b), 0.0]])
+        ends = lrf_to_platform(np.concatenate([0 * direction, 4 * direction]), np.full(2, phi), setup.rig.T_head_lrf)
+        along = (ends[1] - ends[0]) / 4
+        assert np.linalg.norm(np.cross(p - ends[0], along)) < 1e-9 and along @ (p - ends[0]) > 0
+
+
+def test_placements_come_in_near_perpendicular_pairs_in_view():
+    setup = sim_lms221()
+    found = record.placements_of(setup)
+    assert [p.number for p in found] == list(range(1, 25))
+    assert [len(p.image_pitch) for p in found] == [3, 1] * 12
+    assert [p.direction for p in found] == [1, -1] * 12
+    distance = [np.linalg.norm(setup.rig.outline(p.T_platform_board).mean(axis=0)) for p in found]
+    assert 1.1 < min(distance) < 1.5 and 2.7 < max(distance) < 3.2
+    for first, second in zip(found[::2], found[1::2], strict=True):
+        a, b = (p.T_platform_board.rotation.as_matrix()[:, :2] for p in (first, second))
+        assert abs(a[:, 0] @ b[:, 0]) < np.cos(np.radians(45))
+    for p in found:
+        for camera in setup.rig.cameras:
+            for pitch in p.image_pitch:
+                assert setup.rig.shows(camera, setup.rig.camera_pose(camera, pitch) * p.T_platform_board)
+
+
+def test_the_shipped_session_is_sound(session, truth):
+    assert validate(QUICK) == []
+    assert session.simulated and session.licence == "CC-BY-4.0" and session.placements == (1, 2, 3, 4, 5)
+    assert all(info.model is None for info in session.cameras.values())
+    assert session.telegram_report()["values"]["dazzled"] > 0
+    purposes = {p: len(session.images(purpose=p)) for p in ("intrinsics", "board", "scene")}
+    assert purposes == {"intrinsics": 24, "board": 16, "scene": 4}
+    head = transform_from_json(truth["T_head_lrf"])
+    assert 0.5 < np.degrees((head.rotation * session.T_head_lrf.rotation.inv()).magnitude()) < 3
+    assert len((QUICK / "platform.csv").read_text().splitlines()) == 1 + len(session.scans["pitch"]) + 8 + 2
+
+
+def test_the_scan_hits_the_true_board(session, truth):
+    head = transform_from_json(truth["T_head_lrf"])
+    for placement in (1, 2, 3, 4):
+        sweep = session.sweep(placement)
+        pitch = np.array(truth["sweeps"][str(placement)]["pitch_rad"])
+        p_lrf = sweep.ranges[..., None] * np.stack(
+            [np.cos(sweep.bearings), np.sin(sweep.bearings), 0 * sweep.bearings], -1
+        )
+        points = lrf_to_platform(p_lrf, pitch[:, None], head)
+        p_board = (
+            transform_from_json(truth["boards"][str(placement)]["T_platform_board"]).inv().apply(points.reshape(-1, 3))
+        )
+        x, y, z = p_board[np.isfinite(p_board).all(axis=1)].T
+        inside = (x > 0.06) & (y > 0.06) & (x / 0.315 + y / 0.38 < 0.7) & (np.abs(z) < 0.05)
+        assert inside.sum() > 60
+        # the device's systematic 5 mm, seen along the normal
+        assert abs(np.mean(z[inside])) < 0.007 and np.std(z[inside]) < 0.012
+
+
+def test_a_sweep_and_an_image_are_rebuilt_to_the_byte(setup, session):
+    placement = record.placements_of(setup)[3]
+    np.testing.assert_array_equal(record.sweep_of(setup, placement).ranges, session.sweep(4).ranges)
+    shots = [s for s in record.shots_of(setup, [placement]) if s.placement == 4 and s.camera == 0]
+    made = record.photograph(setup, shots[0])
+    shipped = [r.file.read_bytes() for r in session.images("left", 4)]
+    assert made == shipped
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_the_data_card_has_the_sums_of_all_files(name):
+    lines = [line for line in (DATA / card.SUMS).read_text().splitlines() if f"  {name}/" in line]
+    files = [f for f in (DATA / name).rglob("*") if f.is_file()]
+    assert len(lines) == len(files)
+    for line in lines:
+        value, file = line.split("  ")
+        assert hashlib.sha256((DATA / file).read_bytes()).hexdigest() == value
+    assert hashlib.sha256((DATA / card.SUMS).read_bytes()).hexdigest() in (DATA / "README.md").read_text()
+
+
+def test_sizes():
+    size = {name: sum(f.stat().st_size for f in (DATA / name).rglob("*") if f.is_file()) for name in SETUPS}
+    assert size["sim_lms221"] < 40e6 and size["sim_quick"] < 3e6
+
+
+def test_a_card_needs_its_marks(tmp_path):
+    (tmp_path / "README.md").write_text("nothing")
+    with pytest.raises(ValueError, match="marks"):
+        card.write_card(tmp_path, [])
+
+
+def test_simulate_writes_a_session(tmp_path, tiny):
+    record.simulate(tmp_path / "s", tiny)
+    assert validate(tmp_path / "s") == [] and open_session(tmp_path / "s").placements == (1, 2)
+    assert [p.name for p in tmp_path.iterdir()] == ["s"]
+
+
+def test_an_existing_folder_is_left_alone(tmp_path, tiny):
+    (tmp_path / "s").mkdir()
+    with pytest.raises(record.SimulationError, match="exists already"):
+        record.simulate(tmp_path / "s", tiny)
+    assert list((tmp_path / "s").iterdir()) == []
+
+
+@pytest.mark.parametrize("after", [1, 12])
+def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, after):
+    calls, real = [], os.fsync
+
+    def full(handle):
+        calls.append(handle)
+        if len(calls) > after:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(record.SimulationError, match="No space left on device.*free some space; nothing was kept"):
+        record.simulate(tmp_path / "s", tiny)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_board_larger_than_the_view(tmp_path, tiny):
+    big = replace(tiny, rig=replace(tiny.rig, board=triangle_board(3.0, 4.0)))
+    with pytest.raises(record.SimulationError, match="is 5 m long: 125 deg at 1.3 m, but LMS221-30206 sees 100 deg"):
+        record.simulate(tmp_path / "s", big)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match="but camera 'left' sees 39 deg"):
+        check_size(replace(tiny.rig, board=triangle_board(0.9, 1.0)), 1.3)
+
+
+def test_impossible_setups(tiny):
+    for change, message in (
+        ({"step": 0.0}, "the pitch step is 0.0"),
+        ({"quality": 0}, "JPEG quality is 1 to 100, got 0"),
+        ({"intrinsics_views": -1}, "-1 intrinsics views"),
+        ({"room_sweep": (0.0, 1.0)}, "room_sweep is"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(tiny, **change)
+    with pytest.raises(ValueError, match="0 pairs"):
+        pairs(tiny.rig, 0, (1.0, 2.0), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="has no pattern"):
+        held_close(replace(tiny.rig, board=triangle_board()), tiny.rig.cameras[0], 3, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="mount is one of head, platform, got 'roof'"):
+        replace(tiny.rig.cameras[0], mount="roof")
+
+
+def test_cameras_on_the_base_do_not_turn(tiny):
+    fixed = replace(tiny.rig.cameras[0], mount="platform", mounting=RigidTransform.identity())
+    a, b = (tiny.rig.camera_pose(fixed, pitch).as_matrix() for pitch in (0.0, 0.3))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_the_verb_refuses(tmp_path, capsys):
+    assert main(["simulate", "sim_quick", str(tmp_path)]) == 1
+    assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,128 @@
+"""Rendered images: corners where the camera model puts them, and settings that cannot be."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.camera import CameraModel, project, undistort
+from lrfcal_lib.simulate import room, shapes, textures
+from lrfcal_lib.simulate.render import Exposure, Imager
+from lrfcal_lib.simulate.scene import Lights, Material, Thing, World
+from lrfcal_lib.simulate.setups import printed_triangle
+
+LENS = CameraModel(512, 384, 800.0, 798.0, 258.0, 189.0, np.array([-0.21, 0.09, 0.0006, -0.0004, 0.0]))
+CLEAN = Exposure(read_noise=0.0, shot_noise=0.0, samples=5)
+LIGHT = Lights(np.array([[0.3, -1.0, -0.5]]), np.array([0.6]), 0.5)
+
+
+def plain(albedo):
+    return Material(textures.plain((albedo,) * 3))
+
+
+def shifted(by):
+    return RigidTransform.from_translation(by)
+
+
+def board_pose(distance, turn, roll):
+    facing = Rotation.from_euler("x", 180, degrees=True) * Rotation.from_euler("YXZ", [turn, 15, roll], degrees=True)
+    return RigidTransform.from_components(np.array([0, 0, distance]) - facing.apply([0.1, 0.1, 0]), facing)
+
+
+def looking_at(board, pose):
+    front = Material(textures.chessboard(board, 0.07, 0.75, 0.65))
+    wall = Thing(*shapes.rectangle(9, 9), plain(0.5), shifted([0, 0, 4.0]))
+    return World([Thing(*shapes.polygon(board.corners), front, pose), wall], LIGHT)
+
+
+@pytest.mark.parametrize(("distance", "turn", "roll"), [(0.9, 0, -135), (1.2, 30, 20), (1.6, -25, 100)])
+def test_chessboard_corners_reproject(distance, turn, roll):
+    board, pose = printed_triangle(), board_pose(distance, turn, roll)
+    image = Imager(LENS, CLEAN).render(looking_at(board, pose), RigidTransform.identity(), np.random.default_rng(0))
+    true = project(pose.apply(board.pattern.points()), LENS)
+    window = max(2, int(0.3 * np.linalg.norm(true[1] - true[0])))
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
+    start = (true + np.random.default_rng(1).uniform(-0.5, 0.5, true.shape)).astype(np.float32).reshape(-1, 1, 2)
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    found = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), stop).reshape(-1, 2)
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.05
+
+
+def test_the_share_of_a_pixel_that_an_edge_covers():
+    """Along a straight slanted edge the light changes exactly where the edge is, through the whole lens model."""
+    board, pose = printed_triangle(), board_pose(1.0, 0, 8)
+    imager = Imager(LENS, CLEAN)
+    light = imager.light(looking_at(board, pose), RigidTransform.identity(), np.random.default_rng(0))[..., 1]
+    ends = project(pose.apply([[0.03, 0.0, 0.0], [0.28, 0.0, 0.0]]), LENS)
+    columns = np.arange(int(ends[:, 0].min()) + 2, int(ends[:, 0].max()) - 2)
+    along = np.linspace(0.03, 0.28, 2000)
+    edge = project(pose.apply(np.column_stack([along, 0 * along, 0 * along])), LENS)
+    order = np.argsort(edge[:, 0])
+    true = np.interp(columns, edge[order, 0], edge[order, 1])
+    misses = []
+    for column, v in zip(columns, true, strict=True):
+        strip = light[int(v) - 5 : int(v) + 7, column]
+        below = (strip - strip[0]) / (strip[-1] - strip[0])  # the board is above or below: both ends are plain
+        misses.append(int(v) + 6.5 - below.sum() - v)
+    assert abs(np.mean(misses)) < 0.02
+
+
+def test_the_same_seed_makes_the_same_picture():
+    world, pose = looking_at(printed_triangle(), board_pose(1.0, 10, 0)), RigidTransform.identity()
+    imager = Imager(LENS)
+    first, again, other = (imager.render(world, pose, np.random.default_rng(s)) for s in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert np.any(first != other)
+
+
+def test_automatic_exposure_and_noise():
+    wall = Thing(*shapes.rectangle(9, 9), plain(0.5), shifted([0, 0, 2.0]))
+    world = World([wall], Lights(np.zeros((0, 3)), np.zeros(0), 1.0))
+    exposure = Exposure(vignetting=0.0, bright=200.0, gain=(10.0, 1000.0), read_noise=1.0, shot_noise=0.01)
+    image = Imager(LENS, exposure).render(world, RigidTransform.identity(), np.random.default_rng(0))
+    assert np.mean(image) == pytest.approx(200, abs=0.1)
+    assert np.std(image.astype(float)) == pytest.approx(np.sqrt(1 + 2 + 1 / 12), rel=0.02)
+    dark = Imager(LENS, Exposure(vignetting=0.0, bright=200.0, gain=(10.0, 100.0)))
+    assert np.mean(dark.render(world, RigidTransform.identity(), np.random.default_rng(0))) == pytest.approx(
+        50, abs=0.1
+    )
+
+
+def test_a_light_casts_shadows():
+    floor = Thing(*shapes.rectangle(9, 9), plain(1.0), shifted([0, 0, 3.0]))
+    plate = Thing(*shapes.rectangle(0.4, 0.4), plain(1.0), shifted([0.6, 0, 2.0]))
+    world = World([floor, plate], Lights(np.array([[1.2, 0.0, 1.0]]), np.array([4.0]), 0.1))
+    directions = np.array([[0.0, 0.0, 1.0], [0.0, -0.9, 3.0]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.zeros((2, 3))
+    light = world.radiance(origins, directions, world.cast(origins, directions))
+    assert light[0, 0] == pytest.approx(0.1) and light[1, 0] > 0.3
+
+
+def test_a_camera_looks_out_of_the_window():
+    world = room.furnished_room()
+    up = np.array([[3.1, 3.1, 0.3]]) / np.linalg.norm([3.1, 3.1, 0.3])
+    hits = world.cast(np.zeros((1, 3)), up)
+    assert np.isinf(hits.distance[0]) and world.radiance(np.zeros((1, 3)), up, hits).min() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"read_noise": -1.0}, "read_noise is -1.0: it cannot be negative"),
+        ({"gain": (0.0, 10.0)}, "two positive levels"),
+        ({"samples": 0}, "samples is 0"),
+    ],
+)
+def test_impossible_exposures(change, message):
+    with pytest.raises(ValueError, match=message):
+        Exposure(**change)
+
+
+def test_lenses_that_fold_and_odd_sizes():
+    folded = CameraModel(512, 384, 200.0, 200.0, 255.0, 191.0, np.array([-0.9, 0.0, 0.0, 0.0, 0.0]))
+    assert undistort([[0.0, 0.0]], folded).shape == (1, 2)
+    with pytest.raises(ValueError, match="folds the image"):
+        Imager(folded)
+    with pytest.raises(ValueError, match="513 x 384 pixels, both must be multiples of 2"):
+        Imager(CameraModel(513, 384, 800.0, 800.0, 256.0, 192.0))
