@@ -42,29 +42,29 @@ def plain(color, rough=0.0, cell=0.15):
     """One colour, with a soft variation of the share `rough`."""
     color = np.asarray(color, float)
 
-    def texture(points):
+    def _texture(points):
         if not rough:
             return np.broadcast_to(color, points.shape)
         return color * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
 
-    return texture
+    return _texture
 
 
 def wood(color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
     color = np.asarray(color, float)
 
-    def texture(points):
+    def _texture(points):
         return color * (0.8 + 0.4 * value_noise(points, np.asarray(cell)))[:, None]
 
-    return texture
+    return _texture
 
 
 def planks(color, width=0.18, length=1.4):
     """A wooden floor: boards along y with dark joints."""
     grain = wood(color, (0.03, 0.6, 1.0))
 
-    def texture(points):
+    def _texture(points):
         row = np.floor(points[:, 0] / width)
         shifted = points[:, 1] / length + 0.37 * row
         tone = _LATTICE[row.astype(int) & 63, np.floor(shifted).astype(int) & 63, 7]
@@ -72,35 +72,35 @@ def planks(color, width=0.18, length=1.4):
         dark = np.where(joint < 0.002, 0.55, 1.0)
         return grain(points) * ((0.85 + 0.3 * tone) * dark)[:, None]
 
-    return texture
+    return _texture
 
 
 def stripes(first, second, period, axis=0):
     """Two colours in turn along an axis."""
     colors = np.array([first, second], float)
 
-    def texture(points):
+    def _texture(points):
         return colors[np.floor(2 * points[:, axis] / period).astype(int) & 1]
 
-    return texture
+    return _texture
 
 
 def tiles(color, joint, size):
     """Square tiles in x and z with lighter or darker joints of 4 mm."""
     color, joint = np.asarray(color, float), np.asarray(joint, float)
 
-    def texture(points):
+    def _texture(points):
         at = points[:, [0, 2]] / size
         near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
         return np.where(near[:, None], joint, color * (0.94 + 0.12 * value_noise(points, size))[:, None])
 
-    return texture
+    return _texture
 
 
 def printed_page(width, height, heading=0.1, line=0.0055):
     """Lines of text on white paper in the plane z = 0 about the origin: words as dark bars, a heading, a picture."""
 
-    def texture(points):
+    def _texture(points):
         x, y = points[:, 0] / width + 0.5, 0.5 - points[:, 1] / height
         row = np.floor(points[:, 1] / line).astype(int)
         word = np.floor((points[:, 0] + 0.31 * row * line) / (2.1 * line)).astype(int)
@@ -112,14 +112,14 @@ def printed_page(width, height, heading=0.1, line=0.0055):
         grey = np.where(picture, shade, np.where(ink, 0.12, 0.86))
         return np.repeat(grey[:, None], 3, axis=1)
 
-    return texture
+    return _texture
 
 
 def poster(width, height, colors):
     """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
     sky, sun, far, near = np.asarray(colors, float)
 
-    def texture(points):
+    def _texture(points):
         x, y = points[:, 0] / width + 0.5, points[:, 1] / height + 0.5
         out = sky * (0.7 + 0.4 * y)[:, None]
         disc = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height) < 0.11 * width
@@ -129,7 +129,7 @@ def poster(width, height, colors):
         rim = (np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48)
         return np.where(rim[:, None], 0.85, out)
 
-    return texture
+    return _texture
 
 
 def book_spines(seed, pitch=0.035):
@@ -137,7 +137,7 @@ def book_spines(seed, pitch=0.035):
     rng = np.random.default_rng(seed)
     palette = rng.uniform(0.1, 0.6, (64, 1)) * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
 
-    def texture(points):
+    def _texture(points):
         at = points[:, 0] / pitch
         book = np.floor(at).astype(int) & 63
         gap = np.abs(at - np.round(at)) < 0.05
@@ -145,7 +145,7 @@ def book_spines(seed, pitch=0.035):
         color = np.where(label[:, None], 0.75, palette[book])
         return np.where(gap[:, None], 0.04, color)
 
-    return texture
+    return _texture
 
 
 def chessboard(board, dark, light, ring=0.5):
@@ -172,7 +172,7 @@ def chessboard(board, dark, light, ring=0.5):
     """
     pattern = board.pattern
 
-    def texture(points):
+    def _texture(points):
         grey = np.full(len(points), float(dark))
         if pattern is not None:
             at = (points[:, :2] - np.asarray(pattern.origin)) / pattern.square
@@ -182,4 +182,4 @@ def chessboard(board, dark, light, ring=0.5):
             grey[inside & even] = light
         return np.repeat(grey[:, None], 3, axis=1)
 
-    return texture
+    return _texture
