@@ -272,11 +272,11 @@ def _writer(folder, name, setup):
         sigma_range=beam.sigma_range,
         range_resolution=beam.unit,
         max_range=lrf.LARGEST_WORD * beam.unit,
+        spot=(beam.spot_exit, beam.divergence),
     )
     cameras = [CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in rig.cameras]
     reference = {
         "recording": "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at rest",
-        "lrf_spot": {"diameter_at_window_m": beam.spot_exit, "divergence_rad": beam.divergence, "source": "maker"},
         "scene_placements": [2 * setup.pairs + 1] if setup.room_sweep else [],
     }
     return SessionWriter(

@@ -42,6 +42,9 @@ class Block:
     corrected : ndarray, shape (..., n, k), optional
         Jacobian that includes the change of the whitener: ``J - dS/2 S^-1 r`` for residuals with covariance S. The
         steps use it where it is given.
+    cost : ndarray, shape (..., n), optional
+        Negative log likelihood of each residual where it is not half a square; the residuals are then score over root
+        information, the Jacobian root information times the derivative, the whitener one or zero. No loss applies.
     """
 
     residuals: np.ndarray
@@ -49,6 +52,7 @@ class Block:
     whitener: np.ndarray
     count: float | np.ndarray | None = None
     corrected: np.ndarray | None = None
+    cost: np.ndarray | None = None
 
     @property
     def size(self):
@@ -122,6 +126,8 @@ def _scale(block, z, count, scale, axes):
 def _weigh(block, loss, scale, axes):
     """Robust weights (..., n) of a block at its own state and the loss value summed over the trial."""
     r, _ = whiten(block, jacobian=False)
+    if block.cost is not None:
+        return np.ones_like(r), 2 * np.sum(block.cost, axis=axes)
     if loss is None:
         return np.ones_like(r), np.sum(r**2, axis=axes)
     z, count = _group_sizes(block, r)
@@ -155,6 +161,9 @@ def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
     total = 0.0
     for block, root in zip(blocks, roots, strict=True):
+        if block.cost is not None:
+            total = total + np.sum(block.cost, axis=axes)
+            continue
         r, _ = whiten(block, jacobian=False)
         total = total + 0.5 * np.sum((root * r) ** 2, axis=axes)
     return total
