@@ -1,8 +1,8 @@
 """What a beam near a board's edge says about the edge: the likelihood of reading the board or what is behind it.
 
-A beam lights a spot, a disc about its ray. The reading flips from the board to the background where the board's share of
-the returned energy falls below some odds that only the device knows: a constant of the sensor, the same on all edges.
-The background weakens with its distance squared, which is known wherever the scan shows it. So one number a sensor
+A beam lights a spot, a disc about its ray. The reading flips from the board to the background where the board's share
+of the returned energy falls below some odds that only the device knows: a constant of the sensor, the same on all
+edges. The background weakens with its distance squared, which is known wherever the scan shows it. So one number a sensor
 (the log odds) tells by how much boards look larger or smaller, and it is estimated with everything else. Device noise
 makes the flip soft.
 """
