@@ -156,7 +156,7 @@ def test_the_scan_hits_the_true_board(session, truth):
 
 
 def test_a_sweep_and_an_image_are_rebuilt(setup, session):
-    """To the byte on one kind of processor; on another the last bit of a sine moves a rounding here and there."""
+    """To the byte on one kind of processor; on another the last bit of a sine moves roundings and photon counts."""
     placement = record.placements_of(setup)[3]
     made, shipped = record.sweep_of(setup, placement).ranges, session.sweep(4).ranges
     np.testing.assert_array_equal(np.isnan(made), np.isnan(shipped))
@@ -165,8 +165,8 @@ def test_a_sweep_and_an_image_are_rebuilt(setup, session):
     shots = [s for s in record.shots_of(setup, [placement]) if s.placement == 4 and s.camera == 0]
     shipped = [r.file.read_bytes() for r in session.images("left", 4)]
     for pair in zip(record.photograph(setup, shots[0]), shipped, strict=True):
-        one, two = (cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(int) for content in pair)
-        assert np.abs(one - two).mean() < 0.01 and np.abs(one - two).max() < 16
+        one, two = (cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(float) for content in pair)
+        assert np.abs(one - two).mean() < 2.0 and np.abs(cv2.blur(one - two, (15, 15))).max() < 2.0
 
 
 @pytest.mark.parametrize("name", SETUPS)

@@ -2,9 +2,9 @@
 
 A beam lights a spot, a disc about its ray. The reading flips from the board to the background where the board's share
 of the returned energy falls below some odds that only the device knows: a constant of the sensor, the same on all
-edges. The background weakens with its distance squared, which is known wherever the scan shows it. So one number a sensor
-(the log odds) tells by how much boards look larger or smaller, and it is estimated with everything else. Device noise
-makes the flip soft.
+edges. The background weakens with its distance squared, which is known wherever the scan shows it. So one number a
+sensor (the log odds) tells by how much boards look larger or smaller, and it is estimated with everything else. Device
+noise makes the flip soft.
 """
 
 from __future__ import annotations
