@@ -43,6 +43,25 @@ def _report(args):
     return main(args.rest)
 
 
+def _record(args):
+    from lrfcal_lib.acquisition import main
+
+    return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
+
+
+def _emulate(args):
+    from lrfcal_lib.drivers.emulators.run import main
+
+    return main(args.rest)
+
+
+def _count(text):
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} placements: 1 or more are needed")
+    return value
+
+
 def parser():
     """The command line.
 
@@ -71,6 +90,15 @@ def parser():
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
     calibrate.set_defaults(run=_calibrate)
+    record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
+    record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
+    record.add_argument("session", help="folder of the new session")
+    record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
+    record.add_argument("--placements", type=_count, metavar="N", help="record N placements of the plan")
+    record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
+    record.set_defaults(run=_record)
+    emulate = verbs.add_parser("emulate", help="emulate the devices of a rig (emulate -h for more)", add_help=False)
+    emulate.set_defaults(run=_emulate)
     report = verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
     report.set_defaults(run=_report)
     return top
@@ -87,10 +115,11 @@ def main(argv=None):
     Returns
     -------
     int
-        0, or 1 after a message on stderr (a ``ValueError`` is bad input, not a bug).
+        0, or 1 after a message on stderr (a ``ValueError`` is bad input, not a bug). ``record`` has its own: 2, and
+        130 after Ctrl-C.
     """
     args, args.rest = parser().parse_known_args(argv)
-    if args.rest and args.run is not _report:
+    if args.rest and args.run not in (_report, _emulate):
         parser().error(f"unrecognized arguments: {' '.join(args.rest)}")
     try:
         result = args.run(args)

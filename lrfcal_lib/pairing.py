@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ NAME_ANGLE = np.deg2rad(
 )  # between them; a larger one means that the side is none (a cloud cut by hand, an occluder)
 
 
-def observe(prepared, camera, variant="half_step", T_head_lrf=None, pitch_offset=None):
+def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None):
     """Pair what the LRF and one camera saw of the board.
 
     Parameters
@@ -37,15 +38,16 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, pitch_offset
         Rule for the edge point.
     T_head_lrf : RigidTransform, optional
         Platform calibration to use instead of the session's own.
-    pitch_offset : dict of int to float, optional
-        Radians to add to the recorded pitch, by placement.
+    correct : callable, optional
+        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
+        :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
 
     Returns
     -------
     CameraObservations
     """
     view_of = prepared.views[camera]
-    sources = _Sources(prepared, camera, platform_of(prepared, T_head_lrf), pitch_offset or {})
+    sources = _Sources(prepared, camera, platform_of(prepared, T_head_lrf), correct or _as_recorded)
     posed = [p for p, view in view_of.items() if view.T_camera_board is not None]
     pattern = prepared.board.pattern
     k = 0 if pattern is None else pattern.columns * pattern.rows
@@ -83,6 +85,10 @@ def platform_of(prepared, T_head_lrf=None):
     return RigidTransform.identity() if T_head_lrf is None else T_head_lrf
 
 
+def _as_recorded(placement, p_lrf, pitch):
+    return p_lrf, np.asarray(pitch)
+
+
 @dataclass(frozen=True)
 class _Sources:
     """Turns LRF points of a placement into the frame the camera is fixed to."""
@@ -90,14 +96,19 @@ class _Sources:
     prepared: Prepared
     camera: str
     T_head_lrf: RigidTransform
-    pitch_offset: dict
+    correct: Callable
 
     def transform(self, placement):
         mount = self.prepared.session.cameras[self.camera].mount
         view = self.prepared.views[self.camera].get(placement)
         image_pitch = 0.0 if mount == "platform" or view is None else view.pitch
-        offset = self.pitch_offset.get(placement, 0.0)
-        return lambda p, pitch: lrf_to_source(p, np.asarray(pitch) + offset, self.T_head_lrf, mount, image_pitch)
+        if mount == "head":
+            image_pitch = float(self.correct(placement, np.zeros(3), image_pitch)[1])
+
+        def turn(p_lrf, pitch):
+            return lrf_to_source(*self.correct(placement, p_lrf, pitch), self.T_head_lrf, mount, image_pitch)
+
+        return turn
 
     def points(self, placement, p_lrf, pitch):
         return self.transform(placement)(p_lrf, pitch)
@@ -124,11 +135,27 @@ class _Sources:
         return self.T_head_lrf.inv().apply(tilt(p_platform, -self.prepared.views[self.camera][placement].pitch))
 
     def covariance(self, placement, covariance, pitch):
+        rotation = self.rotation(placement, pitch)
+        return rotation @ covariance @ rotation.swapaxes(-1, -2)
+
+    def rotation(self, placement, pitch):
+        """From the LRF at some pitch angles to the source frame, shape (n, 3, 3)."""
         turn = self.transform(placement)
         origin = turn(np.zeros((len(pitch), 3)), pitch)
-        axes = [turn(np.tile(e, (len(pitch), 1)), pitch) - origin for e in np.eye(3)]
-        rotation = np.stack(axes, axis=-1)
-        return rotation @ covariance @ rotation.swapaxes(-1, -2)
+        return np.stack([turn(np.tile(e, (len(pitch), 1)), pitch) - origin for e in np.eye(3)], axis=-1)
+
+    def crossing(self, placement, found, rows):
+        """Some edge points of a scan with all that is known of them, source frame."""
+        p_lrf, pitch = found.points[rows], found.pitch[rows]
+        error = self.pitch_covariance(placement, p_lrf, pitch)
+        return {
+            "points": self.points(placement, p_lrf, pitch),
+            "covariance": self.covariance(placement, found.covariance[rows], pitch) + error,
+            "noise": self.covariance(placement, found.noise[rows], pitch) + error,
+            "half_step": (self.rotation(placement, pitch) @ found.half_step[rows][..., None])[..., 0],
+            "radius": self.prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
+            "background": found.background[rows],
+        }
 
 
 def _stack(parts, shape):
@@ -160,24 +187,26 @@ def _planes(prepared, sources):
 
 def _crossings(prepared, camera, variant, sources):
     """Crossings of named sides with the image line of the same edge, thinned evenly along each edge."""
-    parts = {key: [] for key in ("points", "covariance", "lines", "line_sigma", "placement", "edge", "across")}
+    parts = {key: [] for key in _CROSSING}
     for placement, name, found, side, across in _named_sides(prepared, variant):
         view = prepared.views[camera].get(placement)
         edge = None if view is None else view.edge(name)
         if edge is None:
             continue
         rows = thin(np.flatnonzero(found.side == side), CROSSINGS_PER_EDGE)
-        p_lrf, pitch = found.points[rows], found.pitch[rows]
-        parts["points"].append(sources.points(placement, p_lrf, pitch))
-        noise = sources.pitch_covariance(placement, p_lrf, pitch)
-        parts["covariance"].append(sources.covariance(placement, found.covariance[rows], pitch) + noise)
-        parts["lines"].append(np.tile(edge.line, (len(rows), 1)))
-        parts["line_sigma"].append(np.full(len(rows), np.sqrt(edge.covariance[0, 0])))
-        for key, value in (("placement", placement), ("edge", name), ("across", across)):
-            parts[key].append(np.full(len(rows), value))
-    shapes = {"points": (3,), "covariance": (3, 3), "lines": (3,)}
-    kinds = {"placement": int, "edge": object, "across": bool}
-    return {f"crossing_{k}": join_parts(v, shapes.get(k, ()), kinds.get(k, float)) for k, v in parts.items()}
+        here = {"placement": placement, "edge": name, "across": across, "line_sigma": np.sqrt(edge.covariance[0, 0])}
+        here = {key: np.full(len(rows), value) for key, value in here.items()}
+        here["lines"] = np.tile(edge.line, (len(rows), 1))
+        for key, values in (here | sources.crossing(placement, found, rows)).items():
+            parts[key].append(values)
+    return {f"crossing_{k}": join_parts(v, *_CROSSING[k]) for k, v in parts.items()}
+
+
+_CROSSING = {
+    "points": ((3,),), "covariance": ((3, 3),), "lines": ((3,),), "line_sigma": ((),), "placement": ((), int),
+    "edge": ((), object), "across": ((), bool), "half_step": ((3,),), "noise": ((3, 3),), "radius": ((),),
+    "background": ((),),
+}  # fmt: skip
 
 
 def _named_sides(prepared, variant):
@@ -263,7 +292,7 @@ def _to_board(prepared, placement, rough):
     for camera, T_camera_source in rough.items():
         view = prepared.views[camera].get(placement)
         if view is not None and view.T_camera_board is not None:
-            turn = _Sources(prepared, camera, platform_of(prepared), {}).transform(placement)
+            turn = _Sources(prepared, camera, platform_of(prepared), _as_recorded).transform(placement)
             T_board_source = view.T_camera_board.inv() * T_camera_source
             return lambda p, pitch: T_board_source.apply(turn(p, pitch))
     return None
@@ -390,7 +419,7 @@ def _scatter(outline, name):
     return fit_line(outline.sides[name])[2]
 
 
-def observe_all(prepared, T_head_lrf=None, pitch_offset=None):
+def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in both edge-point variants, keyed by (camera, variant)."""
     keys = [(camera, variant) for camera in prepared.views for variant in VARIANTS]
-    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, pitch_offset) for camera, variant in keys}
+    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}

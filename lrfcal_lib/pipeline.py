@@ -30,10 +30,6 @@ from lrfcal_lib.solvers.projected import solve_projected
 
 RIGHT_ANGLE = 0.15  # largest |cosine| between two sides that are taken for the board's perpendicular edges
 PLATFORM_POINTS = 40  # per edge
-# An assumption: what a ruler and a set square say about a rig, since a session states its platform without a standard
-# deviation. Where a platform is stated worse than this, the combined axis is worse than the data alone and its sigma
-# too small: on the simulated session the stated axis is 1.5 deg and 18 mm off.
-STATED_SIGMA = np.array([np.deg2rad(0.5), np.deg2rad(0.5), 0.010, 0.010])
 
 
 def prepare(session):
@@ -176,6 +172,8 @@ class PlatformCalibration:
     problems : dict of str to str
         Why a method has no result.
     stated : RigidTransform or None
+    stated_sigma : tuple of float
+        How well the stated one is known: direction (radians) and offset (metres).
     """
 
     T_head_lrf: RigidTransform
@@ -183,12 +181,13 @@ class PlatformCalibration:
     solutions: dict
     problems: dict
     stated: RigidTransform | None
+    stated_sigma: tuple
 
     def parameters(self):
         """Angles of the axis out of and within the scan plane, and its offsets within and across it, by method."""
         found = {name: (s.solution.parameters, trusted_axis_covariance(s)) for name, s in self.solutions.items()}
         if self.stated is not None:
-            found["stated"] = chart_parameters(pose_array(self.stated)), np.diag(STATED_SIGMA**2)
+            found["stated"] = chart_parameters(pose_array(self.stated)), stated_covariance(self.stated_sigma)
         return found | {"combined": (chart_parameters(pose_array(self.T_head_lrf)), self.covariance)}
 
     def transform(self, method):
@@ -216,7 +215,8 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     DegenerateGeometry
         If the session neither states its platform nor holds sweeps that determine it.
     """
-    stated, solutions, problems = prepared.session.T_head_lrf, {}, {}
+    stated, sigma = prepared.session.T_head_lrf, prepared.session.platform_sigma
+    solutions, problems = {}, {}
     methods = {
         "projected_last_beam": lambda: solve_projected(platform_observations(prepared, "last_beam"), stated),
         "line_3d": lambda: solve_platform(platform_observations(prepared), stated, sigma_pitch=sigma_pitch),
@@ -227,12 +227,12 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
         except DegenerateGeometry as error:
             problems[name] = str(error)
     if "line_3d" in solutions:
-        T_head_lrf, covariance = combine(solutions["line_3d"], stated)
+        T_head_lrf, covariance = combine(solutions["line_3d"], stated, sigma)
     elif stated is not None:
-        T_head_lrf, covariance = stated, np.diag(STATED_SIGMA**2)
+        T_head_lrf, covariance = stated, stated_covariance(sigma)
     else:
         raise DegenerateGeometry(f"the platform is neither stated nor determined by the sweeps: {problems}")
-    return PlatformCalibration(T_head_lrf, covariance, solutions, problems, stated)
+    return PlatformCalibration(T_head_lrf, covariance, solutions, problems, stated, sigma)
 
 
 def trusted_axis_covariance(solution):
@@ -240,13 +240,20 @@ def trusted_axis_covariance(solution):
     return solution.covariance if solution.covariance_placements is None else solution.covariance_placements
 
 
-def combine(solution, stated):
+def stated_covariance(sigma):
+    """Covariance of the stated axis in the chart, shape (4, 4), from its two standard deviations."""
+    return np.diag(np.repeat(np.square(sigma), 2))
+
+
+def combine(solution, stated, sigma):
     """Weigh an estimated axis and the stated one by their covariances.
 
     Parameters
     ----------
     solution : PlatformSolution
     stated : RigidTransform or None
+    sigma : tuple of float
+        Of the stated one: direction (radians) and offset (metres).
 
     Returns
     -------
@@ -256,7 +263,7 @@ def combine(solution, stated):
     covariance = trusted_axis_covariance(solution)
     if stated is None:
         return solution.T_head_lrf, covariance
-    prior, known = np.diag(STATED_SIGMA**2), chart_parameters(pose_array(stated))
+    prior, known = stated_covariance(sigma), chart_parameters(pose_array(stated))
     gain = prior @ np.linalg.inv(prior + covariance)
     axis = axis_from_chart(known + gain @ (solution.solution.parameters - known))
     unseen = stated * head_from_axis(axis_of(stated)).inv()  # rotation about the axis and shift along it

@@ -122,6 +122,10 @@ def camera_observations(
         crossing_placement=exact["placement"][0],
         crossing_edge=np.array(EDGES)[edges],
         crossing_across=np.zeros(len(edges), bool),
+        crossing_half_step=crossing[2],
+        crossing_noise=crossing[1] - crossing[2][:, :, None] * crossing[2][:, None, :] / 3,
+        crossing_radius=np.full(len(edges), 0.02),
+        crossing_background=np.zeros(len(edges)),
         plane_points=on_face[0],
         plane_covariance=on_face[1],
         plane_placement=exact["placement"][1],
@@ -140,9 +144,11 @@ def camera_observations(
 
 
 def _measured(rng, points, noise, sigma_range, sigma_across, spread):
-    """Points with noise, and its covariance: polar, plus `spread` in all directions."""
+    """Points with noise, its covariance (polar, plus `spread` in all directions), and half the beam step behind it."""
     covariance = polar_noise(points, sigma_range, sigma_across) + spread**2 * np.eye(3)
-    return _draw(rng, points, covariance, noise), covariance
+    across = np.cross([0.0, 0.0, 1.0], points)
+    half_step = np.sqrt(3) * sigma_across * across / np.linalg.norm(across, axis=1, keepdims=True)
+    return _draw(rng, points, covariance, noise), covariance, half_step
 
 
 def _exact(rng, rig, poses, source, face):
@@ -306,6 +312,9 @@ def bare_observations(model, **given):
     whole = ("crossing_placement", "plane_placement", "placements", "scene_placement")
     empty = {name: np.zeros(shape) for name, shape in shapes.items()} | {name: np.zeros(0, int) for name in whole}
     empty |= {"crossing_edge": np.zeros(0, "<U8"), "crossing_across": np.zeros(0, bool)}
+    count = len(given.get("crossing_points", ()))
+    empty |= {"crossing_half_step": np.zeros((count, 3)), "crossing_noise": np.zeros((count, 3, 3))}
+    empty |= {"crossing_radius": np.full(count, 0.005), "crossing_background": np.zeros(count)}
     pixels = np.zeros((len(given.get("placements", ())), 0, 2))
     common = {"camera": "camera", "source": "lrf", "model": model, "pattern_pixels": pixels, "pattern_sigma_px": 0.2}
     return CameraObservations(**(empty | common | given))

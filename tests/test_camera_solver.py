@@ -60,6 +60,8 @@ def test_every_method_is_invariant_to_the_source_frame(name):
     R = move.rotation.as_matrix()
     groups = {f"{g}_points": move.apply(getattr(obs, f"{g}_points")) for g in ("crossing", "plane", "scene")}
     spreads = {f"{g}_covariance": R @ getattr(obs, f"{g}_covariance") @ R.T for g in ("crossing", "plane", "scene")}
+    spreads["crossing_noise"] = R @ obs.crossing_noise @ R.T
+    spreads["crossing_half_step"] = obs.crossing_half_step @ R.T
     here = METHODS[name].solve(obs, rig.T_camera_lrf)
     there = METHODS[name].solve(replace(obs, **groups, **spreads), rig.T_camera_lrf * move.inv())
     angle, distance = transform_difference(there.transform * move, here.transform)

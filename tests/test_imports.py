@@ -15,23 +15,29 @@ RANKS = [
     {"session"},
     {"preprocess", "importers"},
     {"solvers"},
+    {"uncertainty", "candidates", "forecast", "advice", "verdict"},
     {"reconstruct", "prepared"},
     {"pairing"},
     {"pipeline"},
     {"evaluate"},
-    {"notebook", "plots", "export", "report"},
+    {"notebook", "plots", "export", "report", "acquisition", "drivers"},  # drivers: seen from above, see APART
     {"__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
 # what knows the geometry of a rig and its session only, so that it can judge or feed the rest
 APART = dict.fromkeys(("simulate", "drivers"), {"geometry", "board", "camera", "session", "codecs"})
+# emulated devices stand between the two: they look at the simulated world and speak as the drivers expect
+APART["emulators"] = APART["drivers"] | {"simulate", "drivers"}
+CODECS = {"lms2xx", "lms2xx_frame", "lms2xx_replies"}
 MODULES = sorted(LIBRARY.rglob("*.py"))
 
 
 def part_of(names):
-    """First name below the library; the codecs of devices count apart from the drivers, sessions are read with them."""
-    codec = names[0] == "drivers" and len(names) > 1 and names[1].startswith("lms2xx")
-    return "codecs" if codec else names[0]
+    """First name below the library; of the drivers, codecs (sessions are read with them) and emulators count apart."""
+    second = names[1] if names[0] == "drivers" and len(names) > 1 else None
+    if second in CODECS:
+        return "codecs"
+    return "emulators" if second == "emulators" else names[0]
 
 
 def imported_parts(path):

@@ -13,6 +13,9 @@ from lrfcal_lib.prepared import PitchNoise, Prepared
 from lrfcal_lib.solvers.platform import chart_parameters
 from lrfcal_lib.solvers.pose import pose_array
 
+SIGMA = (np.radians(0.5), 0.010)
+STATED = pipeline.stated_covariance(SIGMA)
+
 
 def head(rng, angle=0.05):
     return RigidTransform.from_components(rng.normal(size=3) * 0.1, Rotation.from_rotvec(rng.normal(size=3) * angle))
@@ -33,22 +36,22 @@ def test_the_chart_of_the_axis_is_undone():
 def test_the_better_known_axis_wins(scale, wins):
     rng = np.random.default_rng(1)
     stated, data = head(rng), head(rng)
-    found, covariance = pipeline.combine(estimate(data, scale * np.diag(pipeline.STATED_SIGMA**2)), stated)
+    found, covariance = pipeline.combine(estimate(data, scale * STATED), stated, SIGMA)
     winner = {"data": data, "stated": stated}[wins]
     assert max(axis_difference(axis_of(found), axis_of(winner))) < 1e-6
-    assert (np.diag(covariance) <= pipeline.STATED_SIGMA**2 * (1 + 1e-9)).all()
+    assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
 
 
 def test_combining_keeps_what_no_data_can_show():
     rng = np.random.default_rng(2)
     stated = head(rng)
-    found, _ = pipeline.combine(estimate(stated, np.diag(pipeline.STATED_SIGMA**2)), stated)
+    found, _ = pipeline.combine(estimate(stated, STATED), stated, SIGMA)
     np.testing.assert_allclose(found.as_matrix(), stated.as_matrix(), atol=1e-12)
 
 
 def test_without_a_stated_platform_the_data_stand_alone():
     data = head(np.random.default_rng(3))
-    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None)
+    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None, SIGMA)
     assert found is data and (covariance == np.eye(4)).all()
 
 

@@ -394,15 +394,13 @@ def pitch_errors_table(errors):
     return pd.DataFrame(columns)
 
 
-def axis_knowledge_table(platform, stated_sigma):
+def axis_knowledge_table(platform):
     """Who knows each number of the tilt axis better: the data, or the rough measurement.
 
     Parameters
     ----------
     platform : PlatformCalibration
         With a ``line_3d`` solution.
-    stated_sigma : ndarray, shape (4,)
-        Of the rough measurement, radians and metres.
 
     Returns
     -------
@@ -411,7 +409,7 @@ def axis_knowledge_table(platform, stated_sigma):
     """
     found = np.sqrt(np.diag(platform.parameters()["line_3d"][1]))
     rows = []
-    for name, data, rough in zip(AXIS, found, stated_sigma, strict=True):
+    for name, data, rough in zip(AXIS, found, np.repeat(platform.stated_sigma, 2), strict=True):
         unit, factor = ("deg", np.rad2deg(1.0)) if name.startswith("axis") else ("mm", 1000.0)
         rows.append((name, unit, factor * data, factor * rough, "data" if data < rough else "rough measurement"))
     return pd.DataFrame(rows, columns=["parameter", "unit", "sigma_data", "sigma_rough", "better"])

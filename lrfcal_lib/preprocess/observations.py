@@ -34,6 +34,15 @@ class CameraObservations:
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
         the recorded pitch. The paper uses none of these.
+    crossing_half_step : ndarray, shape (n, 3)
+        From halfway between the last beam on the board and the first off it to the latter, metres.
+    crossing_noise : ndarray, shape (n, 3, 3)
+        The covariance without the beam spacing.
+    crossing_radius : ndarray, shape (n,)
+        Of the beam's spot there, metres.
+    crossing_background : ndarray, shape (n,)
+        What the background adds to the log odds at which a reading flips from the board to it (see
+        :mod:`lrfcal_lib.solvers.edge_likelihood`).
     plane_points : ndarray, shape (m, 3)
         Points on the face of the board, metres.
     plane_covariance : ndarray, shape (m, 3, 3)
@@ -69,6 +78,10 @@ class CameraObservations:
     crossing_placement: np.ndarray
     crossing_edge: np.ndarray
     crossing_across: np.ndarray
+    crossing_half_step: np.ndarray
+    crossing_noise: np.ndarray
+    crossing_radius: np.ndarray
+    crossing_background: np.ndarray
     plane_points: np.ndarray
     plane_covariance: np.ndarray
     plane_placement: np.ndarray

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.geometry import lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.preprocess.background import MIXING, background_odds, beyond
 from lrfcal_lib.preprocess.board_scan import (
     BoardScan,
     EdgeProfile,
@@ -38,7 +39,6 @@ UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of w
 EDGE_SCATTER = 0.006  # metres; about twice what the end points of a real board scatter about a straight edge
 EDGE_BEND = 0.001  # metres; error of edge points that no number of them averages out
 SAME_SIDE = 0.02  # metres; a side found by lines and by columns
-MIXING = 1.0  # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram listing)
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,12 @@ class ScanEdges:
     side : ndarray of int, shape (n,)
         Number of the straight side; -1 for outliers.
     sides : tuple of ScanSide
+    half_step : ndarray, shape (n, 3)
+        From the point halfway between the last beam on the board and the first off it to the latter, metres.
+    noise : ndarray, shape (n, 3, 3)
+        The covariance without the beam spacing.
+    background : ndarray, shape (n,)
+        What the distance of the background adds to the log odds at which readings flip (:func:`background_odds`).
     """
 
     placement: int
@@ -114,6 +120,9 @@ class ScanEdges:
     end: np.ndarray
     side: np.ndarray
     sides: tuple[ScanSide, ...]
+    half_step: np.ndarray
+    noise: np.ndarray
+    background: np.ndarray
 
 
 def edge_points(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
@@ -147,15 +156,18 @@ def edge_points(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
     bearings, pitch = scan.sweep.bearings, scan.sweep.pitch[row]
     shift, warp_sigma = _warp(scan, row, beam, end)
     points, along, line_sigma = _crossings(scan, row, (bearings[beam] + bearings[beam + end]) / 2, shift)
-    mixed = _mixes(scan, row, beam, 0 * end, end)
-    side, sides = _group(scan, points, pitch, row, end, mixed)
+    here, behind = scan.fitted[row, beam], beyond(scan, row, beam, 0 * end, end)
+    side, sides = _group(scan, points, pitch, row, end, behind - here < MIXING)
+    half = along * ((bearings[beam + end] - bearings[beam]) / 2)[:, None]
     sigma = np.abs(bearings[beam + end] - bearings[beam]) * UNIFORM
     sigma = sigma * _inflation(_to_platform(scan, along, pitch), sigma, side, sides)
     if variant == "last_beam":
         points, along, line_sigma = _crossings(scan, row, bearings[beam], shift)
-    covariance = _outer(along * sigma[:, None]) + _outer(_rays(points) * np.hypot(line_sigma, warp_sigma)[:, None])
+    noise = _outer(_rays(points) * np.hypot(line_sigma, warp_sigma)[:, None])
+    covariance = _outer(along * sigma[:, None]) + noise
     side, sides = _keep(side, sides, [s for s in sides if s.angle >= min_angle])
-    return ScanEdges(scan.placement, variant, points, covariance, pitch, row, end, side, sides)
+    more = half, noise, background_odds(here, behind)
+    return ScanEdges(scan.placement, variant, points, covariance, pitch, row, end, side, sides, *more)
 
 
 def _keep(side, sides, kept):
@@ -245,15 +257,6 @@ def _inflation(along, sigma, side, sides):
     return out
 
 
-def _mixes(scan, row, beam, down, right, beams=3):
-    """Whether something stands so close behind ends of the board that readings at the edge mix both."""
-    step, shape = np.arange(1, beams + 1), scan.mask.shape
-    rows = np.clip(row[:, None] + down[:, None] * step, 0, shape[0] - 1)
-    columns = np.clip(beam[:, None] + right[:, None] * step, 0, shape[1] - 1)
-    beyond = np.sort(np.nan_to_num(scan.sweep.ranges[rows, columns], nan=np.inf), axis=1)[:, beams // 2]
-    return beyond - scan.fitted[row, beam] < MIXING
-
-
 def _group(scan, p_lrf, pitch, order, end, mixed, known=()):
     """Assign points to straight sides in the board's plane; returns side numbers and the sides."""
     side, sides = np.full(len(p_lrf), -1), []
@@ -339,33 +342,38 @@ def sweep_edges(scan, variant="half_step", *, min_angle=LEAST_ANGLE):
         For another variant.
     """
     _check_variant(variant)
-    line, beam, beyond, end = _column_ends(scan)
+    line, beam, after, end = _column_ends(scan)
     pitch = scan.sweep.pitch
-    middle, step = (pitch[line] + pitch[beyond]) / 2, np.abs(np.diff(pitch))
+    middle, step = (pitch[line] + pitch[after]) / 2, np.abs(np.diff(pitch))
     points, by_pitch = _at_pitch(scan, line, beam, middle)
-    mixed = _mixes(scan, line, beam, beyond - line, 0 * end)
-    side, sides = _group(scan, points, middle, beam, end, mixed, edge_points(scan, min_angle=0.0).sides)
-    sigma = UNIFORM * np.maximum(np.abs(pitch[beyond] - pitch[line]), np.median(step) if len(step) else 0.0)
+    here, behind = scan.fitted[line, beam], beyond(scan, line, beam, after - line, 0 * end)
+    known = edge_points(scan, min_angle=0.0).sides
+    side, sides = _group(scan, points, middle, beam, end, behind - here < MIXING, known)
+    sigma = np.maximum(np.abs(pitch[after] - pitch[line]), np.median(step) if len(step) else 0.0)
+    half = by_pitch * (np.copysign(sigma, pitch[after] - pitch[line]) / 2)[:, None]
+    sigma = UNIFORM * sigma
     sigma = sigma * _inflation(_to_platform(scan, by_pitch, middle), sigma, side, sides)
     chosen = middle if variant == "half_step" else pitch[line]
     points, by_pitch = _at_pitch(scan, line, beam, chosen)
     range_sigma = _crossings(scan, line, scan.sweep.bearings[beam])[2]
-    covariance = _outer(by_pitch * sigma[:, None]) + _outer(_rays(points) * range_sigma[:, None])
+    noise = _outer(_rays(points) * range_sigma[:, None])
+    covariance = _outer(by_pitch * sigma[:, None]) + noise
     side, sides = _keep(side, sides, [s for s in sides if s.angle <= np.pi / 2 - min_angle])
-    return ScanEdges(scan.placement, variant, points, covariance, chosen, line, end, side, sides)
+    more = half, noise, background_odds(here, behind)
+    return ScanEdges(scan.placement, variant, points, covariance, chosen, line, end, side, sides, *more)
 
 
 def _column_ends(scan):
     """Ends of columns: last line on the board, beam, the next line off it, and -1 / +1 for low and high pitch."""
     beams, first, last = row_ends(scan.mask.T)
-    line, beyond, beam = np.r_[first, last], np.r_[first - 1, last + 1], np.r_[beams, beams]
+    line, after, beam = np.r_[first, last], np.r_[first - 1, last + 1], np.r_[beams, beams]
     keep = (line >= BORDER) & (line < len(scan.mask) - BORDER) & np.isfinite(scan.lines[line, 0])
-    line, beyond, beam = line[keep], beyond[keep], beam[keep]
-    here, step = scan.fitted[line, beam], scan.sweep.pitch[beyond] - scan.sweep.pitch[line]
-    visible = ~(scan.sweep.ranges[beyond, beam] < here - depth_jump(here, step))
-    line, beyond, beam = line[visible], beyond[visible], beam[visible]
+    line, after, beam = line[keep], after[keep], beam[keep]
+    here, step = scan.fitted[line, beam], scan.sweep.pitch[after] - scan.sweep.pitch[line]
+    visible = ~(scan.sweep.ranges[after, beam] < here - depth_jump(here, step))
+    line, after, beam = line[visible], after[visible], beam[visible]
     upwards = np.polyfit(np.arange(len(scan.sweep.pitch)), scan.sweep.pitch, 1)[0] > 0 if len(scan.mask) > 1 else True
-    return line, beam, beyond, np.where((beyond > line) == upwards, 1, -1)
+    return line, beam, after, np.where((after > line) == upwards, 1, -1)
 
 
 def _at_pitch(scan, line, beam, pitch):

@@ -7,6 +7,7 @@
     lrf/telegrams.bin       or what the device sent, and lrf/index.csv: t_s, offset, length, placement, pitch_deg
     images/<camera>/*.png   images.csv: t_s, camera, file, placement, pitch_deg, purpose (intrinsics | board | scene)
     edges.csv               optional edges picked by hand: camera, file, edge, u1, v1, u2, v2
+    platform.csv            recordings only, never read here: t_s, commanded_deg, measured_deg
     truth.json              simulated sessions only; never read here
 
 Everything is plain text or a NumPy archive without pickles. session.json may name the LRF's file (rig.lrf.file),
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from lrfcal_lib.session.common import SessionError
 from lrfcal_lib.session.files import EDGE_COLUMNS, IMAGE_COLUMNS, PURPOSES, EdgePick, ImageRecord, image_size
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.recording import Session, Sweep, open_session, validate
 from lrfcal_lib.session.stated import (
     SCHEMA,
@@ -35,7 +37,7 @@ from lrfcal_lib.session.writer import SessionWriter, finish
 
 __all__ = [
     "EDGE_COLUMNS", "IMAGE_COLUMNS", "INDEX_COLUMNS", "PURPOSES", "SCHEMA", "CameraInfo", "EdgePick", "ImageRecord",
-    "LrfInfo", "Session", "SessionError", "SessionWriter", "Sweep", "TelegramLog", "board_from_json", "board_to_json",
-    "finish", "image_size", "model_from_json", "model_to_json", "open_session", "transform_from_json",
+    "LrfInfo", "Session", "SessionError", "SessionRecorder", "SessionWriter", "Sweep", "TelegramLog", "board_from_json",
+    "board_to_json", "finish", "image_size", "model_from_json", "model_to_json", "open_session", "transform_from_json",
     "transform_to_json", "validate",
 ]  # fmt: skip

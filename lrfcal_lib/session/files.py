@@ -16,7 +16,9 @@ from lrfcal_lib.session.telegrams import read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
 EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
+PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
+DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -161,11 +163,18 @@ def _check_angles(bearings, pitch):
         raise ValueError("bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round")
 
 
-def missing_parts(placements, scans, records, cameras):
+def unfinished_of(data):
+    """Placements that session.json says are being recorded; None for a session that is not being recorded."""
+    return None if data.get("unfinished") is None else tuple(int(p) for p in data["unfinished"])
+
+
+def missing_parts(placements, scans, records, cameras, unfinished=None):
     """What a session states and does not hold, as sentences; the rest can be used."""
     seen = np.unique(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)])
     out = [f"placement {p}: no scan line with a range" for p in placements if p not in seen]
-    extra = sorted(set(seen.tolist()) - set(placements))
+    again = "its recording was not finished, ignored; 'record --resume' records it again"
+    out += [f"placement {p}: {again}" for p in unfinished or ()]
+    extra = sorted(set(seen.tolist()) - set(placements) - set(unfinished or ()))
     out += [f"placement {p}: in the scan lines but not in session.json, ignored" for p in extra]
     shot = {(r.camera, r.placement) for r in records}
     out += [f"placement {p}: no image of camera '{c}'" for p in placements for c in cameras if (c, p) not in shot]
@@ -181,13 +190,19 @@ def inside(path, name, where):
     return path / name
 
 
-def read_images(path, stated):
-    """The records of images.csv; every image must exist, be complete and have its camera's size."""
+def read_images(path, stated, unfinished=None):
+    """The records of images.csv; every image must exist, be complete and have its camera's size.
+
+    Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
+    """
     file = path / "images.csv"
     if not stated["cameras"] and not file.exists():
         return ()
-    out = []
-    for number, row in enumerate(read_table(file, IMAGE_COLUMNS), start=2):
+    out, skipped = [], {str(p) for p in unfinished or ()}
+    rows = read_table(file, IMAGE_COLUMNS, torn=True)[0] if unfinished is not None else read_table(file, IMAGE_COLUMNS)
+    for number, row in enumerate(rows, start=2):
+        if row["purpose"] == DROPPED or row["placement"] in skipped:
+            continue
         with naming(f"{file} line {number}"):
             out.append(_image_record(path, row, stated))
             check_image_size(out[-1].file, image_size(out[-1].file), stated["cameras"][row["camera"]])

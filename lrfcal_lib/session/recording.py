@@ -19,6 +19,7 @@ from lrfcal_lib.session.files import (
     read_edges,
     read_images,
     read_scans,
+    unfinished_of,
 )
 from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
 from lrfcal_lib.session.telegrams import TelegramLog, other_than_stated
@@ -64,6 +65,9 @@ class Session:
     lrf : LrfInfo
     T_head_lrf : RigidTransform or None
         The platform as its maker or a tape measure states it.
+    platform_sigma : tuple of float
+        How well: standard deviations of the axis' direction (radians) and offset (metres). Where nobody states them,
+        0.5 deg and 10 mm are assumed: what a set square and a ruler give.
     cameras : dict of str to CameraInfo
     placements : tuple of int
         All that the session states, also those without data.
@@ -85,6 +89,7 @@ class Session:
     board: Board
     lrf: LrfInfo
     T_head_lrf: RigidTransform | None
+    platform_sigma: tuple[float, float]
     cameras: dict[str, CameraInfo]
     placements: tuple[int, ...]
     image_records: tuple[ImageRecord, ...]
@@ -226,10 +231,11 @@ def open_session(path):
         raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
     with naming(path / "session.json"):
         stated = parse_session(data)
+        unfinished = unfinished_of(data)
         scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
-    records = read_images(path, stated)
+    records = read_images(path, stated, unfinished)
     picks = read_edges(path, stated, records)
-    problems = missing_parts(stated["placements"], scans, records, stated["cameras"])
+    problems = missing_parts(stated["placements"], scans, records, stated["cameras"], unfinished)
     problems += () if log is None else (*log.problems, *other_than_stated(scans, stated["lrf"]))
     found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
     return Session(path=path, **found, **stated)

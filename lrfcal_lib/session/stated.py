@@ -98,10 +98,28 @@ def parse_session(data):
         "board": board_from_json(data["board"]),
         "lrf": lrf_from_json(rig["lrf"]),
         "T_head_lrf": transform_from_json(rig["platform"]["T_head_lrf"]),
+        "platform_sigma": platform_sigma_from_json(rig["platform"]),
         "cameras": {name: camera_from_json(name, c) for name, c in rig["cameras"].items()},
         "placements": placements,
         "reference": dict(data.get("reference", {})),
     }
+
+
+def platform_sigma_from_json(data):
+    """How well the stated platform is known: standard deviations of direction (radians) and offset (metres)."""
+    direction = math.radians(_positive(data.get("sigma_direction_deg", 0.5), "sigma_direction_deg"))
+    offset = _positive(data.get("sigma_offset_m", 0.010), "sigma_offset_m")
+    if offset > 1:
+        raise ValueError(f"sigma_offset_m is {offset:g}: millimetres? Divide by 1000")
+    return direction, offset
+
+
+def platform_to_json(T_head_lrf, sigma=None):
+    """The stated platform as it stands in session.json; `sigma` as in :func:`platform_sigma_from_json`."""
+    stated = {"T_head_lrf": transform_to_json(T_head_lrf)}
+    if sigma is None:
+        return stated
+    return stated | {"sigma_direction_deg": round(math.degrees(sigma[0]), 9), "sigma_offset_m": sigma[1]}
 
 
 def plain_name(name, what):

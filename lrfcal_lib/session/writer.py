@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -18,7 +19,7 @@ from lrfcal_lib.session.stated import (
     camera_to_json,
     lrf_to_json,
     parse_session,
-    transform_to_json,
+    platform_to_json,
 )
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
@@ -38,6 +39,8 @@ class SessionWriter:
     lrf : LrfInfo
     cameras : iterable of CameraInfo
     T_head_lrf : RigidTransform, optional
+    platform_sigma : tuple of float, optional
+        How well it is known: direction (radians) and offset (metres).
     name : str, optional
         The folder's name by default.
     licence, source : str
@@ -58,14 +61,14 @@ class SessionWriter:
 
     def __init__(
         self, path, board, lrf, cameras=(), T_head_lrf=None, *, name=None, licence="", source="", simulated=False,
-        reference=None, placements=(),
+        platform_sigma=None, reference=None, placements=(),
     ):  # fmt: skip
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
         self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
         data = {"schema": SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source}
-        rig = {"lrf": lrf_to_json(lrf), "platform": {"T_head_lrf": transform_to_json(T_head_lrf)}}
+        rig = {"lrf": lrf_to_json(lrf), "platform": platform_to_json(T_head_lrf, platform_sigma)}
         rig["cameras"] = {c.name: camera_to_json(c) for c in self.cameras.values()}
         data |= {"simulated": simulated, "board": board_to_json(board), "rig": rig}
         self.data = {**data, "placements": [int(p) for p in placements], "reference": reference or {}}
@@ -76,12 +79,15 @@ class SessionWriter:
     def _create(self):
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
-        (self.path / "lrf").mkdir(parents=True)
-        for name in self.cameras:
-            (self.path / "images" / name).mkdir(parents=True)
-        if self.cameras:
-            _write(self.path / "images.csv", ",".join(IMAGE_COLUMNS) + "\n")
+        self._make_folders()
         self._write_index()
+
+    def _make_folders(self):
+        (self.path / "lrf").mkdir(parents=True, exist_ok=True)
+        for name in self.cameras:
+            (self.path / "images" / name).mkdir(parents=True, exist_ok=True)
+        if self.cameras and not (self.path / "images.csv").exists():
+            write_file(self.path / "images.csv", ",".join(IMAGE_COLUMNS) + "\n")
 
     def __enter__(self):
         return self
@@ -91,7 +97,7 @@ class SessionWriter:
             finish(self.path)
 
     def _write_index(self):
-        _write(self.path / "session.json", json.dumps(self.data, indent=1) + "\n")
+        write_file(self.path / "session.json", json.dumps(self.data, indent=1) + "\n")
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
@@ -130,7 +136,7 @@ class SessionWriter:
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
         self.bearings, self.parts = bearings, self.parts + 1
-        _write(self.path / "lrf" / f"part_{self.parts:06d}.npz", scans)
+        write_file(self.path / "lrf" / f"part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
@@ -160,15 +166,16 @@ class SessionWriter:
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
             if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
-        if not self.telegrams.exists():
-            _write(self.telegrams.with_name("index.csv"), ",".join(INDEX_COLUMNS) + "\n")
+        index = self.telegrams.with_name("index.csv")
+        if not index.exists():
+            write_file(index, ",".join(INDEX_COLUMNS) + "\n")
         self._note_placement(placement)
-        offset = _append(self.telegrams, b"".join(telegrams))
+        offset = append_file(self.telegrams, b"".join(telegrams))
         rows = []
         for raw, angle, time in zip(telegrams, np.degrees(pitch), time_s, strict=True):
-            rows.append([_cell(time), offset, len(raw), "" if placement < 0 else placement, _cell(angle)])
+            rows.append([cell(time), offset, len(raw), "" if placement < 0 else placement, cell(angle)])
             offset += len(raw)
-        _append(self.telegrams.with_name("index.csv"), "".join(",".join(map(str, row)) + "\n" for row in rows))
+        append_file(index, "".join(",".join(map(str, row)) + "\n" for row in rows))
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
         """Append an image.
@@ -199,10 +206,10 @@ class SessionWriter:
         self.shots[camera] += 1
         suffix = ".png" if pixels else Path(image).suffix.lower()
         name = f"images/{camera}/{self.shots[camera]:04d}{suffix}"
-        _write(self.path / name, cv2.imencode(".png", image)[1].tobytes() if pixels else Path(image).read_bytes())
+        write_file(self.path / name, cv2.imencode(".png", image)[1].tobytes() if pixels else Path(image).read_bytes())
         self._note_placement(placement)
-        cells = [_cell(time_s), camera, name, "" if placement < 0 else placement, _cell(math.degrees(pitch)), purpose]
-        _append(self.path / "images.csv", ",".join(map(str, cells)) + "\n")
+        cells = [cell(time_s), camera, name, "" if placement < 0 else placement, cell(math.degrees(pitch)), purpose]
+        append_file(self.path / "images.csv", ",".join(map(str, cells)) + "\n")
 
 
 def finish(path):
@@ -220,9 +227,7 @@ def finish(path):
         If there is no sweep, or one of them is damaged.
     """
     path = Path(path)
-    for table in (path / "images.csv", path / "lrf" / "index.csv"):
-        if table.exists() and not table.read_text().endswith("\n"):
-            _write(table, table.read_text().rpartition("\n")[0] + "\n")  # a row cut off by a crash
+    mend_tables(path)
     if (path / "lrf" / "telegrams.bin").exists():
         return
     parts = sorted((path / "lrf").glob("part_*.npz"))
@@ -231,9 +236,16 @@ def finish(path):
     sweeps = [read_npz(part) for part in parts]
     shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
     scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
-    _write(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, compress=True)
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, compress=True)
     for part in parts:
         part.unlink()
+
+
+def mend_tables(path):
+    """Remove rows that a crash cut off at the end of a session's tables."""
+    for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
+        if table.exists() and not table.read_text().endswith("\n"):
+            write_file(table, table.read_text().rpartition("\n")[0] + "\n")
 
 
 def _checked_telegrams(telegrams):
@@ -246,11 +258,12 @@ def _checked_telegrams(telegrams):
     return telegrams
 
 
-def _cell(value):
+def cell(value):
+    """A number as it stands in a table, empty for NaN."""
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
-def _write(file, content, compress=False):
+def write_file(file, content, compress=False):
     """Write a file so that it is either complete or not there: under another name, fsync, rename."""
     draft = file.with_name(file.name + ".draft")
     with draft.open("wb") as stream:
@@ -261,13 +274,28 @@ def _write(file, content, compress=False):
         stream.flush()
         os.fsync(stream.fileno())
     os.replace(draft, file)
+    sync_folder(file.parent)
 
 
-def _append(file, content):
-    """Append to a file, which is on the disk afterwards; where the new part begins."""
-    with file.open("ab") as stream:
-        begin = stream.tell()
-        stream.write(content.encode() if isinstance(content, str) else content)
-        stream.flush()
-        os.fsync(stream.fileno())
+def append_file(file, content):
+    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
+    begin = file.stat().st_size if file.exists() else 0
+    try:
+        with file.open("ab") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.truncate(file, begin)  # half a row would spoil the next one
+        raise
     return begin
+
+
+def sync_folder(folder):
+    """Bring the names of a folder's files to the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -281,6 +281,7 @@ def _writer(folder, name, setup):
     }
     return SessionWriter(
         folder, rig.board, info, cameras, rig.T_head_lrf_stated, name=name, licence=LICENCE, simulated=True,
+        platform_sigma=rig.stated_sigma,
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}", reference=reference,
     )  # fmt: skip
 

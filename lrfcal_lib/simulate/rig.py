@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,8 @@ class Rig:
         The truth.
     T_head_lrf_stated : RigidTransform
         As a tape measure gives it.
+    stated_sigma : tuple of float
+        How well it is said to be known: direction (radians) and offset (metres).
     cameras : tuple of RigCamera
     board : Board
         With corners.
@@ -72,6 +75,7 @@ class Rig:
     cameras: tuple[RigCamera, ...]
     board: Board
     ring: float = 0.65
+    stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
         """``T_camera_platform`` while the head stands at a true pitch.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.bauermann import solve_bauermann
 from lrfcal_lib.solvers.camera import edge_residuals_px, plane_residuals_m, solve_lines, solve_paper_lines
+from lrfcal_lib.solvers.line_ml import edge_bias, solve_line_ml
 from lrfcal_lib.solvers.outliers import find_outlying_placements
 from lrfcal_lib.solvers.pitch_errors import SweepPoints, estimate_pitch_errors
 from lrfcal_lib.solvers.platform import PlatformObservations, PlatformPrior, PlatformSolution, solve_platform
@@ -43,6 +44,7 @@ class Method:
 METHODS = {
     "line_last_beam": Method("last_beam", solve_paper_lines, "crossing", "lines, last beam (the paper)"),
     "line": Method("half_step", solve_lines, "crossing", "lines, half step"),
+    "line_ml": Method("half_step", solve_line_ml, "crossing", "lines, likelihood"),
     "zhang_pless": Method("half_step", solve_zhang_pless, "plane", "Zhang-Pless"),
     "zhang_pless_joint": Method("half_step", solve_zhang_pless_joint, "plane", "Zhang-Pless with intrinsics"),
     "wasielewski_strauss": Method("half_step", solve_wasielewski_strauss, "crossing", "Wasielewski-Strauss"),
@@ -58,11 +60,13 @@ __all__ = [
     "PlatformSolution",
     "Solution",
     "SweepPoints",
+    "edge_bias",
     "edge_residuals_px",
     "estimate_pitch_errors",
     "find_outlying_placements",
     "plane_residuals_m",
     "solve_bauermann",
+    "solve_line_ml",
     "solve_lines",
     "solve_paper_lines",
     "solve_platform",

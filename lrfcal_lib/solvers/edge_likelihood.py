@@ -51,9 +51,18 @@ def disc_edge(log_odds):
     slope : ndarray
         ``dx / dlog_odds`` (negative).
     """
-    x = np.interp(-np.asarray(log_odds, float), -_LOG_ODDS, _X)
-    share = np.clip(disc_share(x), 1e-12, 1 - 1e-12)
-    return x, -share * (1 - share) * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
+    log_odds = np.asarray(log_odds, float)
+    x = np.interp(-log_odds, -_LOG_ODDS, _X)
+    slope, here = _slope(x)
+    refined = x + slope * np.clip(log_odds - here, -1e-4, 1e-4)  # value and slope must agree for steps to converge
+    return refined, _slope(refined)[0]
+
+
+def _slope(x):
+    """``dx / dlog_odds`` and the log odds of the share inside, at a distance of the edge in radii."""
+    inside, outside = (np.maximum(disc_share(v), 1e-12) for v in (x, -x))
+    slope = -inside * outside * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
+    return slope, np.log(inside / outside)
 
 
 def edge_shift(log_odds, radius, background=0.0):

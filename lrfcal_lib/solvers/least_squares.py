@@ -294,6 +294,7 @@ def solve(
     loss=None,
     scale=1.0,
     max_iterations=60,
+    tolerance=1e-8,
     required=True,
     n_observations=None,
     limit=1.0,
@@ -304,7 +305,7 @@ def solve(
 
     Parameters
     ----------
-    evaluate, start, retract, shared, loss, scale, max_iterations
+    evaluate, start, retract, shared, loss, scale, max_iterations, tolerance
         See :func:`minimise`.
     names : sequence of str
         Of the unknowns reported (with `shared`, the shared ones).
@@ -343,9 +344,8 @@ def solve(
     axes = -1 if shared is None else (-2, -1)
     if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
         raise ValueError(f"{method}: residuals at the start value are not finite: check the observations and T0")
-    state, converged, iterations, history = minimise(
-        evaluate, start, retract, shared=shared, loss=loss, scale=scale, max_iterations=max_iterations
-    )
+    about = {"shared": shared, "loss": loss, "scale": scale, "max_iterations": max_iterations, "tolerance": tolerance}
+    state, converged, iterations, history = minimise(evaluate, start, retract, **about)
     r, J, weights = _whole(_blocks(evaluate, state), loss, scale, axes)
     hessians, scores = by_placement(r, J, weights, groups, shared)
     hessian = np.sum(hessians, axis=-3)
@@ -365,8 +365,8 @@ def solve(
     fitted = {"residuals": r, "jacobian": J, "weights": weights, "chi2": chi2, "inflation": inflation, "state": state}
     run = {"converged": converged, "iterations": iterations, "cost_history": history, "unobservable": lost}
     spread = {"covariance": covariance, "covariance_placements": clustered}
-    about = {"names": tuple(names), "method": method, "n_observations": n_observations or r.shape[-1]}
-    return Solution(transform, parameters, **about, **run, **fitted, **spread)
+    titles = {"names": tuple(names), "method": method, "n_observations": n_observations or r.shape[-1]}
+    return Solution(transform, parameters, **titles, **run, **fitted, **spread)
 
 
 def _with_earlier(iterations, history, earlier):

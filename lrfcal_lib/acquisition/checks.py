@@ -1,0 +1,190 @@
+"""Is what was just recorded any good? Lights for one placement of the board, from what is on the disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.pattern import PatternFinder, PatternNotFound, grey
+from lrfcal_lib.preprocess.view import view_board
+from lrfcal_lib.session import SessionError
+
+STATES = ("ok", "warn", "bad")
+FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
+PARALLEL = np.cos(np.radians(20))  # two sides that include less give one constraint, not two
+FEWEST_LINES = 8  # scan lines on the board
+BLURRED_PX = 4.0  # rise of a chessboard edge from 10 to 90 %; about 2 in a sharp image
+DARK, CLIPPED = 60, 250  # grey levels of a white square
+LOW_CONTRAST = 40  # grey levels between white and dark squares
+
+
+@dataclass(frozen=True)
+class Light:
+    """One check.
+
+    Attributes
+    ----------
+    name : str
+    state : {'ok', 'warn', 'bad'}
+    text : str
+        What was seen, and what to do where it is not good.
+    """
+
+    name: str
+    state: str
+    text: str
+
+
+def check_placement(session, placement, advice=None):
+    """Check a placement that was just recorded.
+
+    Parameters
+    ----------
+    session : Session
+        Opened after the placement was finished.
+    placement : int
+    advice : callable, optional
+        ``advice(session)`` says in a sentence what the next placement should add; '' if all is known well enough.
+
+    Returns
+    -------
+    list of Light
+        'scan', 'edges', one for each camera, and 'information' where there is advice. Nothing is raised for data that
+        cannot be used: that is what the lights are for.
+    """
+    if placement in session.scene_placements:
+        return [_scene(session, placement)]
+    lights = check_scan(_sweep(session, placement), session.board, session.T_head_lrf)
+    lights += [_camera(session, placement, camera) for camera in session.cameras]
+    if advice is not None:
+        text = advice(session)
+        lights.append(Light("information", "warn" if text else "ok", text or "every direction is well determined"))
+    return lights
+
+
+def check_scan(sweep, board, T_head_lrf=None):
+    """Check the scans of a placement.
+
+    Parameters
+    ----------
+    sweep : Sweep or None
+        None where there is no range at all.
+    board : Board
+    T_head_lrf : RigidTransform, optional
+
+    Returns
+    -------
+    list of Light
+        'scan' and, where the board was found, 'edges'.
+    """
+    if sweep is None:
+        return [Light("scan", "bad", "no scan line with a range: is something close before the window?")]
+    try:
+        found = scan.find_board(sweep, board, T_head_lrf)
+    except scan.BoardNotFound as error:
+        return [Light("scan", "bad", f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls")]
+    rows = np.flatnonzero(found.mask.any(axis=1))
+    text = f"board on {len(rows)} scan lines at {abs(found.distance):.2f} m, {1000 * found.sigma_range:.1f} mm rms"
+    if len(rows) < FEWEST_LINES:
+        return [Light("scan", "warn", f"{text}: take a smaller step, or go nearer"), _edges(found)]
+    cut = [end for end, row in (("first", 0), ("last", len(sweep.pitch) - 1)) if row in rows]
+    if cut and np.ptp(sweep.pitch) > 0:
+        return [Light("scan", "warn", f"{text}; the {' and '.join(cut)} line hits it: sweep farther"), _edges(found)]
+    return [Light("scan", "ok", text), _edges(found)]
+
+
+def _edges(found):
+    """How many straight sides of the board the scans cross, and how."""
+    sides = list(scan.edge_points(found).sides)
+    known = {side.side for side in sides}
+    if np.ptp(found.sweep.pitch) > 0:
+        sides += [side for side in scan.sweep_edges(found).sides if side.side not in known]
+    good = [side for side in sides if side.n_points >= FEWEST_CROSSINGS]
+    told = ", ".join(f"{s.n_points} crossings at {np.degrees(s.angle):.0f} deg" for s in good)
+    if not good:
+        return Light("edges", "bad", "no straight side: turn the board so that scan lines cross its edges")
+    if len(good) >= 2 and _turned(good):
+        return Light("edges", "ok", f"{len(good)} sides: {told}")
+    return Light("edges", "warn", f"{len(good)} sides: {told}; turn the board to show another side")
+
+
+def _turned(sides):
+    """Whether two of the sides are not parallel."""
+    ways = np.array([np.subtract(*side.ends) for side in sides])
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return bool(np.abs(ways @ ways.T).min() < PARALLEL)
+
+
+def check_image(image, board, model=None, name="image"):
+    """Check an image of the board.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (h, w) or (h, w, 3)
+    board : Board
+    model : CameraModel, optional
+        Needed for a board without a pattern.
+    name : str
+        Of the light.
+
+    Returns
+    -------
+    Light
+    """
+    if board.pattern is None:
+        if model is None:
+            return Light(name, "warn", "not checked: the board has no pattern, and the camera no intrinsics yet")
+        view = view_board(image, board, model)
+        return Light(name, "bad", view.reason) if view.reason else Light(name, "ok", f"{len(view.edges)} edges")
+    try:
+        corners = PatternFinder(board.pattern)(image)
+    except PatternNotFound as error:
+        return Light(name, "bad", str(error))
+    return _quality(grey(image), corners, board.pattern, name)
+
+
+def _quality(picture, corners, pattern, name):
+    """Sharpness and exposure at the pattern (the 10-90 % rise of its edges; mean grey of its squares)."""
+    size = (pattern.columns, pattern.rows)
+    rise, dark, white = cv2.estimateChessboardSharpness(picture, size, corners.astype(np.float32))[0][:3]
+    text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
+    faults = {
+        "blurred, hold the board still and focus": rise > BLURRED_PX,
+        "too dark, more light or a longer exposure": white < DARK,
+        "overexposed, less light or a shorter exposure": white > CLIPPED,
+        "little contrast, avoid glare": white - dark < LOW_CONTRAST,
+    }
+    wrong = [fault for fault, holds in faults.items() if holds]
+    return Light(name, "warn" if wrong else "ok", "; ".join([text, *wrong]))
+
+
+def _sweep(session, placement):
+    try:
+        return session.sweep(placement)
+    except SessionError:
+        return None
+
+
+def _camera(session, placement, camera):
+    """The worst of a camera's images of a placement."""
+    name, records = f"camera {camera}", session.images(camera, placement)
+    if not records:
+        return Light(name, "bad", "no image")
+    model = session.cameras[camera].model
+    lights = [check_image(session.read_image(record), session.board, model, name) for record in records]
+    good = [light for light in lights if light.state != "bad"]
+    worst = max(good or lights, key=lambda light: STATES.index(light.state))
+    state = "warn" if good and len(good) < len(lights) else worst.state
+    return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
+
+
+def _scene(session, placement):
+    sweep = _sweep(session, placement)
+    if sweep is None:
+        return Light("scan", "bad", "no scan line with a range")
+    share = np.isfinite(sweep.ranges).mean()
+    state = "ok" if share > 0.2 else "warn"
+    return Light("scan", state, f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back")

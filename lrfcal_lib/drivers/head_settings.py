@@ -1,0 +1,128 @@
+"""What is assumed about a pan-tilt head: every assumption is a setting."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from lrfcal_lib.drivers.pelco_d import FASTEST
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    """Settings of a Pelco-D head. Nothing is published about the Ya An YA3050, so all defaults are assumptions.
+
+    Attributes
+    ----------
+    address : int
+        1, the usual factory setting of the DIP switches.
+    baudrate : int
+        2400, the most common default; 9600 is the next.
+    feedback : "auto" or bool
+        Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer.
+    absolute : "auto" or bool
+        Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
+    echo : "auto" or bool
+        Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed; True makes a
+        missing one an error (the adapter is dead), False makes one a warning.
+    pitch_limits_deg : (float, float)
+        Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
+    position_zero_deg : float
+        Elevation that the head tells at pitch 0.
+    invert : bool
+        The head hangs upside down, or counts its tilt the other way: its "up" lowers the view.
+    tilt_speed : int
+        Speed byte, 0 (very slow) to 0x3F; 0x20 is half of it.
+    degrees_per_second : float, (float, float) or None
+        Speed at `tilt_speed`, both ways or (up, down). None: 4 is assumed, as of constant-speed heads, until it was
+        calibrated or learnt, and the log says so.
+    start_delay_s : float
+        From the motion frame to the movement, less what it runs on after the stop; calibrated together with the speed.
+    start_pitch_deg : float
+        Where a head without feedback stands when it is opened: 0, levelled by hand.
+    tolerance_deg : float
+        Readings that differ by less are the same: heads tell 0.01, cheap encoders jitter by more.
+    arrival_deg : float
+        A move that ends this near has arrived; its settled pitch is returned and counts.
+    settle_s : float
+        The head rests when its readings stay the same for this long.
+    stall_s : float
+        Rest away from where it was sent for this long means that it does not get there.
+    poll_s : float
+        Between queries while it moves.
+    reply_s : float
+        A reply begins within this time after the query was sent (0.35 in use elsewhere, 1 by slow heads).
+    gap_s : float
+        Silence kept between frames, and time left for an acknowledgement (0.05 in use elsewhere).
+    retries : int
+        Queries repeated when no reply came.
+    sends : int
+        Motion frames are sent this often in a row: 2 on weak lines. Stops are sent twice or more in any case.
+    repeat_s : float or None
+        Motion frames are repeated at this interval: below 1 for heads that stop by themselves without.
+    reconnect_s : float
+        A call waits this long for a vanished port to come back.
+
+    Raises
+    ------
+    ValueError
+        For values that no head can have.
+    """
+
+    address: int = 1
+    baudrate: int = 2400
+    feedback: str | bool = "auto"
+    absolute: str | bool = "auto"
+    echo: str | bool = "auto"
+    pitch_limits_deg: tuple[float, float] = (-60.0, 60.0)
+    position_zero_deg: float = 0.0
+    invert: bool = False
+    tilt_speed: int = 0x20
+    degrees_per_second: float | tuple[float, float] | None = None
+    start_delay_s: float = 0.0
+    start_pitch_deg: float = 0.0
+    tolerance_deg: float = 0.1
+    arrival_deg: float = 0.5
+    settle_s: float = 0.3
+    stall_s: float = 1.5
+    poll_s: float = 0.1
+    reply_s: float = 0.35
+    gap_s: float = 0.05
+    retries: int = 3
+    sends: int = 1
+    repeat_s: float | None = None
+    reconnect_s: float = 3.0
+
+    def __post_init__(self):
+        for name in ("feedback", "absolute", "echo"):
+            self._need(name, getattr(self, name) in ("auto", True, False), '"auto", true or false')
+        self._need("address", self.address in range(256), "a byte, 0 to 255, as its DIP switches say")
+        self._need("tilt_speed", self.tilt_speed in range(FASTEST + 1), f"0 to {FASTEST}")
+        low, high = self.pitch_limits_deg
+        self._need("pitch_limits_deg", -180 <= low < high <= 180, "(lowest, highest) within -180 to 180")
+        self._need("degrees_per_second", self.degrees_per_second is None or min(self.speeds_deg) > 0, "positive")
+        for name in ("baudrate", "tolerance_deg", "arrival_deg", "reply_s", "sends"):
+            self._need(name, getattr(self, name) > 0, "positive")
+        for name in ("settle_s", "stall_s", "poll_s", "gap_s", "retries", "reconnect_s"):
+            self._need(name, getattr(self, name) >= 0, "0 or more")
+        self._need("repeat_s", self.repeat_s is None or self.repeat_s > 0, "positive, or none")
+
+    def _need(self, name, holds, what):
+        if not holds:
+            raise ValueError(f"{name} of the head is {getattr(self, name)!r}: it must be {what}")
+
+    @property
+    def speeds_deg(self):
+        """Degrees per second (up, down) at `tilt_speed`; 4 where none is stated."""
+        speed = 4.0 if self.degrees_per_second is None else self.degrees_per_second
+        return tuple(speed) if isinstance(speed, (tuple, list)) else (speed, speed)
+
+    def elevation(self, pitch):
+        """What the head calls a pitch, rad."""
+        return math.radians(self.position_zero_deg) + (-pitch if self.invert else pitch)
+
+    def pitch(self, elevation):
+        """The pitch of an elevation that the head tells, rad, in [-pi, pi)."""
+        turn = elevation - math.radians(self.position_zero_deg)
+        turn = (turn + math.pi) % (2 * math.pi) - math.pi
+        return -turn if self.invert else turn

@@ -1,0 +1,379 @@
+"""Finding an LMS2xx on a port, reading what it is, and setting it up; writes to flash only what differs."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+
+from lrfcal_lib.drivers.errors import LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.lms2xx import MODES, UNITS, TelegramError
+from lrfcal_lib.drivers.lms2xx_link import (
+    CONFIGURATION,
+    CONFIGURE,
+    ERRORS,
+    MODE,
+    ON_REQUEST,
+    RATES,
+    STATUS,
+    TYPE,
+    VARIANT,
+    Link,
+)
+from lrfcal_lib.drivers.lms2xx_replies import (
+    parse_configuration,
+    parse_errors,
+    parse_status,
+    parse_type,
+)
+from lrfcal_lib.drivers.lms2xx_scans import VALUES, Assembler
+
+logger = logging.getLogger(__name__)
+INSTALLATION = b"\x00"  # data of MODE
+AGAIN_S = 0.1  # between looks for a port that vanished
+FIND_S = 6.0
+COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
+
+
+class LMS2xxSetup:
+    """An LMS2xx that waits for requests; `LMS2xx` adds scans and streaming and is what programs use."""
+
+    def __init__(self, port, *, address=0, password=b"SICK_LMS", clock=time.time, log=logger):
+        self.port, self.type, self.firmware = port, "", ""
+        self.status = self.configuration = self.variant = None
+        self._address, self._password, self._clock, self._log = address, bytes(password), clock, log
+        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), threading.Event()
+        self._link = self._assembler = self._settled = None
+
+    @classmethod
+    def open(
+        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=time.time, log=logger
+    ):
+        """Find the device at a port whatever it is doing, stop its stream, and read what it is.
+
+        Parameters
+        ----------
+        port : str or Path
+        baudrate : int, optional
+            To switch to afterwards; the one found stays by default.
+        address : int
+            Of the device; 0 reaches any.
+        password : bytes
+            Eight characters, of the installation mode; the factory's by default.
+        find_s : float
+            Longest time to find the rate.
+        clock : callable
+            Seconds, for the instants of scans.
+        log : logging.Logger
+
+        Returns
+        -------
+        LMS2xx
+
+        Raises
+        ------
+        PortError
+            If the port is missing, forbidden, busy, or no serial line.
+        NoReply, WrongDevice
+            If nothing, or something else answers.
+        ValueError
+            For a rate or an address that no LMS2xx has, or a password of another length.
+        """
+        if baudrate is not None:
+            _code_of(baudrate)
+        if not 0 <= address < 0x80 or len(password) != 8:
+            raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
+        device = cls(str(port), address=address, password=password, clock=clock, log=log)
+        try:
+            device._connect(baudrate or 38400, time.monotonic() + find_s)
+            if baudrate is not None and baudrate != device.baudrate:
+                device._set_rate(baudrate)
+            device._prepare()
+        except BaseException:
+            device._release()
+            raise
+        return device
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """Close the port."""
+        self._release()
+
+    @property
+    def baudrate(self):
+        """Of both ends of the line."""
+        return self._opened().baudrate
+
+    @property
+    def counts(self):
+        """How often what happened since `open`, a dict.
+
+        'telegrams': sound ones; 'crc_errors': damaged ones; 'resyncs': stray bytes skipped; 'dropped': scans that the
+        mirror made between two that came (needs real-time indices), most of them because the line is slow; 'stale':
+        scans that were not newer than the one before; 'reconnects'.
+        """
+        return dict(self._counts)
+
+    # ------------------------------------------------------------------------------------------------- connecting
+
+    def _connect(self, first, end, deadline=math.inf):
+        """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
+        options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted}
+        self._link = Link(self.port, first, self._counts, **options)
+        self._link.deadline = deadline
+        self._link.find([first, *(rate for rate in RATES if rate != first)], end - time.monotonic())
+        self._link.hush()
+        self._read_status()
+        self._link.senders = {0x80, 0x80 | self.status.address}
+        model, *rest = self._told(TYPE, parse_type)
+        if not model.startswith("LMS2"):
+            raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx")
+        self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
+        self._read_configuration()
+        told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
+        self._log.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
+
+    def _prepare(self, interlaced=False):
+        """Expect scans as the device is set now; these settings are those to come back to."""
+        if self.variant not in VALUES:
+            raise WrongDevice(f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does")
+        self._settled = (self.baudrate, self.variant, self.configuration)
+        self._assembler = Assembler(self.variant, self.configuration, self.baudrate, interlaced, self._counts)
+
+    def _opened(self):
+        if self._link is None:
+            raise LineLost(f"{self.port} is closed: open it, or call reconnect()")
+        return self._link
+
+    def _ask(self, code, data=b"", **options):
+        return self._opened().ask(code, data, **options)
+
+    def _told(self, code, parse):
+        """What a reply says."""
+        raw = self._ask(code).raw
+        try:
+            return parse(raw)
+        except TelegramError as error:
+            text = f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
+            raise WrongDevice(text) from error
+
+    def _idle(self):
+        """To be overridden: raise where the device is not free for requests."""
+
+    def reconnect(self, deadline=10.0):
+        """Find the device again after the line was lost or the device restarted, and give it the same settings.
+
+        Parameters
+        ----------
+        deadline : float
+            Seconds.
+
+        Raises
+        ------
+        LineLost
+            If the port did not come back.
+        NoReply, WrongDevice, Refused
+            If the port did, but the device does not work as before.
+        """
+        self._idle()
+        self._mend(deadline)
+
+    def _mend(self, deadline):
+        end = time.monotonic() + deadline
+        rate, variant, configuration = self._settled
+        self._release()
+        self._reopen(rate, end)
+        if self.variant != variant:
+            self._set_variant(variant)
+        if self.configuration.block != configuration.block:
+            self._write(configuration)
+        if self.baudrate != rate:
+            self._set_rate(rate)
+        self._prepare()
+        self._link.deadline = math.inf
+        self._counts["reconnects"] += 1
+        self._log.warning("%s: the device is back at %d Bd", self.port, rate)
+
+    def _reopen(self, rate, end):
+        """Wait for the port and connect."""
+        while True:
+            try:
+                return self._connect(rate, min(end, time.monotonic() + FIND_S), end)
+            except (PortError, LineLost) as error:
+                self._release()
+                if self._interrupted.wait(AGAIN_S) or time.monotonic() > end - AGAIN_S:
+                    raise LineLost(f"the line did not come back: {error}") from error
+
+    def _release(self):
+        """Close the port."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    # ------------------------------------------------------------------------------------------------- settings
+
+    def read_status(self):
+        """Read the status reply.
+
+        Returns
+        -------
+        DeviceStatus
+        """
+        self._idle()
+        return self._read_status()
+
+    def _read_status(self):
+        self.status = self._told(STATUS, parse_status)
+        self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
+        return self.status
+
+    def _read_configuration(self):
+        def parse(raw):
+            found = parse_configuration(raw)
+            _ = found.unit  # a unit that no manual lists is seen here
+            return found
+
+        self.configuration = self._told(CONFIGURATION, parse)
+
+    def read_errors(self):
+        """The list of errors: tuples of severity, whether it is over, number (manual, 10.11)."""
+        self._idle()
+        return self._told(ERRORS, parse_errors)
+
+    def set_baudrate(self, rate):
+        """Change the rate of both ends; flash is not written.
+
+        Parameters
+        ----------
+        rate : int
+            9600, 19200, 38400 or 500000.
+
+        Raises
+        ------
+        PortError
+            If the line of this machine cannot; nothing has changed.
+        Refused, NoReply
+            If the device declines, or does not come through at the new rate; the old one holds again.
+        """
+        _code_of(rate)
+        self._idle()
+        if rate != self.baudrate:
+            self._set_rate(rate)
+            self._prepare()
+
+    def _set_rate(self, rate):
+        old = self.baudrate
+        self._link.set_rate(rate)  # before the device is told: raises where this end cannot
+        self._link.set_rate(old)
+        self._mode(bytes([_code_of(rate)]), f"{rate} Bd")
+        self._link.set_rate(rate)
+        try:
+            self._ask(TYPE)
+        except (NoReply, Refused) as error:
+            self._link.find([old, *(r for r in RATES if r not in (old, rate)), rate], FIND_S)
+            need = "RS-422 (a jumper in the plug of the device)" if rate == 500000 else "a shorter cable"
+            text = f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; {self.baudrate} Bd now"
+            raise NoReply(text) from error
+
+    def _mode(self, data, what, sign=None):
+        """Change the operating mode; replies A0 other than 00 are refusals."""
+        reply = self._ask(MODE, data, sign=sign)
+        if reply.code != sign and reply.raw[5]:
+            raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
+
+    def set_variant(self, fov_deg, resolution_deg):
+        """Change field of view and resolution, only if they differ.
+
+        Parameters
+        ----------
+        fov_deg, resolution_deg : float
+            180 with 1 or 0.5; 100 with 1, 0.5 or 0.25.
+
+        Returns
+        -------
+        bool
+            Whether anything was changed.
+        """
+        self._idle()
+        wanted = (float(fov_deg), float(resolution_deg))
+        if wanted not in VALUES:
+            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in VALUES)
+            raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
+        self._read_status()
+        differs = self.variant != wanted
+        if differs:
+            self._set_variant(wanted)
+            self._prepare()
+        return differs
+
+    def _set_variant(self, wanted):
+        words = b"".join(round(v).to_bytes(2, "little") for v in (wanted[0], 100 * wanted[1]))
+        try:
+            self._ask(VARIANT, words)
+        except NoReply as error:  # the reply may be lost and the variant set
+            self._log.warning("%s; reading the variant", error)
+        self._read_status()
+        if self.variant != wanted:
+            have = "{:g} deg in steps of {:g} deg".format(*self.variant)
+            raise Refused(f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}")
+
+    def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
+        """Change settings that are kept in flash (some thousand writes), only if they differ.
+
+        Parameters
+        ----------
+        unit : {'cm', 'mm'}, optional
+        measuring_mode : int, optional
+            Key of `lms2xx.MODES`; tells the largest range, too.
+        realtime_indices : bool, optional
+            Whether scans carry their indices; without them dropped and repeated scans cannot be seen.
+
+        Returns
+        -------
+        bool
+            Whether anything was written.
+
+        Raises
+        ------
+        Refused
+            For a wrong password, or values that the device declines.
+        ValueError
+            For values that no LMS2xx has.
+        """
+        self._idle()
+        if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
+            raise ValueError(f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}")
+        self._read_configuration()
+        options = {"unit": unit, "measuring_mode": measuring_mode, "realtime_indices": realtime_indices}
+        wanted = self.configuration.changed(**options)
+        differs = wanted.block != self.configuration.block
+        if differs:
+            self._write(wanted)
+        self._prepare()
+        return differs
+
+    def _write(self, wanted):
+        """Write a configuration in installation mode, and read it back."""
+        try:
+            self._mode(INSTALLATION + self._password, "the password of the installation mode")
+            self._ask(CONFIGURE, wanted.block)
+        except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
+            self._log.warning("%s; reading the configuration", error)
+        finally:
+            self._mode(ON_REQUEST, "to leave the installation mode")
+        self._read_configuration()
+        if self.configuration.block != wanted.block:
+            raise Refused(f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}")
+
+
+def _code_of(rate):
+    """Data of command 20 that sets a rate."""
+    if rate not in RATES:
+        raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {rate}")
+    return RATES[rate]

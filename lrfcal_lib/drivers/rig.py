@@ -1,0 +1,402 @@
+"""A rig: its devices opened together, and what they record while the board stays where it is, as a stream of events."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lrfcal_lib.drivers.control import ask
+from lrfcal_lib.drivers.errors import DeviceError, NoReply
+from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
+from lrfcal_lib.drivers.rig_file import RigFileError
+
+LOG = logging.getLogger(__name__)
+SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
+IMAGE_S = 15.0  # wait for one fresh image, a camera that comes back included
+BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
+GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
+SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The head rests at a stop.
+
+    Attributes
+    ----------
+    placement : int
+    time_s : float
+        Host clock; what is recorded at this stop is later.
+    commanded, pitch : float
+        Radians.
+    measured : bool
+        False where the head does not tell its pitch: dead reckoning.
+    number, of : int
+        This stop and how many there are.
+    """
+
+    placement: int
+    time_s: float
+    commanded: float
+    pitch: float
+    measured: bool
+    number: int
+    of: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scanned:
+    """Scans, each with its pitch.
+
+    Attributes
+    ----------
+    placement : int
+    readings : tuple of Reading
+    pitch : ndarray, shape (len(readings),)
+        Radians.
+    share : float
+        Of a continuous sweep that is done, 0 to 1; NaN at a stop.
+    """
+
+    placement: int
+    readings: tuple
+    pitch: np.ndarray
+    share: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """An image.
+
+    Attributes
+    ----------
+    placement : int
+        -1 for the board held close.
+    camera : str
+    frame : Frame
+    pitch : float
+        Radians.
+    purpose : {'board', 'scene', 'intrinsics'}
+    """
+
+    placement: int
+    camera: str
+    frame: object
+    pitch: float
+    purpose: str
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The pitch over a continuous sweep.
+
+    Attributes
+    ----------
+    placement : int
+    commanded : float
+        Where the sweep was sent, radians.
+    track : tuple of (float, float, bool)
+        Host time, pitch in radians, measured.
+    """
+
+    placement: int
+    commanded: float
+    track: tuple
+
+
+class Rig:
+    """The devices of a rig file; a context manager that stops the head and closes all of them.
+
+    Parameters
+    ----------
+    stated : RigFile
+    lrf : LMS2xx
+    head : PanTilt
+    cameras : dict of str to Camera
+    clock : callable
+        Host clock, s, of all of them.
+    """
+
+    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time):
+        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras or {}, clock
+        self._closing = contextlib.ExitStack()
+
+    @classmethod
+    def open(cls, stated, *, log=LOG, clock=time.time):
+        """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
+
+        Parameters
+        ----------
+        stated : RigFile
+        log : logging.Logger
+        clock : callable
+
+        Returns
+        -------
+        Rig
+
+        Raises
+        ------
+        DeviceError
+            With the device in the message; those opened before are closed again.
+        """
+        with contextlib.ExitStack() as stack:
+            head = stack.enter_context(_named("head", _open_head, stated, log, clock))
+            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, log, clock))
+            cameras = {}
+            for name in stated.cameras:
+                cameras[name] = _named(f"camera '{name}'", _open_camera, stated, name, log, clock)
+                stack.callback(cameras[name].close)
+            rig = cls(stated, lrf, head, cameras, clock=clock)
+            rig._closing = stack.pop_all()
+        return rig
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+    def close(self):
+        """Stop the head and close all devices; a second call does nothing."""
+        self._closing.close()
+
+    @property
+    def lrf_info(self):
+        """The stated LrfInfo with the field of view, step and unit that the device has now."""
+        view, step = (180, 0.25) if self.stated.lrf_device.get("interlaced") else self.lrf.variant
+        unit = {"mm": 0.001, "cm": 0.01}[self.lrf.configuration.unit]
+        ends = tuple(math.radians(90 + side * view / 2) for side in (-1, 1))
+        model = self.stated.lrf.model or self.lrf.type
+        found = {"field_of_view": ends, "bearing_step": math.radians(step), "range_resolution": unit, "model": model}
+        return replace(self.stated.lrf, **found)
+
+    def begin_telegrams(self):
+        """Telegrams with which a recording begins: the configuration, which states the measuring mode."""
+        return [encode_configuration(self.lrf.configuration)]
+
+    # -------------------------------------------------------------------------------------------- the board
+
+    def move_board(self, placement):
+        """Put the board of an emulated rig at a placement.
+
+        Returns
+        -------
+        bool
+            False where nobody but the user can: a real rig.
+        """
+        return self._control("place", placement)
+
+    def hold_close(self, camera, view):
+        """Hold the board of an emulated rig close to a camera; as :meth:`move_board`."""
+        return self._control("close", camera, view)
+
+    def _control(self, command, *arguments):
+        if self.stated.control is None:
+            return False
+        try:
+            ask(self.stated.control, {"command": command, "arguments": list(arguments)})
+        except (OSError, ValueError) as error:
+            raise DeviceError(
+                f"control socket {self.stated.control}: {error}; is 'python -m lrfcal_lib emulate' still running? "
+                "Remove devices.control from the rig file to move a real board by hand"
+            ) from error
+        return True
+
+    # ---------------------------------------------------------------------------------------------- recording
+
+    def acquire(self, placement):
+        """Record one placement: a generator of events, in the order in which things happen.
+
+        Parameters
+        ----------
+        placement : Placement
+            Of the plan, which also says how (stop-and-go or continuous).
+
+        Yields
+        ------
+        Moved, Scanned, Photographed or Tracked
+            Scans and images of a stop are later than the instant at which the head came to rest there. In a
+            continuous sweep every scan has the pitch at the instant of its middle beam, interpolated between the
+            head's readings (dead reckoning without them), and is handed out as soon as that is known.
+
+        Raises
+        ------
+        DeviceError
+            Whatever happens, also when the generator is closed: the head is stopped, and the scans are.
+        """
+        sweep = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go
+        try:
+            yield from sweep(placement)
+        except BaseException:
+            self.halt()
+            raise
+
+    def acquire_close(self, camera):
+        """Take one image of the board held close to a camera, the head at pitch 0; events as :meth:`acquire`."""
+        try:
+            yield from self._photograph([camera], -1, self._move(-1, 0.0, 1, 1), "intrinsics")
+        except BaseException:
+            self.halt()
+            raise
+
+    def halt(self):
+        """Stop the head and the scans; what cannot be stopped is logged, with what to do."""
+        for name, device in (("head", self.head), ("laser range finder", self.lrf)):
+            try:
+                device.stop()
+            except DeviceError as error:
+                LOG.error("the %s could not be stopped (%s): cut its power if it moves", name, error)
+
+    def _stop_and_go(self, placement):
+        stops = _stops(placement)
+        self.lrf.start(interlaced=bool(self.stated.lrf_device.get("interlaced")))
+        for number, (pitch, scan, photo) in enumerate(stops, 1):
+            moved = self._move(placement.number, pitch, number, len(stops))
+            yield moved
+            if scan:
+                count = self.stated.plan.scans_per_stop
+                readings = self.lrf.take(count, after=moved.time_s, timeout=SCAN_S * count)
+                _later(readings[0].time_s, moved, "scan")
+                yield Scanned(placement.number, tuple(readings), np.full(count, moved.pitch))
+            if photo:
+                yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
+        self.lrf.stop()
+
+    def _move(self, placement, pitch, number, of):
+        reached = self.head.move_to(pitch)
+        return Moved(placement, self.clock(), pitch, reached, self.head.has_feedback, number, of)
+
+    def _photograph(self, cameras, placement, moved, purpose):
+        for name in cameras:
+            frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
+            _later(frame.time_s, moved, f"image of camera '{name}'")
+            yield Photographed(placement, name, frame, moved.pitch, purpose)
+
+    def _continuous(self, placement):
+        first, last = placement.pitch[[0, -1]]
+        images = sorted(placement.image_pitch, reverse=placement.direction < 0)
+        for number, pitch in enumerate([*images, first], 1):
+            moved = self._move(placement.number, float(pitch), number, len(images) + 1)
+            yield moved
+            if number <= len(images):
+                yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
+        self.lrf.start()
+        held = [self.lrf.newest(timeout=SCAN_S)]
+        heard, newest = time.monotonic(), held[-1].time_s
+        self.head.start_sweep(float(last), self.stated.plan.sweep_speed)
+        while self.head.moving():
+            fresh = self._since(newest)
+            if fresh:
+                heard, newest = time.monotonic(), fresh[-1].time_s
+            elif time.monotonic() - heard > GAP_S:
+                raise NoReply(f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder")
+            known, held = self._placed(held + fresh, self._usable(self.head.track))
+            if known:
+                yield Scanned(placement.number, *known, _share(known[1][-1], first, last))
+        track = self.head.finish_sweep()
+        known, _ = self._placed(held + self._since(newest), track)
+        self.lrf.stop()
+        if known:
+            yield Scanned(placement.number, *known, 1.0)
+        yield Tracked(placement.number, float(last), tuple(track))
+
+    def _since(self, instant):
+        """All scans after an instant that come within the time of a batch."""
+        end, found = time.monotonic() + BATCH_S, []
+        with contextlib.suppress(NoReply):
+            while time.monotonic() < end:
+                found += self.lrf.take(1, after=instant, timeout=BATCH_S)
+                instant = found[-1].time_s
+        return found
+
+    def _usable(self, track):
+        """What of a growing track will not change any more."""
+        return [point for point in track if point[2]] if self.head.has_feedback else track
+
+    @staticmethod
+    def _placed(readings, track):
+        """Scans within a track with their pitch (None without any), and those that are later."""
+        if len(track) < 2:
+            return None, readings
+        times, pitch = np.array([point[:2] for point in track], float).T
+        instants = np.array([np.mean(one.beam_times_s[[0, -1]]) for one in readings])
+        inside = [i for i, t in enumerate(instants) if times[0] <= t <= times[-1]]
+        later = [one for one, t in zip(readings, instants, strict=True) if t > times[-1]]
+        if not inside:
+            return None, later
+        return (tuple(readings[i] for i in inside), np.interp(instants[inside], times, pitch)), later
+
+
+def _stops(placement):
+    """Stops of a sweep in the order of motion: pitch, whether scans are taken there, whether images."""
+    scans, images = list(placement.pitch), list(placement.image_pitch)
+    stops = [[p, True, any(abs(p - i) < SAME_STOP for i in images)] for p in scans]
+    stops += [[i, False, True] for i in images if all(abs(p - i) >= SAME_STOP for p in scans)]
+    return sorted(([float(p), *what] for p, *what in stops), reverse=placement.direction < 0)
+
+
+def _later(instant, moved, what):
+    """Refuse what was recorded while the head still moved, whatever a driver says."""
+    if instant <= moved.time_s:
+        raise DeviceError(f"the {what} is {moved.time_s - instant:.3f} s older than the stop it belongs to")
+
+
+def _share(pitch, first, last):
+    return float(np.clip((pitch - first) / (last - first), 0, 1))
+
+
+def _named(device, opener, *arguments):
+    """Open a device; its name stands before the message of whatever goes wrong."""
+    try:
+        return opener(*arguments)
+    except DeviceError as error:
+        error.args = (f"{device}: {error}", *error.args[1:])
+        raise
+    except ValueError as error:
+        raise RigFileError(f"{arguments[0].path}: {device}: {error}") from error
+
+
+def _open_head(stated, log, clock):
+    from lrfcal_lib.drivers.pan_tilt import PanTilt
+
+    return PanTilt.open(stated.head_device, stated.head_settings, log=log, clock=clock)
+
+
+def _open_lrf(stated, log, clock):
+    from lrfcal_lib.drivers.lms2xx_device import LMS2xx
+
+    asked = stated.lrf_device
+    options = {key: asked[key] for key in ("baudrate", "address") if key in asked}
+    if "password" in asked:
+        options["password"] = asked["password"].encode()
+    lrf = LMS2xx.open(asked["port"], **options, log=log, clock=clock)
+    try:
+        if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
+            lrf.set_variant(*asked["variant"])
+        lrf.configure(**{key: asked.get(key) for key in ("unit", "measuring_mode", "realtime_indices")})
+    except BaseException:
+        lrf.close()
+        raise
+    return lrf
+
+
+def _open_camera(stated, name, log, clock):
+    from lrfcal_lib.drivers.video import Camera
+
+    asked, info = stated.camera_devices[name], stated.cameras[name]
+    options = {"exposure": asked.get("exposure"), "fps": asked.get("fps"), "log": log, "clock": clock}
+    camera = Camera.open(asked["source"], name=name, size=(info.width, info.height), **options)
+    got = camera.settings["size"]["got"]
+    if got is not None and tuple(got) != (info.width, info.height):
+        camera.close()
+        raise ValueError(
+            f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {info.width} x {info.height}: "
+            "state a size that it can do"
+        )
+    return camera

@@ -1,0 +1,123 @@
+"""Serial ports: open with errors that say what to do, set a rate and see that it holds.
+
+Nothing that pseudo-terminals lack (RTS, DTR, low latency, RS-485 mode) is asked for.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import termios
+from contextlib import contextmanager
+from pathlib import Path
+
+import serial
+
+from lrfcal_lib.drivers.errors import LineLost, PortError
+
+WRITE_S = 1.0  # longest time a write may block
+
+
+def open_port(path, baudrate, *, timeout):
+    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit, no flow control.
+
+    Parameters
+    ----------
+    path : str or Path
+        Such as /dev/ttyUSB0.
+    baudrate : int
+    timeout : float
+        Seconds that a read waits for its bytes.
+
+    Returns
+    -------
+    serial.Serial
+        A write blocks for 1 s at most.
+
+    Raises
+    ------
+    PortError
+        If the port is missing, forbidden, busy, no serial line, or cannot do this rate.
+    """
+    path = os.fspath(path)
+    try:
+        port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
+    except (OSError, ValueError, termios.error) as error:
+        raise PortError(_reason(path, error)) from error
+    try:
+        set_rate(port, baudrate)
+    except BaseException:
+        port.close()
+        raise
+    return port
+
+
+def set_rate(port, baudrate):
+    """Change the rate of an open port and read it back.
+
+    Parameters
+    ----------
+    port : serial.Serial
+    baudrate : int
+
+    Raises
+    ------
+    PortError
+        If the line cannot do this rate; the old one holds.
+    LineLost
+        If the port vanished.
+    """
+    old = port.baudrate
+    try:
+        with line_lost(port.port):
+            port.baudrate = baudrate
+            got = set(termios.tcgetattr(port.fd)[4:6])
+    except ValueError as error:
+        port.baudrate = old
+        raise PortError(f"{port.port} cannot do {baudrate} Bd: {error}") from error
+    if got != {getattr(termios, f"B{baudrate}", None)}:
+        port.baudrate = old
+        raise PortError(
+            f"{port.port} does not take {baudrate} Bd: its driver set another rate; "
+            "500000 Bd needs an RS-422 interface whose clock divides to it, else use 38400"
+        )
+
+
+@contextmanager
+def line_lost(path):
+    """Turn what pyserial raises when a port vanishes into LineLost."""
+    try:
+        yield
+    except (OSError, termios.error) as error:
+        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
+
+
+def _reason(path, error):
+    """Why a port could not be opened, and what to do."""
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"there is no port {path}: check cable and power; present are {', '.join(_present()) or 'none'}"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return f"the port {path} is busy, held by {_holder(path)}: close that program"
+    return f"{path} is no serial line ({error}): name the port of the device"
+
+
+def _present():
+    """Ports of this machine."""
+    from serial.tools.list_ports import comports
+
+    return sorted(one.device for one in comports())
+
+
+def _holder(path):
+    """The processes that have a port open, as far as this user may see."""
+    found, real = set(), os.path.realpath(path)
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if os.readlink(link) == real:
+                found.add(f"{(link.parents[1] / 'comm').read_text().strip()} (process {link.parts[2]})")
+        except OSError:  # that process ended, or belongs to somebody else
+            continue
+    return ", ".join(sorted(found)) or "another program"

@@ -1,0 +1,469 @@
+"""One maximum-likelihood estimate of the whole rig from ranges, edges and images at all pitch angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.geometry import DegenerateGeometry, TiltAxis, axis_of, head_from_axis
+from lrfcal_lib.solvers.edge_likelihood import disc_edge
+from lrfcal_lib.solvers.joint_blocks import SENSOR, JointData, JointState, Unknowns, gather, joint_blocks, move_state
+from lrfcal_lib.solvers.joint_noise import (
+    CONTRADICTION,
+    LARGEST_SHARE,
+    ROUGH_MISS,
+    estimate_noise,
+    misfits,
+    rough_misses,
+)
+from lrfcal_lib.solvers.joint_start import start_states
+from lrfcal_lib.solvers.least_squares import minimise, solve, whiten
+from lrfcal_lib.solvers.platform import AXIS_NAMES, AXIS_WORDS
+from lrfcal_lib.solvers.platform_blocks import chart_parameters
+from lrfcal_lib.solvers.pose import POSE_NAMES, motion_words, pose_array, pose_parameters, pose_transform
+from lrfcal_lib.solvers.solution import Solution
+
+SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
+START_STEPS = 8
+NOISE_ROUNDS, ROUND_STEPS = 3, 10
+OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
+LEVELS = (
+    "face_scale", "view_scale", "sigma_pitch", "face_share", "beam_share", "lapse", "sweep_sigma", "side_sigma",
+    "prior",
+)  # fmt: skip
+SWEEP_SIGMA = (np.radians(0.5), 0.05)
+GOOD_START = 25.0  # half a squared residual; a start value this good is not searched further
+ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
+UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """The joint estimate.
+
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+        In the gauge of the stated platform (rotation about the axis and shift along it cannot be observed).
+    transforms : dict of str to RigidTransform
+        ``T_camera_lrf`` or ``T_camera_platform`` by camera.
+    boards : dict of int to RigidTransform
+        ``T_platform_board`` by placement.
+    sensor : dict of str to float
+        Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by direction (rad).
+    sweeps : dict of int to ndarray
+        Offset (rad) and stretch of the recorded pitch of each sweep.
+    size : dict of str to float
+        By how much each edge lies outside the stated one, metres.
+    noise : dict of str to float
+        Factors on the stated standard deviations, and shares of independent errors, as estimated.
+    misfit : dict of int to float
+        Normalised squared residuals of each placement (1 is what the noise explains).
+    excluded : dict of int to str
+        Placements left out, with the reason.
+    unobservable : tuple of str
+        Motions that the data do not determine, in words.
+    solution : Solution
+        Of the shared unknowns (covariances, names, convergence).
+    state : JointState
+    unknowns : Unknowns
+    data : JointData
+    """
+
+    T_head_lrf: RigidTransform
+    transforms: dict
+    boards: dict
+    sensor: dict
+    sweeps: dict
+    size: dict
+    noise: dict
+    misfit: dict
+    excluded: dict
+    unobservable: tuple
+    solution: Solution
+    state: JointState
+    unknowns: Unknowns
+    data: JointData
+
+    @property
+    def converged(self):
+        return bool(self.solution.converged)
+
+    @property
+    def axis(self) -> TiltAxis:
+        return axis_of(self.T_head_lrf)
+
+    @property
+    def edge_bias(self):
+        """Where readings flip with a background as far and bright as the board, spot radii outside the edge."""
+        return float(disc_edge(self.sensor["edge_log_odds"])[0])
+
+    def columns(self, prefix):
+        """Indices of the shared unknowns whose names begin so."""
+        return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
+
+    def covariance(self, prefix, clustered=False):
+        """Covariance of a group of shared unknowns, e.g. 'left_' or 'axis'; `clustered` by placement where known."""
+        found = self.solution.covariance_placements if clustered else None
+        found = self.solution.covariance if found is None else found
+        index = self.columns(prefix)
+        return found[np.ix_(index, index)]
+
+    def correct(self, placement, p_lrf, pitch):
+        """Measured points and recorded pitch as they should have been.
+
+        Parameters
+        ----------
+        placement : int
+        p_lrf : ndarray, shape (n, 3)
+            LRF frame, metres.
+        pitch : array_like, broadcastable to (n,)
+            Radians.
+
+        Returns
+        -------
+        p_lrf : ndarray, shape (n, 3)
+            Without the range offset.
+        pitch : ndarray
+            With scale, offset by direction and the sweep's own errors, as far as they were estimated.
+        """
+        p_lrf, pitch = np.asarray(p_lrf, float), np.asarray(pitch, float)
+        length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
+        points = p_lrf * (1 - self.sensor["range_offset"] / np.maximum(length, 1e-9))
+        corrected = pitch * (1 + self.sensor["pitch_scale"])
+        if placement in self.sweeps:
+            index = list(self.sweeps).index(placement)
+            offset, stretch = self.sweeps[placement]
+            turn = self.sensor["pitch_by_direction"] * self.data.direction[index]
+            corrected = corrected + turn + offset + stretch * (pitch - self.data.middle[index])
+        return points, corrected
+
+    def camera(self, name):
+        """The pose of one camera as a `Solution` like those of the other methods."""
+        index, whole = self.columns(f"{name}_"), self.solution
+        pose = pose_array(self.transforms[name])
+        spread = {
+            "covariance": self.covariance(f"{name}_"),
+            "covariance_placements": None if whole.covariance_placements is None else self.covariance(f"{name}_", True),
+        }
+        return replace(
+            whole, transform=self.transforms[name], parameters=pose_parameters(pose), names=POSE_NAMES,
+            jacobian=whole.jacobian[..., index], unobservable=self.unobservable, state=pose, **spread,
+        )  # fmt: skip
+
+    def __repr__(self):
+        return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
+
+
+def solve_joint(
+    obs,
+    T0=None,
+    *,
+    prior=None,
+    axis=True,
+    sensor=("range_offset", "edge_log_odds", "edge_log_softness"),
+    size=False,
+    sides=False,
+    side_sigma=0.35,
+    sweep="none",
+    sweep_sigma=SWEEP_SIGMA,
+    lapse=0.0,
+    noise="stated",
+    start=None,
+    required=True,
+    max_iterations=60,
+):
+    """Estimate axis, cameras, range offset, edge bias and the pose of every board at once.
+
+    Parameters
+    ----------
+    obs : JointObservations
+    T0 : RigidTransform, optional
+        Rough ``T_head_lrf``; closed forms are tried in any case.
+    prior : PlatformPrior, optional
+        A rough measurement of the axis with its standard deviations. It yields where the data contradict it.
+    axis : bool
+        False: the axis is the one of T0 (or the stated one), and known.
+    sensor : sequence of str
+        Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_blocks.SENSOR`; others stay zero (softness: 0.2).
+    size : bool
+        Estimate the board's size: one offset an edge.
+    sides : bool
+        Every side of every placement deviates from the sensor's edge bias, because backgrounds are not alike.
+    side_sigma : float
+        Scale of these deviations, log odds.
+    sweep : {'none', 'offset', 'offset_stretch'}
+        Errors of the recorded pitch that every sweep has of its own.
+    sweep_sigma : tuple of float
+        Their expected standard deviations, radians and fraction.
+    lapse : float
+        Share of edge beams expected to say nothing.
+    noise : {'stated', 'estimate'}
+        Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among neighbours) from the
+        residuals, and leave out placements that contradict all others, by name.
+    start : JointState, optional
+        Skips the search for a start value.
+    required : bool
+        False: report unobservable motions instead of raising.
+    max_iterations : int
+
+    Returns
+    -------
+    JointSolution
+
+    Raises
+    ------
+    DegenerateGeometry
+        Naming the unobservable motions, when `required`, or when there is no start value.
+    ValueError
+        For unknown names, contradictory noise settings, or observations that are not finite.
+    """
+    check_settings(obs, sensor, sweep_sigma, noise, lapse)
+    unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
+    excluded = {}
+    if start is None:
+        obs, start, excluded = best_start(obs, unknowns, sweep_sigma, T0)
+    data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), side_sigma=side_sigma, prior=prior)
+    state = _converge(start, data, unknowns, max_iterations)
+    data = replace(data, lapse=lapse)
+    if noise == "estimate":
+        state, data = settle(state, data, unknowns, max_iterations)
+        obs, state, data, bad = drop_contradictions(obs, state, data, unknowns)
+        excluded |= bad
+        if bad:
+            state, data = settle(state, data, unknowns, max_iterations)
+    found = _solve(obs, data, in_stated_gauge(state, obs), unknowns, required, max_iterations)
+    return _wrap(obs, data, unknowns, found, excluded)
+
+
+def settle(state, data, unknowns, iterations):
+    """Estimate unknowns and noise levels in turn until they agree."""
+    for _ in range(NOISE_ROUNDS):
+        data = estimate_noise(state, data, unknowns)
+        state = _converge(state, data, unknowns, min(iterations, ROUND_STEPS))
+    return state, data
+
+
+def drop_contradictions(obs, state, data, unknowns):
+    """Leave out placements whose residuals are far larger than those of the others."""
+    found = misfits(state, data, unknowns)
+    level = np.median(found)
+    bad = np.flatnonzero(found > CONTRADICTION * max(level, 1.0))
+    if len(bad) == 0:
+        return obs, state, data, {}
+    words = {
+        int(obs.placements[i]): f"placement {obs.placements[i]}: its residuals are "
+        f"{np.sqrt(found[i] / level):.0f} times those of the others; left out"
+        for i in bad
+    }
+    obs = obs.select(np.delete(obs.placements, bad))
+    own = {key: np.delete(getattr(state, key), bad, axis=0) for key in OWN}
+    return obs, replace(state, **own), with_levels(gather(obs), data), words
+
+
+def with_levels(data, like):
+    """Padded observations with the noise levels of others."""
+    return replace(data, **{key: getattr(like, key) for key in LEVELS})
+
+
+def solve_again(obs, like, max_iterations=60):
+    """Solve for other placements with the settings, noise levels and start value of a solution.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Some of the placements that `like` was made from (for leave-one-out and random halves).
+    like : JointSolution
+    max_iterations : int
+
+    Returns
+    -------
+    JointSolution
+
+    Raises
+    ------
+    DegenerateGeometry
+        When these placements leave a motion open.
+    """
+    known = list(like.boards)
+    rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
+    obs = obs.select([known[row] for row in rows])
+    state = replace(like.state, **{key: getattr(like.state, key)[rows] for key in OWN})
+    data = with_levels(gather(obs), like.data)
+    state = _converge(state, data, like.unknowns, max_iterations)
+    found = _solve(obs, data, in_stated_gauge(state, obs), like.unknowns, True, max_iterations)
+    return _wrap(obs, data, like.unknowns, found, like.excluded)
+
+
+def check_settings(obs, sensor, sweep_sigma, noise, lapse):
+    """Refuse settings that contradict themselves."""
+    unknown = [name for name in sensor if name not in SENSOR]
+    if unknown:
+        raise ValueError(f"sensor unknowns are {', '.join(SENSOR)}; got {unknown[0]!r}")
+    if noise not in ("stated", "estimate"):
+        raise ValueError(f"noise is 'stated' or 'estimate', got {noise!r}")
+    if not 0 <= lapse < 0.5:
+        raise ValueError(f"lapse is the share of beams that say nothing, 0 to 0.5, got {lapse}")
+    if min(sweep_sigma) <= 0:
+        raise ValueError(f"sweep_sigma must be positive (radians, fraction), got {sweep_sigma}")
+    if len(obs.placements) == 0:
+        raise DegenerateGeometry("no placement to calibrate with")
+
+
+def best_start(obs, unknowns, sweep_sigma, T0=None):
+    """The most promising start value, and the placements that no start value can bring together.
+
+    Returns
+    -------
+    obs : JointObservations
+        Without those placements.
+    state : JointState
+    excluded : dict of int to str
+
+    Raises
+    ------
+    DegenerateGeometry
+        When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
+    """
+    data, best, least = gather(obs), None, np.inf
+    for state in start_states(obs, T0):
+        if not unknowns.axis:
+            known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
+            state = replace(state, head=pose_array(known))
+        kept, fitting, bad = without_contradictions(obs, state, data)
+        cut = replace(gather(kept) if bad else data, sweep_sigma=tuple(sweep_sigma))
+        state, cost = a_few_steps(fitting, cut, unknowns)
+        if best is None or cost < least:
+            best, least = (kept, state, bad), cost
+        if least < GOOD_START * count_rows(cut):
+            break
+    kept, state, bad = best
+    if len(bad) > LARGEST_SHARE * len(obs.placements):
+        raise DegenerateGeometry(
+            f"{len(bad)} of {len(obs.placements)} placements contradict the others: their images put the board "
+            f"elsewhere than their scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry the "
+            "right numbers"
+        )
+    return best
+
+
+def without_contradictions(obs, state, data):
+    """Leave out the placements whose scans lie far off where their images put the board."""
+    misses = rough_misses(state, data)
+    bad = misses > max(ROUGH_MISS, 5 * np.median(misses))
+    if not bad.any():
+        return obs, state, {}
+    words = {
+        int(p): f"placement {p}: the scan is {1000 * miss:.0f} mm off where its image puts the board; left out"
+        for p, miss in zip(obs.placements[bad], misses[bad], strict=True)
+    }
+    own = {key: getattr(state, key)[~bad] for key in OWN}
+    return obs.select(obs.placements[~bad]), replace(state, **own), words
+
+
+def a_few_steps(state, data, unknowns):
+    """A state after a few steps with soft edges, and its cost."""
+    coarse = replace(unknowns, sensor=tuple(n for n in unknowns.sensor if n == "range_offset"), sides=False)
+    state = _converge(state, data, coarse, START_STEPS)
+    return state, total_cost(state, data, coarse)
+
+
+def count_rows(data):
+    """Number of observations."""
+    return sum(int(group["used"].sum()) for group in (data.face, data.beam, data.view))
+
+
+def in_stated_gauge(state, obs):
+    """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
+    axis = head_from_axis(axis_of(pose_transform(state.head)))
+    stated = obs.T_head_lrf
+    head = axis if stated is None else stated * head_from_axis(axis_of(stated)).inv() * axis
+    change = head * pose_transform(state.head).inv()
+    boards = pose_array(change * pose_transform(state.boards))
+    cameras = state.cameras.copy()
+    fixed = [i for i, mount in enumerate(obs.mounts) if mount == "platform"]
+    if fixed:
+        cameras[fixed] = pose_array(pose_transform(cameras[fixed]) * change.inv())
+    return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
+
+
+def total_cost(state, data, unknowns):
+    """Half the squared residuals and the negative log likelihood of all observations."""
+    total = 0.0
+    for block in joint_blocks(state, data, unknowns):
+        total += block.cost.sum() if block.cost is not None else 0.5 * np.sum(whiten(block, False)[0] ** 2)
+    return float(total) if np.isfinite(total) else np.inf
+
+
+def _converge(state, data, unknowns, iterations):
+    evaluate, move = _problem(data, unknowns)
+    return minimise(evaluate, state, move, shared=unknowns.shared, max_iterations=iterations, tolerance=ROUGH_STEP)[0]
+
+
+def _problem(data, unknowns):
+    return (lambda s: joint_blocks(s, data, unknowns)), (lambda s, step: move_state(s, step, unknowns))
+
+
+def _solve(obs, data, state, unknowns, required, max_iterations):
+    evaluate, move = _problem(data, unknowns)
+    names = unknowns.names(obs.cameras, obs.edges)
+    return solve(
+        evaluate, state, move, names=names, method="joint", read=lambda s: (None, _parameters(s, unknowns)),
+        scales=[SCALES.get(name, 1.0) for name in names], words=lambda d: joint_words(d, names, obs.cameras),
+        shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=max_iterations,
+        tolerance=LAST_STEP,
+        n_observations=count_rows(data),
+    )  # fmt: skip
+
+
+def _parameters(state, unknowns):
+    poses = pose_parameters(state.cameras).ravel() if len(state.cameras) else np.zeros(0)
+    return np.concatenate([chart_parameters(state.head), poses, state.sensor, state.size])[unknowns.mask]
+
+
+def joint_words(direction, names, cameras):
+    """A direction of the shared unknowns in words."""
+    direction = np.asarray(direction) / np.max(np.abs(direction))
+    words = []
+    for camera in cameras:
+        index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
+        if index and np.max(np.abs(direction[index])) > 0.3:
+            words.append(motion_words(direction[index], camera))
+    for name, value in zip(names, direction, strict=True):
+        if abs(value) > 0.3 and not any(name.startswith(f"{c}_") for c in cameras):
+            words.append(_WORDS.get(name, name.replace("_", " ")))
+    return " with ".join(words)
+
+
+_WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
+    "range_offset": "the range offset",
+    "edge_log_odds": "the edge bias",
+    "edge_log_softness": "the softness of the edges",
+    "pitch_scale": "the scale of the pitch",
+    "pitch_by_direction": "the pitch offset by sweep direction",
+}
+
+
+def _wrap(obs, data, unknowns, found, excluded):
+    state = found.state
+    T_head_lrf = pose_transform(state.head)
+    return JointSolution(
+        T_head_lrf,
+        {name: pose_transform(pose) for name, pose in zip(obs.cameras, state.cameras, strict=True)},
+        dict(zip(obs.placements.tolist(), pose_transform(state.boards), strict=True)),
+        dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
+        {int(p): s for p, s in zip(obs.placements, state.sweeps, strict=True)},
+        dict(zip(obs.edges, state.size.tolist(), strict=True)),
+        noise_levels(data, obs.cameras),
+        dict(zip(obs.placements.tolist(), misfits(state, data, unknowns).tolist(), strict=True)),
+        excluded, found.unobservable, found, state, unknowns, data,
+    )  # fmt: skip
+
+
+def noise_levels(data, cameras):
+    """Noise levels in use by name."""
+    views = {f"view_scale_{name}": float(scale) for name, scale in zip(cameras, data.view_scale, strict=True)}
+    names = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
+    return {name: float(getattr(data, name)) for name in names} | views

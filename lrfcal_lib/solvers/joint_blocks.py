@@ -1,0 +1,487 @@
+"""Residuals of the joint estimate with analytic Jacobians, padded to rectangles by placement.
+
+Every ray of the range finder leaves the mirror at ``o = Rx(pitch) t`` with direction ``d = Rx(pitch) R d_lrf`` in the
+platform frame (R, t of ``T_head_lrf``). A range ends on the board's plane; an edge is passed at the distance of two
+lines in space; a camera sees the board where the chain of transforms puts it. All derivatives go through o and d.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
+from lrfcal_lib.solvers.least_squares import Block
+from lrfcal_lib.solvers.platform import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.solvers.platform_blocks import prior_terms
+from lrfcal_lib.solvers.pose import POSE_NAMES, cross, move_pose
+
+SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
+EXTRA = ("size",)  # one unknown an edge
+SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
+SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
+AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Everything that moves.
+
+    Attributes
+    ----------
+    head : ndarray, shape (3, 4)
+        ``T_head_lrf``.
+    cameras : ndarray, shape (c, 3, 4)
+        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+    sensor : ndarray, shape (5,)
+        In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
+    size : ndarray, shape (e,)
+        By how much each edge lies outside the stated one, metres.
+    boards : ndarray, shape (p, 3, 4)
+        ``T_platform_board``.
+    sweeps : ndarray, shape (p, 2)
+        Offset (radians) and stretch of the recorded pitch of each sweep.
+    sides : ndarray, shape (p, e)
+        By how much the log odds of each side differ from the sensor's: what stands behind it is darker or brighter.
+    """
+
+    head: np.ndarray
+    cameras: np.ndarray
+    sensor: np.ndarray
+    size: np.ndarray
+    boards: np.ndarray
+    sweeps: np.ndarray
+    sides: np.ndarray
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Which columns of the full Jacobian are unknown.
+
+    Attributes
+    ----------
+    cameras, edges : int
+        How many there are.
+    axis, size : bool
+    sensor : tuple of str
+        Of `SENSOR`.
+    sweep : {'none', 'offset', 'offset_stretch'}
+    poses : bool
+        Whether the cameras' poses are unknown.
+    sides : bool
+        Whether every side of every placement has a deviation of its own from the sensor's edge bias.
+    """
+
+    cameras: int
+    edges: int
+    axis: bool = True
+    sensor: tuple = ("range_offset", "edge_log_odds", "edge_log_softness")
+    size: bool = False
+    sweep: str = "none"
+    poses: bool = True
+    sides: bool = False
+
+    @property
+    def mask(self):
+        """Of the full set of shared columns, those that are unknown."""
+        poses, size = [self.poses] * 6 * self.cameras, [self.size] * self.edges
+        return np.array([self.axis] * 4 + poses + [name in self.sensor for name in SENSOR] + size)
+
+    @property
+    def shared(self):
+        """Number of unknowns common to all placements."""
+        return int(self.mask.sum())
+
+    @property
+    def own(self):
+        """Number of unknowns of one placement."""
+        return 6 + SWEEPS[self.sweep] + self.edges * self.sides
+
+    def names(self, cameras, edges):
+        """Names of the shared unknowns."""
+        poses = [f"{c}_{n}" for c in cameras for n in POSE_NAMES]
+        every = [*AXIS_NAMES, *poses, *SENSOR, *(f"size_{e}" for e in edges)]
+        return tuple(np.array(every)[self.mask].tolist())
+
+
+@dataclass(frozen=True)
+class JointData:
+    """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
+
+    Attributes
+    ----------
+    face, beam, view : dict of str to ndarray
+        Fields of a group of :class:`lrfcal_lib.solvers.joint_observations.JointObservations`, with `used` and ``ray``
+        (LRF frame) or, for views, ``whitener`` (p, v, 6, 6).
+    lines : ndarray, shape (e, 3)
+    middle, direction : ndarray, shape (p,)
+    on_head : ndarray of bool, shape (c,)
+    face_scale, view_scale : float, and ndarray, shape (c,)
+        Factors on the stated standard deviations.
+    sigma_pitch : float
+        Standard deviation of the recorded pitch of a single image, radians: what a head at rest is off by.
+    face_share, beam_share : float
+        Independent errors per observation: below one where neighbours repeat each other's errors.
+    lapse : float
+        See :func:`lrfcal_lib.solvers.edge_likelihood.beam_terms`.
+    sweep_sigma : tuple of float
+        Standard deviation of the sweeps' own offset (radians) and stretch.
+    side_sigma : float
+        Scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom: most
+        backgrounds are alike, some are dark).
+    prior : PlatformPrior or None
+        The stated platform; it yields where the data contradict it.
+    """
+
+    face: dict
+    beam: dict
+    view: dict
+    lines: np.ndarray
+    middle: np.ndarray
+    direction: np.ndarray
+    on_head: np.ndarray
+    face_scale: float = 1.0
+    view_scale: np.ndarray | None = None
+    sigma_pitch: float = 0.0
+    face_share: float = 1.0
+    beam_share: float = 1.0
+    lapse: float = 0.0
+    sweep_sigma: tuple = (np.radians(0.5), 0.05)
+    side_sigma: float = 0.35
+    prior: PlatformPrior | None = None
+
+
+def pad(group, count):
+    """Rows of a group sorted into a rectangle by placement."""
+    place = group["placement"]
+    order = np.argsort(place, kind="stable")
+    number = np.bincount(place, minlength=count)
+    width = max(1, int(number.max(initial=0)))
+    slot = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
+    out = {}
+    for key, value in group.items():
+        if key != "placement":
+            filled = np.zeros((count, width) + value.shape[1:], value.dtype)
+            filled[place[order], slot] = value[order]
+            out[key] = filled
+    used = np.zeros((count, width), bool)
+    used[place[order], slot] = True
+    return out | {"used": used}
+
+
+def gather(obs):
+    """Observations as padded arrays.
+
+    Parameters
+    ----------
+    obs : JointObservations
+
+    Returns
+    -------
+    JointData
+    """
+    count = len(obs.placements)
+    face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
+    for group in (face, beam):
+        b = group["bearing"]
+        group["ray"] = np.stack([np.cos(b), np.sin(b), 0 * b], axis=-1)
+    view["covariance"] = np.where(view["used"][..., None, None], view["covariance"], np.eye(6))
+    view["whitener"] = np.linalg.inv(np.linalg.cholesky(view["covariance"])) * view["used"][..., None, None]
+    view["pose"] = np.where(view["used"][..., None, None], view["pose"], np.eye(4))
+    on_head = np.array([m == "head" for m in obs.mounts], bool)
+    return JointData(
+        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, view_scale=np.ones(len(obs.cameras))
+    )
+
+
+def true_pitch(state, data, pitch):
+    """Corrected pitch (p, n) and its derivatives by (scale, direction, offset, stretch), (p, n, 4)."""
+    scale, by_direction = state.sensor[3:5]
+    offset, stretch = state.sweeps[:, :1], state.sweeps[:, 1:]
+    away, turn = pitch - data.middle[:, None], np.broadcast_to(data.direction[:, None], pitch.shape)
+    corrected = pitch * (1 + scale) + by_direction * turn + offset + stretch * away
+    return corrected, np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
+
+
+def tilted(vectors, pitch, sign=1.0):
+    """``Rx(sign pitch) v`` of vectors (p, n, 3) or (3,) at angles (p, n)."""
+    c, s = np.cos(pitch), sign * np.sin(pitch)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return np.stack([x + 0 * c, c * y - s * z, s * y + c * z], axis=-1)
+
+
+def rays(state, data, group):
+    """Origins and directions (p, n, 3) of the beams of a group in the platform frame, pitch and its derivatives."""
+    pitch, by_parts = true_pitch(state, data, group["pitch"])
+    d_head = group["ray"] @ state.head[:, :3].T
+    return tilted(state.head[:, 3], pitch), tilted(d_head, pitch), d_head, pitch, by_parts
+
+
+def ray_columns(by_o, by_d, ray):
+    """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and direction."""
+    o, d, d_head, pitch, by_parts = ray
+    back_o, back_d = tilted(by_o, pitch, -1.0), tilted(by_d, pitch, -1.0)
+    head = np.concatenate([cross(d_head, back_d), back_o], axis=-1)[..., AXIS_COLUMNS]
+    turn = (cross(o, by_o) + cross(d, by_d))[..., :1]
+    return head, turn * by_parts
+
+
+def assemble(unknowns, head, parts, board, *, cameras=None, sensor=None, size=None, sides=None):
+    """Columns side by side, only those that are unknown: shared ones first, then the placement's own."""
+    shape = head.shape[:-1]
+    empty = np.zeros(shape + (6 * unknowns.cameras,)) if cameras is None else cameras
+    sensor = np.zeros(shape + (3,)) if sensor is None else sensor
+    size = np.zeros(shape + (unknowns.edges,)) if size is None else size
+    shared = np.concatenate([head, empty, sensor, parts[..., :2], size], axis=-1)[..., unknowns.mask]
+    own = [board, parts[..., 2 : 2 + SWEEPS[unknowns.sweep]]]
+    if unknowns.sides:
+        own.append(np.zeros(shape + (unknowns.edges,)) if sides is None else sides)
+    return np.concatenate([shared, *own], axis=-1)
+
+
+def face_block(state, data, unknowns):
+    """Predicted minus measured ranges to the board's plane, metres."""
+    group = data.face
+    ray = rays(state, data, group)
+    o, d = ray[:2]
+    normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
+    along = np.sum(normal * d, axis=-1, keepdims=True)
+    along = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    r = np.sum(normal * (origin - o), axis=-1, keepdims=True) / along
+    by_q = normal / along
+    head, parts = ray_columns(-by_q, -r * by_q, ray)
+    by_normal = (origin - o - r * d) / along
+    board = np.concatenate([cross(np.broadcast_to(normal, by_normal.shape), by_normal), by_q], axis=-1)
+    sensor = np.zeros(r.shape[:2] + (3,))
+    sensor[..., 0] = 1.0
+    J = assemble(unknowns, head, parts, board, sensor=sensor)
+    residuals = r[..., 0] + state.sensor[0] - group["range"]
+    sigma = np.where(group["used"], group["sigma"], 1.0) * data.face_scale
+    return Block(residuals * group["used"], J, group["used"] * np.sqrt(data.face_share) / sigma)
+
+
+def edge_distance(state, data, group, ray):
+    """Signed distance (p, n) of rays from their edges, positive outside, and its gradients by o, d and edge direction.
+
+    Returns
+    -------
+    u : ndarray, shape (p, n)
+    by_o, by_d, by_t : ndarray, shape (p, n, 3)
+        The gradient by the edge's point is ``-by_o``.
+    a, t, n : ndarray, shape (p, n, 3)
+        Point (relative to the board's origin), direction and outward normal of the edge, platform frame.
+    """
+    o, d = ray[:2]
+    rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
+    line = data.lines[group["edge"]]
+    shift = -(line[..., 2] - state.size[group["edge"]])[..., None]
+    zero = np.zeros(line.shape[:2] + (1,))
+    normal = np.concatenate([line[..., :2], zero], axis=-1)
+    along = np.stack([-line[..., 1], line[..., 0], zero[..., 0]], axis=-1)
+    a, t, n = ((shift * normal) @ rotation, along @ rotation, normal @ rotation)
+    away = o - a - state.boards[:, None, :, 3]
+    m = cross(d, t)
+    length = np.linalg.norm(m, axis=-1, keepdims=True)
+    c = m / length * np.where(np.sum(m * n, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    u = np.sum(c * away, axis=-1)
+    g = (away * np.sign(np.sum(c * m, axis=-1, keepdims=True)) - u[..., None] * m / length) / length
+    return u, c, cross(t, g), cross(g, d), a, t, n
+
+
+def beam_block(state, data, unknowns):
+    """Negative log likelihoods of beams near the edges."""
+    group = data.beam
+    ray = rays(state, data, group)
+    u, by_o, by_d, by_t, a, t, n = edge_distance(state, data, group, ray)
+    own = np.take_along_axis(state.sides, group["edge"], axis=1)
+    shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"] + own)
+    sigma = np.where(group["used"], group["radius"], 1.0) * np.exp(state.sensor[2])
+    margin = shift - u
+    cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
+    head, parts = ray_columns(-by_o, -by_d, ray)
+    board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
+    sensor = np.stack([0 * u, slope, -margin], axis=-1)
+    size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
+    np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
+    np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
+    J = assemble(unknowns, head, parts, board, sensor=sensor, size=size, sides=sides)
+    share = data.beam_share * group["used"]
+    root = np.sqrt(information)
+    alive = root * sigma > 1e-7
+    residuals = np.divide(score, root, out=np.zeros_like(score), where=alive)
+    return Block(residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share)
+
+
+def view_chain(state, data):
+    """Rotations and translations that make up the predicted ``T_camera_board`` of every view."""
+    camera = state.cameras[data.view["camera"]]
+    on_head = data.on_head[data.view["camera"]]
+    pitch, by_parts = true_pitch(state, data, np.where(on_head, data.view["pitch"], 0.0))
+    pitch = np.where(on_head, pitch, 0.0)
+    head = np.where(on_head[..., None, None], state.head, np.eye(3, 4))
+    A = camera[..., :3] @ np.swapaxes(head[..., :3], -1, -2)
+    board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
+    y = tilted(board[..., 3], pitch, -1.0)
+    back = tilted(np.broadcast_to(np.eye(3), pitch.shape + (3, 3)), pitch[..., None], -1.0)  # rows Rx(-pitch) e_i
+    return camera, head, A, A @ np.swapaxes(back, -1, -2), board, y, on_head, by_parts
+
+
+def log_rotation(R):
+    """Rotation vectors of stacks of matrices."""
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+
+
+def _hat(v):
+    out = np.zeros(v.shape + (3,))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def inverse_left_jacobian(w):
+    """How a small turn of a rotation changes its rotation vector, shape (..., 3) -> (..., 3, 3)."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    safe = np.maximum(angle, 1e-4)
+    bend = np.where(angle > 1e-4, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)), 1 / 12)
+    W = _hat(w)
+    return np.eye(3) - 0.5 * W + bend * (W @ W)
+
+
+def view_block(state, data, unknowns):
+    """Predicted against measured poses of the board in the cameras: rotation vectors and translations."""
+    camera, head, A, B, board, y, on_head, by_parts = view_chain(state, data)
+    R, t = B @ board[..., :3], (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
+    pose = data.view["pose"]
+    w = log_rotation(R @ np.swapaxes(pose[..., :3, :3], -1, -2))
+    residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
+    left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
+
+    def rows(turn, shift):
+        return np.concatenate([left @ turn, shift], axis=-2)
+
+    moved = on_head[..., None, None]
+    by_head = np.concatenate([rows(-A, A @ _hat(y - head[..., 3])), rows(zero, -A)], axis=-1)
+    turn = rows(-A[..., :1], (A @ _hat(y))[..., :1]) * moved
+    by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
+    own = np.concatenate([rows(eye, -_hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
+    cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
+    np.put_along_axis(cameras, data.view["camera"][..., None, None, None], own[..., None, :], axis=-2)
+    cameras = cameras.reshape(cameras.shape[:3] + (-1,))
+    parts = turn * by_parts[..., None, :]
+    J = assemble(unknowns, by_head[..., AXIS_COLUMNS] * moved, parts, by_board, cameras=cameras)
+    p, v = residuals.shape[:2]
+    return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
+
+
+def view_whitener(data, by_pitch):
+    """Inverse Cholesky factors of the views' covariances, with what the error of the recorded pitch adds to them."""
+    if data.sigma_pitch == 0:
+        return data.view["whitener"] / data.view_scale[data.view["camera"]][..., None, None]
+    scale = data.view_scale[data.view["camera"]][..., None, None]
+    covariance = scale**2 * data.view["covariance"]
+    covariance = covariance + data.sigma_pitch**2 * by_pitch[..., :, None] * by_pitch[..., None, :]
+    return np.linalg.inv(np.linalg.cholesky(covariance)) * data.view["used"][..., None, None]
+
+
+def sweep_block(state, data, unknowns):
+    """What is expected of the sweeps' own errors of the pitch."""
+    count, first = SWEEPS[unknowns.sweep], unknowns.shared + 6
+    J = np.zeros((len(state.sweeps), count, unknowns.shared + unknowns.own))
+    J[:, range(count), range(first, first + count)] = 1.0
+    whitener = np.broadcast_to(1 / np.array(data.sweep_sigma[:count]), (len(J), count))
+    return Block(state.sweeps[:, :count], J, whitener)
+
+
+def side_block(state, data, unknowns):
+    """What is expected of the sides' deviations from the sensor's edge bias: Student's t, as a likelihood."""
+    x, spread = state.sides, SIDE_FREEDOM * data.side_sigma**2
+    J = np.zeros(x.shape + (unknowns.shared + unknowns.own,))
+    J[:, range(x.shape[1]), range(J.shape[-1] - x.shape[1], J.shape[-1])] = 1.0
+    root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
+    cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
+    return Block(root * x, root[..., None] * J, np.ones_like(x), cost=cost)
+
+
+def prior_block(state, data, unknowns):
+    """What is stated about the axis: Student's t, so that a wrong statement loses; every placement holds a part."""
+    r, J = prior_terms(state.head, data.prior)
+    sigma = np.repeat([data.prior.sigma_direction, data.prior.sigma_offset], 2)
+    square, p = np.sum((r / sigma) ** 2), len(state.boards)
+    root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
+    jacobian = np.zeros((p, 4, unknowns.shared + unknowns.own))
+    jacobian[..., :4] = root[:, None] * J
+    cost = np.full((p, 4), 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p)
+    return Block(np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=cost)
+
+
+def joint_blocks(state, data, unknowns):
+    """All residuals of the joint estimate.
+
+    Parameters
+    ----------
+    state : JointState
+    data : JointData
+    unknowns : Unknowns
+
+    Returns
+    -------
+    list of Block
+        Of :func:`named_blocks`.
+    """
+    return list(named_blocks(state, data, unknowns).values())
+
+
+def named_blocks(state, data, unknowns):
+    """Residuals by name: 'face' (metres), 'beam' (likelihoods), 'view' (radians and metres), 'sweep', 'side', 'prior'."""
+    makers = {"face": face_block, "beam": beam_block, "view": view_block}
+    blocks = {n: make(state, data, unknowns) for n, make in makers.items() if getattr(data, n)["used"].any()}
+    if SWEEPS[unknowns.sweep]:
+        blocks["sweep"] = sweep_block(state, data, unknowns)
+    if unknowns.sides:
+        blocks["side"] = side_block(state, data, unknowns)
+    if data.prior is not None and unknowns.axis:
+        blocks["prior"] = prior_block(state, data, unknowns)
+    return blocks
+
+
+def move_state(state, step, unknowns):
+    """Retraction of the joint estimate.
+
+    Parameters
+    ----------
+    state : JointState
+    step : tuple of ndarray
+        Shared increments (c,) and those of each placement (p, l).
+    unknowns : Unknowns
+
+    Returns
+    -------
+    JointState
+    """
+    full = np.zeros(len(unknowns.mask))
+    full[unknowns.mask] = step[0]
+    c = len(state.cameras)
+    head = np.zeros(6)
+    head[AXIS_COLUMNS] = full[:4]
+    sensor = state.sensor + full[4 + 6 * c : 9 + 6 * c]
+    sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
+    count = SWEEPS[unknowns.sweep]
+    sweeps = state.sweeps.copy()
+    sweeps[:, :count] += step[1][:, 6 : 6 + count]
+    return replace(
+        state,
+        head=move_pose(state.head, head),
+        cameras=move_pose(state.cameras, full[4 : 4 + 6 * c].reshape(c, 6)) if c else state.cameras,
+        sensor=sensor,
+        size=state.size + full[9 + 6 * c :],
+        boards=move_pose(state.boards, step[1][:, :6]),
+        sweeps=sweeps,
+        sides=state.sides + step[1][:, 6 + count :] if unknowns.sides else state.sides,
+    )
+
+
+__all__ = [
+    "JointData", "JointState", "SENSOR", "SWEEPS", "Unknowns", "edge_distance", "gather",
+    "joint_blocks", "move_state", "named_blocks", "rays",
+]  # fmt: skip

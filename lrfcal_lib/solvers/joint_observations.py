@@ -1,0 +1,143 @@
+"""Everything a recording says about the whole rig at once: what the joint estimate takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.board import outline_lines
+
+GROUPS = ("face", "beam", "view")
+
+
+@dataclass(frozen=True)
+class JointObservations:
+    """Ranges on boards, beams about their edges and board poses in images, of all placements.
+
+    Every group has an array `<group>_placement` of indices into `placements`. Any group may be empty.
+
+    Attributes
+    ----------
+    placements : ndarray of int, shape (p,)
+        Numbers of the placements.
+    direction : ndarray of int, shape (p,)
+        Sweep direction, +1 or -1; 0 for a single shot.
+    middle : ndarray, shape (p,)
+        Pitch about which a sweep may be stretched, radians.
+    face_range, face_bearing, face_pitch, face_sigma : ndarray, shape (m,)
+        Ranges measured on the board's face (metres), their bearings and recorded pitch (radians), and standard
+        deviations (metres).
+    face_placement : ndarray of int, shape (m,)
+    beam_bearing, beam_pitch : ndarray, shape (n,)
+        Of beams near an edge, radians.
+    beam_hit : ndarray of bool, shape (n,)
+        Whether the beam read the board.
+    beam_edge : ndarray of int, shape (n,)
+        Index into `edges`.
+    beam_radius : ndarray, shape (n,)
+        Of the spot at the board, metres.
+    beam_background : ndarray, shape (n,)
+        See :mod:`lrfcal_lib.solvers.edge_likelihood`.
+    beam_placement : ndarray of int, shape (n,)
+    view_camera : ndarray of int, shape (v,)
+        Index into `cameras`.
+    view_pitch : ndarray, shape (v,)
+        Recorded pitch at the image, radians; only used for cameras on the head.
+    view_pose : ndarray, shape (v, 4, 4)
+        ``T_camera_board`` from the pattern's corners and the board's edges in the image.
+    view_covariance : ndarray, shape (v, 6, 6)
+        Of its increments ``[w, v]``.
+    view_placement : ndarray of int, shape (v,)
+    edges : tuple of str
+    corners : ndarray, shape (e, 2)
+        Outline of the board, metres.
+    cameras, mounts : tuple of str
+        Names, and 'head' or 'platform'.
+    T_head_lrf : RigidTransform or None
+        Stated platform: one of the start values, and the rotation about the axis and shift along it that no data show.
+    """
+
+    placements: np.ndarray
+    direction: np.ndarray
+    middle: np.ndarray
+    face_range: np.ndarray
+    face_bearing: np.ndarray
+    face_pitch: np.ndarray
+    face_sigma: np.ndarray
+    face_placement: np.ndarray
+    beam_bearing: np.ndarray
+    beam_pitch: np.ndarray
+    beam_hit: np.ndarray
+    beam_edge: np.ndarray
+    beam_radius: np.ndarray
+    beam_background: np.ndarray
+    beam_placement: np.ndarray
+    view_camera: np.ndarray
+    view_pitch: np.ndarray
+    view_pose: np.ndarray
+    view_covariance: np.ndarray
+    view_placement: np.ndarray
+    edges: tuple
+    corners: np.ndarray
+    cameras: tuple
+    mounts: tuple
+    T_head_lrf: RigidTransform | None = None
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
+                bad = int((~np.isfinite(value)).sum())
+                raise ValueError(f"{field.name} holds {bad} values that are not finite: leave such observations out")
+        for group in GROUPS:
+            place = getattr(self, f"{group}_placement")
+            if len(place) and not 0 <= place.min() <= place.max() < len(self.placements):
+                raise ValueError(f"{group}_placement are indices below {len(self.placements)}, got up to {place.max()}")
+        if len(self.face_sigma) and self.face_sigma.min() <= 0:
+            raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
+
+    def lines(self):
+        """Sides of the board, see :meth:`lrfcal_lib.board.Board.lines`."""
+        return outline_lines(self.corners)
+
+    def group(self, name):
+        """Fields of one group of observations: dict of arrays without the group's prefix."""
+        return {f.name[len(name) + 1 :]: getattr(self, f.name) for f in fields(self) if f.name.startswith(name + "_")}
+
+    def keep(self, **masks):
+        """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
+        changed = {}
+        for name, mask in masks.items():
+            changed |= {f"{name}_{key}": value[mask] for key, value in self.group(name).items()}
+        return replace(self, **changed)
+
+    def select(self, placements):
+        """The observations of some placements only (for leave-one-out and random halves).
+
+        Parameters
+        ----------
+        placements : iterable of int
+            Numbers of placements.
+
+        Returns
+        -------
+        JointObservations
+        """
+        kept = np.flatnonzero(np.isin(self.placements, np.asarray(list(placements))))
+        new = np.full(len(self.placements), -1)
+        new[kept] = np.arange(len(kept))
+        rows = {name: new[getattr(self, f"{name}_placement")] >= 0 for name in GROUPS}
+        out = self.keep(**rows)
+        moved = {f"{name}_placement": new[getattr(out, f"{name}_placement")] for name in GROUPS}
+        cut = {key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")}
+        return replace(out, **moved, **cut)
+
+    def with_cameras(self, names):
+        """The observations of some cameras only."""
+        kept = [i for i, name in enumerate(self.cameras) if name in names]
+        out = self.keep(view=np.isin(self.view_camera, kept))
+        camera = np.searchsorted(kept, out.view_camera) if kept else out.view_camera
+        chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
+        return replace(out, view_camera=camera, **chosen)

@@ -1,0 +1,291 @@
+"""Can this calibration be trusted, for what error, and what to record next: the first page of a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lrfcal_lib.advice import Suggestion, group_sigma, suggest_placement
+from lrfcal_lib.candidates import outline
+from lrfcal_lib.geometry import DegenerateGeometry
+from lrfcal_lib.solvers.platform import AXIS_NAMES
+from lrfcal_lib.uncertainty import point_sigma, projection_sigma, range_noise
+
+YES, CARE, NO = "yes", "with care", "no"
+FEWEST, FEW = 3, 6  # placements
+PARALLEL = np.radians(6.0)  # normals of the boards about their mean
+SAME_DISTANCE = 0.12  # range of the distances, relative to their median
+SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
+SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
+MISFIT = 4.0  # normalised squared residual, relative to the median placement's
+MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
+STATED = 2.0  # residuals in units of the stated noise
+POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
+BAD = {"mm": 50.0, "px": 25.0}
+FIELD = (np.radians(np.linspace(60, 120, 7)), np.radians(np.linspace(-20, 20, 9)))
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a calibration is not simply to be trusted.
+
+    Attributes
+    ----------
+    answer : {'with care', 'no'}
+    kind : str
+        A key: 'convergence', 'unobservable', 'cameras', 'placements', 'parallel', 'distance', 'pitch', 'image pitch',
+        'misfit', 'excluded', 'model error', 'noise', 'error'.
+    words : str
+    """
+
+    answer: str
+    kind: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a calibration can be trusted.
+
+    Attributes
+    ----------
+    answer : {'yes', 'with care', 'no'}
+    reasons : tuple of Reason
+        The worst first; empty for 'yes'.
+    errors : dict of float to dict of str to float
+        By distance in metres: 'cloud_mm' and, by camera, '<camera>_px', one standard deviation (root mean square over
+        the field), errors of the model included as far as they scatter over placements; inf where nothing bounds them.
+    range_noise_mm : float
+        Of every single point, on top.
+    suggestion : Suggestion or None
+    no_suggestion : str
+        Why there is none.
+    """
+
+    answer: str
+    reasons: tuple
+    errors: dict
+    range_noise_mm: float
+    suggestion: Suggestion | None
+    no_suggestion: str = ""
+
+    def sentences(self):
+        """For the first page: the warning before anything else, the errors, what to record next.
+
+        Returns
+        -------
+        list of str
+        """
+        first = {
+            YES: "This calibration can be trusted.",
+            CARE: "Use this calibration with care: ",
+            NO: "This calibration cannot be trusted: ",
+        }[self.answer]
+        words = [r.words for r in self.reasons]
+        out = [first + ("; ".join(words) + "." if words else "")]
+        out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
+        out.append(
+            "These are single standard deviations of the calibration, with errors of the model as they show between "
+            f"placements; each range has {self.range_noise_mm:.2g} mm of noise of its own."
+        )
+        out.append(self.suggestion.sentence() if self.suggestion else self.no_suggestion)
+        return [sentence for sentence in out if sentence]
+
+
+def _error_words(errors):
+    words = []
+    for name, value in errors.items():
+        what, unit = name.rsplit("_", 1)
+        where = "in the cloud" if what == "cloud" else f"in the image of '{what}'"
+        words.append(f"{value:.2g} {unit} {where}" if np.isfinite(value) else f"no bound {where}")
+    return ", ".join(words)
+
+
+def verdict(solution, models, *, distances=(1.0, 2.0, 5.0), suggest=True, **options):
+    """Judge a joint estimate.
+
+    Parameters
+    ----------
+    solution : JointSolution
+        Solved with ``required=False``, so that weak sessions get here.
+    models : dict of str to CameraModel
+    distances : sequence of float
+        Metres.
+    suggest : bool
+        Also look for the next placement.
+    **options
+        Of :func:`lrfcal_lib.advice.suggest_placement`.
+
+    Returns
+    -------
+    Verdict
+    """
+    errors = {float(d): expected_errors(solution, models, d) for d in distances}
+    reasons = diagnose(solution) + error_reasons(expected_errors(solution, models, 2.0))
+    reasons.sort(key=lambda r: r.answer != NO)
+    answer = NO if any(r.answer == NO for r in reasons) else CARE if reasons else YES
+    suggestion, problem = None, ""
+    if suggest:
+        try:
+            suggestion = suggest_placement(solution, models, **options)
+        except DegenerateGeometry as error:
+            problem = f"No placement can be suggested: {error}."
+    noise = 1000 * range_noise(solution)
+    return Verdict(answer, tuple(reasons), errors, noise, suggestion, problem)
+
+
+def expected_errors(solution, models, distance):
+    """Standard deviations at one distance: 'cloud_mm', and '<camera>_px' of each camera."""
+    out = {"cloud_mm": 1000 * float(point_sigma(solution, *FIELD, distance).rms()[0])}
+    for camera in solution.transforms:
+        out[f"{camera}_px"] = float(projection_sigma(solution, camera, models[camera], distance, (12, 9)).rms()[0])
+    return out
+
+
+def error_reasons(errors):
+    """Errors at 2 m that are too large for anybody."""
+    reasons = []
+    for name, value in errors.items():
+        unit = name.rsplit("_", 1)[1]
+        if not value <= POOR[unit]:
+            answer = CARE if value <= BAD[unit] else NO
+            reasons.append(Reason(answer, "error", f"the expected error at 2 m is {_error_words({name: value})}"))
+    return reasons
+
+
+def diagnose(solution):
+    """Weaknesses of a joint estimate and of the recording behind it.
+
+    Parameters
+    ----------
+    solution : JointSolution
+
+    Returns
+    -------
+    list of Reason
+    """
+    checks = (
+        _convergence, _cameras, _unobservable, _placements, _pitch, _parallel, _distances, _misfit, _excluded,
+        _model_error, _noise,
+    )  # fmt: skip
+    return [reason for check in checks for reason in check(solution)]
+
+
+def _convergence(solution):
+    if not solution.converged:
+        n = solution.solution.iterations
+        yield Reason(NO, "convergence", f"the estimate has not converged after {n} iterations")
+
+
+def _cameras(solution):
+    """Cameras that see no board, or hardly any."""
+    view = solution.data.view
+    for number, name in enumerate(solution.transforms):
+        seen = int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
+        if seen == 0:
+            yield Reason(NO, "cameras", f"camera '{name}' never sees the board: nothing is known about it")
+        elif seen < FEWEST:
+            yield Reason(CARE, "cameras", f"camera '{name}' sees the board in {seen} placements only")
+
+
+def _unobservable(solution):
+    if solution.unobservable:
+        yield Reason(NO, "unobservable", "the data do not determine " + "; ".join(solution.unobservable))
+
+
+def _placements(solution):
+    n = len(solution.boards)
+    if n < FEW:
+        words = f"{n} placements only, {FEW} or more are needed to see errors of the model"
+        yield Reason(NO if n < FEWEST else CARE, "placements", words)
+
+
+def _pitch(solution):
+    """Range of the pitch in the whole recording, and among the images of a placement."""
+    if not any(name in solution.solution.names for name in AXIS_NAMES):
+        return
+    data = solution.data
+    head_views = data.view["used"] & data.on_head[data.view["camera"]] if len(data.on_head) else data.view["used"]
+    parts = [(data.face["pitch"], data.face["used"]), (data.view["pitch"], head_views)]
+    pitches = np.concatenate([pitch[used] for pitch, used in parts])
+    if len(pitches) == 0 or np.ptp(pitches) < SMALL_PITCH:
+        span = np.degrees(np.ptp(pitches)) if len(pitches) else 0.0
+        words = f"the recorded pitch ranges over {span:.1f} deg only: the tilt axis is hardly determined"
+        yield Reason(NO, "pitch", words)
+        return
+    if head_views.any():
+        spans = [np.ptp(p[u]) for p, u in zip(data.view["pitch"], head_views, strict=True) if u.any()]
+        if max(spans) < SMALL_IMAGE_PITCH:
+            words = "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"
+            yield Reason(CARE, "image pitch", words)
+
+
+def _parallel(solution):
+    normals = solution.state.boards[:, :, 2]
+    mean = normals.mean(axis=0) / np.linalg.norm(normals.mean(axis=0))
+    off = np.arccos(np.clip(normals @ mean, -1, 1)).max()
+    if off < PARALLEL and len(normals) > 1:
+        words = f"all boards are parallel (within {np.degrees(off):.1f} deg): lean them every way by 20 deg and more"
+        yield Reason(CARE, "parallel", words)
+
+
+def _distances(solution):
+    """Spread of the distances of the boards' middles from the head."""
+    middle = board_middles(solution)
+    distance = np.linalg.norm(middle - solution.T_head_lrf.translation, axis=1)
+    if len(distance) > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
+        words = (
+            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): errors elsewhere are "
+            "extrapolated, and the range offset is hard to tell from shifts"
+        )
+        yield Reason(CARE, "distance", words)
+
+
+def board_middles(solution):
+    """Middles of the boards in the platform frame, shape (p, 3), metres."""
+    middle = np.append(outline(solution).mean(axis=0), 0.0)
+    return solution.state.boards[:, :, :3] @ middle + solution.state.boards[:, :, 3]
+
+
+def _misfit(solution):
+    found = solution.misfit
+    level = max(np.median(list(found.values())), 1.0) if found else 1.0
+    bad = [p for p, value in found.items() if value > MISFIT * level]
+    if bad:
+        words = ", ".join(f"{p} ({np.sqrt(found[p] / level):.1f} times)" for p in bad)
+        yield Reason(CARE, "misfit", f"placements fit much worse than the others: {words}")
+
+
+def _excluded(solution):
+    if solution.excluded:
+        yield Reason(CARE, "excluded", "; ".join(solution.excluded.values()))
+
+
+def _model_error(solution):
+    """Scatter over placements against the propagated noise."""
+    clustered = solution.solution.covariance_placements
+    if clustered is None:
+        return
+    plain, scatter = group_sigma(solution.solution.covariance, solution), group_sigma(clustered, solution)
+    worst = max(plain, key=lambda name: scatter[name] / max(plain[name], 1e-12))
+    ratio = scatter[worst] / max(plain[worst], 1e-12)
+    if ratio > MODEL_ERROR:
+        what = "the axis" if worst == "axis" else f"camera '{worst}'"
+        words = f"placements disagree about {what} {ratio:.1f} times more than the noise explains: an error of the model"
+        yield Reason(CARE, "model error", words)
+
+
+def _noise(solution):
+    """Residuals much larger than the stated noise."""
+    found = {"ranges": solution.noise.get("face_scale", 1.0)}
+    found |= {f"images of '{c}'": solution.noise.get(f"view_scale_{c}", 1.0) for c in solution.transforms}
+    overall = np.sqrt(np.median(list(solution.misfit.values()))) if solution.misfit else 1.0
+    large = [f"{name} {scale:.1f} times" for name, scale in found.items() if scale > STATED]
+    if not large and overall > STATED:
+        large = [f"all together {overall:.1f} times"]
+    if large:
+        yield Reason(CARE, "noise", "residuals are larger than the stated noise (" + ", ".join(large) + ")")
+
+
+__all__ = ["CARE", "NO", "Reason", "Verdict", "YES", "board_middles", "diagnose", "expected_errors", "verdict"]

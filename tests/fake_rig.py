@@ -1,0 +1,228 @@
+"""A rig without hardware and without threads: devices with the drivers' calls, their own clock, and known truth."""
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+
+from lrfcal_lib.drivers.errors import DeviceError, NoReply
+from lrfcal_lib.drivers.lms2xx import encode_words, scan_quarters
+from lrfcal_lib.drivers.lms2xx_replies import Configuration
+from lrfcal_lib.drivers.rig import Rig
+from lrfcal_lib.drivers.rig_file import checked, rig_of
+
+SIZE = (32, 24)
+BEAMS = 101  # 100 deg in steps of 1 deg
+BEARINGS = np.radians(scan_quarters(BEAMS) / 4)
+SCAN_S = 0.02
+LAZY_S = 0.013  # from the question to the first beam
+
+
+@dataclass(frozen=True)
+class Reading:
+    """As of the driver."""
+
+    telegrams: tuple
+    ranges: np.ndarray
+    bearings: np.ndarray
+    time_s: float
+    beam_times_s: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """As of the driver."""
+
+    image: np.ndarray
+    time_s: float
+    index: int
+
+
+class Clock:
+    """Time that passes when the devices let it pass."""
+
+    def __init__(self, now=1000.0):
+        self.now = now
+
+    def __call__(self):
+        return self.now
+
+
+def telegram(pitch):
+    """What the fake device sends at a pitch: a wall that differs for every pitch."""
+    words = 2000 + np.arange(BEAMS) + round(math.degrees(pitch) * 40) % 4000
+    return encode_words(words.astype(np.uint16), unit="mm")
+
+
+def picture(pitch, camera="left"):
+    """What a fake camera sees at a pitch."""
+    rng = np.random.default_rng([round(math.degrees(pitch) * 100) + 100000, len(camera)])
+    return rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+
+
+class Device:
+    """A context manager that is closed at the end."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+
+class Head(Device):
+    """Moves at 20 deg/s; answers unless it is told not to."""
+
+    def __init__(self, clock, feedback=True, silent_moving=False):
+        self.clock, self.has_feedback, self.silent_moving = clock, feedback, silent_moving
+        self.at, self.stops, self.track, self.sweep, self.fail = 0.0, 0, [], None, None
+        self.speed = math.radians(20)
+
+    def move_to(self, pitch, timeout=None):
+        if self.fail is not None:
+            raise self.fail
+        self.clock.now += abs(pitch - self.at) / self.speed + 0.3
+        self.at = pitch
+        return pitch
+
+    def start_sweep(self, stop_at, speed=None):
+        self.sweep = (self.clock(), self.at, stop_at)
+        self.track = []
+        self.note()
+
+    def true(self, instant):
+        """Pitch at an instant of the sweep."""
+        begun, first, last = self.sweep
+        return first + np.sign(last - first) * np.clip(self.speed * (instant - begun), 0, abs(last - first))
+
+    def note(self):
+        """Append to the track; a head that arrived meanwhile is noted when it did."""
+        begun, first, last = self.sweep
+        arrives = begun + abs(last - first) / self.speed
+        before = self.track[-1][0] if self.track else -math.inf
+        for instant in [arrives, self.clock()] if before < arrives < self.clock() else [self.clock()]:
+            resting = instant == begun or instant >= arrives
+            measured = self.has_feedback and (resting or not self.silent_moving)
+            # between readings a head that moves is only reckoned, badly: nobody may use that where readings exist
+            wrong = 0.0 if measured or not self.has_feedback else math.radians(3)
+            self.track = [*self.track, (instant, float(self.true(instant)) + wrong, measured)]
+
+    def moving(self):
+        if self.sweep is None:
+            return False
+        if self.fail is not None:
+            raise self.fail
+        self.note()
+        return abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
+
+    def finish_sweep(self, timeout=None):
+        self.clock.now += 0.05
+        self.note()
+        self.at, self.sweep_done, self.sweep = self.sweep[2], self.sweep, None
+        return self.track
+
+    def stop(self):
+        self.stops += 1
+
+    def close(self):
+        self.stop()
+
+
+class Lrf(Device):
+    """Scans the wall at the head's pitch."""
+
+    type, firmware, variant, port = "LMS221", "X01.27", (100.0, 1.0), "/dev/fake"
+
+    def __init__(self, head, clock):
+        self.head, self.clock, self.streaming, self.silent, self.stale = head, clock, False, False, 0.0
+        self.configuration = Configuration().changed(measuring_mode=0, unit="mm")
+        self.readings, self.wait = [], None
+
+    def start(self, interlaced=False):
+        self.streaming = True
+
+    def stop(self):
+        self.streaming = False
+
+    def close(self):
+        self.stop()
+
+    def _scan(self, instant):
+        pitch = self.head.at if self.head.sweep is None else float(self.head.true(instant))
+        if self.head.sweep is not None:
+            self.head.note()
+            time.sleep(0.01)  # a batch of a sweep ends by the real time
+        times = instant + (np.arange(BEAMS) / 360) * 0.0133
+        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0), BEARINGS, instant, times)
+        self.readings.append(reading)
+        return reading
+
+    def newest(self, after=None, timeout=2.0):
+        return self.take(1, after)[0]
+
+    def take(self, count, after=None, timeout=None):
+        if not self.streaming:
+            raise DeviceError("the device does not stream; call start() first")
+        out = []
+        for _ in range(count):
+            if self.wait is not None:
+                self.wait()
+            if self.silent:
+                self.clock.now += timeout or 2.0
+                raise NoReply("no new scan: the stream is silent")
+            instant = (self.clock() if after is None else max(after, self.clock())) + LAZY_S - self.stale
+            out.append(self._scan(instant))
+            self.clock.now = max(self.clock.now, instant + SCAN_S)
+        return out
+
+
+class Camera(Device):
+    """Sees noise that depends on the pitch."""
+
+    def __init__(self, name, head, clock):
+        self.name, self.head, self.clock, self.count = name, head, clock, 0
+        self.show = picture
+
+    def newest(self, after=None, timeout=5.0):
+        self.clock.now += 0.04
+        self.count += 1
+        return Frame(self.show(self.head.at, self.name), self.clock(), self.count)
+
+    def close(self):
+        pass
+
+
+def rig_data(cameras=("left",), **plan):
+    """A rig file as parsed JSON; keyword arguments go to the plan."""
+    edges = ["a", "b", "c"]
+    board = {"name": "triangle", "edges": edges, "features": edges[:2], "corners_m": [[0, 0], [0.4, 0], [0, 0.3]],
+             "pattern": {"kind": "chessboard", "columns": 4, "rows": 5, "square_m": 0.03}}  # fmt: skip
+    lrf = {"model": "LMS221", "field_of_view_deg": [40, 140], "bearing_step_deg": 1.0, "sigma_range_m": 0.01}
+    named = {c: {"mount": "head", "width": SIZE[0], "height": SIZE[1], "intrinsics": None} for c in cameras}
+    return {
+        "board": board,
+        "rig": {"lrf": lrf, "platform": {"T_head_lrf": None}, "cameras": named},
+        "devices": {
+            "lrf": {"port": "/dev/fake_lrf", "variant": [100, 1], "unit": "mm"},
+            "head": {"port": "/dev/fake_head"},
+            "cameras": {c: {"source": 0} for c in cameras},
+        },
+        "plan": {"pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "count": 3, **plan},
+    }
+
+
+def make_rig(data=None, *, feedback=True, silent_moving=False):
+    """An open rig of fakes."""
+    clock = Clock()
+    stated = checked(rig_of(json.loads(json.dumps(data or rig_data()))))
+    head = Head(clock, feedback, silent_moving)
+    cameras = {name: Camera(name, head, clock) for name in stated.cameras}
+    return Rig(stated, Lrf(head, clock), head, cameras, clock=clock)
+
+
+def opened(rig):
+    """Stands in for the class Rig where a program opens one."""
+    return SimpleNamespace(open=lambda stated, **options: rig)

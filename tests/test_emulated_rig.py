@@ -1,0 +1,262 @@
+"""The emulated rig: one world behind all devices, its cameras, its control socket, and the command line."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import serial
+
+from lrfcal_lib.drivers.control import ask
+from lrfcal_lib.drivers.emulators import EmulatedRig, Head
+from lrfcal_lib.drivers.emulators.camera import CameraServer, scaled
+from lrfcal_lib.drivers.emulators.line import Clock
+from lrfcal_lib.drivers.emulators.run import main
+from lrfcal_lib.drivers.emulators.world import EmulatedWorld
+from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
+from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.session.stated import parse_session
+from lrfcal_lib.simulate import beam as lrf
+from lrfcal_lib.simulate.placements import Placement
+from lrfcal_lib.simulate.record import placements_of, world_of
+from lrfcal_lib.simulate.setups import sim_quick
+
+DEADLINE = 180.0  # s, against hanging
+QUARTERS = np.arange(160, 561)
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return sim_quick()
+
+
+@pytest.fixture(scope="module")
+def placements(setup):
+    return placements_of(setup)
+
+
+@pytest.fixture
+def world(setup, placements):
+    return EmulatedWorld(setup, Clock(), placements=placements)
+
+
+def until(condition, what):
+    end = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < end, f"{what} did not happen"
+        time.sleep(0.02)
+
+
+def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch(world, setup, placements):
+    world.put(1)
+    beam, pitch = setup.rig.beam, float(np.mean(placements[0].sweep))
+    world.head = Head(setup.rig.platform, pitch=pitch)
+    times = 1.0 + beam.beam_times()
+    scans = np.array([world.scan(0, QUARTERS, times)[0] for _ in range(60)])
+    true = world.head.pitch(1.0)
+    ideal = lrf.ideal_readings(beam, world_of(setup, placements[0].T_platform_board), beam.bearings(),
+                               np.full(401, true), setup.rig.T_head_lrf)[0]  # fmt: skip
+    error = scans - beam.systematic - ideal
+    assert np.nanstd(error) == pytest.approx(beam.sigma_range, rel=0.05)
+    assert abs(np.nanmean(error)) < 5 * beam.sigma_range / np.sqrt(error.size)
+
+
+def test_beams_of_a_moving_head_see_its_pitch_at_their_instants(world, setup):
+    world.put(1)
+    world.head.move(0.0, 0.5, 0.5)
+    times = 0.5 + setup.rig.beam.beam_times()
+    found, reasons, pitch = world.scan(0, QUARTERS, times)
+    ideal = lrf.ideal_readings(setup.rig.beam, world._scene[1], np.radians(QUARTERS / 4), world.head.pitch(times),
+                               setup.rig.T_head_lrf)[0]  # fmt: skip
+    good = reasons == 0
+    assert pitch == pytest.approx(world.head.pitch([times.min(), times.max()])) and np.ptp(pitch) > 0.01
+    assert np.abs(found - ideal - setup.rig.beam.systematic)[good].max() < 6 * setup.rig.beam.sigma_range
+
+
+def test_what_gives_no_range_has_its_reason(world):
+    world.put(None)
+    world.head = Head(pitch=np.radians(35))  # into the lamps
+    _, reasons, _ = world.scan(0, QUARTERS, np.full(401, 1.0))
+    assert set(np.unique(reasons)) <= {REASONS.index(r) for r in ("valid", "not valid", "dazzled", "noise")}
+
+
+def test_places(world, setup, placements):
+    world.put(2)
+    assert world.place.T_platform_board is placements[1].T_platform_board
+    world.hold_close("left", 3)
+    close = setup.rig.camera_pose(setup.rig.cameras[0], 0.0) * world.place.T_platform_board
+    assert setup.rig.shows(setup.rig.cameras[0], close, setup.rig.board.pattern.points())
+    assert 0.1 < close.translation[2] < 1.0 and not world.place.stand
+    world.put(None)
+    assert world.truth()["place"] == ["placement", None] and set(world.truth()["boards"]) == {1, 2, 3, 4}
+    with pytest.raises(ValueError, match="no placement 9; there are 1, 2, 3, 4, and none"):
+        world.put(9)
+    with pytest.raises(ValueError, match="no view 99 of camera 'left'"):
+        world.hold_close("left", 99)
+    with pytest.raises(ValueError, match="no view 0 of camera 'middle'"):
+        world.hold_close("middle", 0)
+
+
+def test_images_of_another_width_show_the_same(setup):
+    small = scaled(setup.rig, 320)
+    for a, b in zip(small.cameras, setup.rig.cameras, strict=True):
+        assert (a.model.width, a.model.height) == (320, 240) and a.model.fx == b.model.fx / 2
+        assert (a.model.cx + 0.5) / a.model.fx == pytest.approx((b.model.cx + 0.5) / b.model.fx)
+    with pytest.raises(ValueError, match="both must be even"):
+        scaled(setup.rig, 333)
+
+
+@pytest.fixture(scope="module")
+def rig(setup, placements):
+    with EmulatedRig(setup, placements=placements, image_width=64, platform={"settle": 0.1}) as rig:
+        yield rig
+    assert rig.error() is None and not rig.folder.exists()
+
+
+def test_cameras_open_as_any_stream_and_show_the_place(rig):
+    rig.place(1)
+    video = cv2.VideoCapture(rig.camera_urls["left"])
+    assert video.isOpened()
+    ok, first = video.read()
+    assert ok and first.shape == (48, 64, 3)
+    rig.place(None)
+    until(lambda: np.abs(video.read()[1].astype(int) - first).mean() > 3, "an image without the board")
+    video.release()
+
+
+def test_one_image_and_wrong_names(rig):
+    data = urllib.request.urlopen(rig.camera_urls["right"].replace("mjpg", "jpg"), timeout=DEADLINE).read()
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (48, 64, 3)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(rig.camera_urls["right"].replace("right", "up"), timeout=DEADLINE)
+
+
+def test_no_image_while_the_head_moves(rig):
+    """A new one afterwards, which shows the new pitch."""
+    cameras, head = rig._cameras, rig.world.head
+    until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
+    before = cameras.image("left", timeout=DEADLINE)[0]
+    head.move(rig.clock.now(), head.measured(rig.clock.now()) + 0.2, 0.2)
+    assert cameras.image("left", timeout=0.3) == (None, None)
+    after = cameras.image("left", timeout=DEADLINE)[0]
+    assert after[2] == pytest.approx(before[2] + 0.2, abs=0.01) and head.settled(rig.clock.now())
+
+
+def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
+    """The drawing process is replaced by one that ends when it is told."""
+    from concurrent.futures import Future
+
+    world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
+    server, asked = CameraServer(world), []
+
+    def submit(function, index, place, pitch, *_):
+        asked.append((pitch, Future()))
+        return asked[-1][1]
+
+    server._pool.submit = submit
+    until(lambda: server.image("left", timeout=0.05) == (None, None) and asked, "the wish for an image")
+    world.head.go(world.clock.now(), 0.05, 2.0)
+    asked[0][1].set_result(b"old")
+    until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1, "the wish for a new one")
+    asked[-1][1].set_result(b"new")
+    assert server.image("left", timeout=DEADLINE)[1] == b"new"
+    server.start()
+    server.close()
+
+
+def test_control_socket(rig):
+    assert ask(rig.control, "place 2") == {} and rig.truth()["place"] == ["placement", 2]
+    assert ask(rig.control, {"command": "place", "arguments": ["none"]}) == {}
+    assert ask(rig.control, "close right 1") == {} and rig.world.place.key == ("close", "right", 1)
+    assert ask(rig.control, "fault head mute 2") == {"armed": ["mute"]}
+    assert ask(rig.control, "clear") == {} and not rig.faults["head"].armed
+    assert ask(rig.control, "faults")["counts"] == {"lrf": {}, "head": {}}
+    assert [p["number"] for p in ask(rig.control, "placements")["placements"]] == [1, 2, 3, 4]
+    assert ask(rig.control, "status")["lrf"]["baudrate"] == rig.lrf.baudrate
+    assert "T_head_lrf" in ask(rig.control, "truth")["truth"] and len(ask(rig.control, "help")["commands"]) == 9
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [("dance", "no command 'dance'"), ("place", "no placement|none"), ("place x", "invalid literal"),
+     ("fault wheel drop", "no device 'wheel'"), ("fault lrf stall", "no fault 'stall'"), ("{", "Expecting property"),
+     ("close left", "missing"), ('{"arguments": []}', "command")],
+)  # fmt: skip
+def test_control_refuses(rig, line, match):
+    if line == "place":  # no number is no board
+        assert ask(rig.control, line) == {}
+        return
+    with pytest.raises(ValueError, match=match):
+        ask(rig.control, line)
+
+
+def test_the_devices_share_one_world(rig):
+    """The head moves by Pelco-D, and the scans that leave the other port are of where it then is."""
+    rig.place(1)
+    head, port = serial.Serial(rig.head_port, 2400), serial.Serial(rig.lrf_port, 9600, timeout=0.2)
+    head.write(bytes.fromhex("FF 01 00 4D 01 F4 43"))  # 5 deg down
+    until(lambda: rig.world.head.settled(rig.clock.now()) and rig.pitch() < -0.08, "the move")
+    before, data, end = len(rig.scans), b"", time.monotonic() + DEADLINE
+    while not len(split_stream(data).offset) and time.monotonic() < end:
+        port.write(bytes.fromhex("02 00 02 00 30 01 31 18"))
+        data += port.read(740) + port.read(740) + port.read(740) + port.read(740) + port.read(740)
+    record = rig.scans[before]
+    assert record.telegram in data
+    assert np.degrees(record.pitch_rad) == pytest.approx(-5.0, abs=0.2)
+    assert rig.pitch(record.time_s) == pytest.approx(record.pitch_rad[0])
+    head.close()
+    port.close()
+
+
+def test_rig_file_states_what_a_session_states(rig, setup, tmp_path):
+    (tmp_path / "rig.json").write_text(json.dumps(rig.rig_file()))
+    stated = json.loads((tmp_path / "rig.json").read_text())
+    assert len(read_rig_file(tmp_path / "rig.json").plan.to_do()) == 4
+    parsed = parse_session({**stated, "placements": [1]})
+    assert parsed["board"].name == setup.rig.board.name and parsed["cameras"]["left"].width == 64
+    assert stated["devices"]["lrf"]["port"] == rig.lrf_port and stated["devices"]["lrf"]["variant"] == [100, 0.25]
+    assert stated["devices"]["head"]["pitch_limits_deg"] == [-60, 45]
+    assert stated["plan"]["placements"][1]["pitch_deg"][0] > stated["plan"]["placements"][1]["pitch_deg"][1]
+    low, high, step = stated["plan"]["pitch_deg"]
+    assert all(low <= min(p["pitch_deg"][:2]) and max(p["pitch_deg"][:2]) <= high for p in stated["plan"]["placements"])
+    assert step == 0.25
+
+
+def test_own_placements_and_unknown_setups(setup, tmp_path):
+    mine = [Placement(7, placements_of(setup)[0].T_platform_board, (-0.1, 0.1), (0.0,))]
+    with EmulatedRig(setup, placements=mine, cameras=False, folder=tmp_path / "rig") as rig:
+        rig.place(7)
+        assert rig.rig_file()["rig"]["cameras"] == {} and (tmp_path / "rig" / "lrf").is_symlink()
+    assert list((tmp_path / "rig").iterdir()) == []
+    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
+        EmulatedRig("x")
+    with pytest.raises(ValueError, match="time_scale"):
+        main(["sim_quick", "--no-cameras", "--time-scale", "0"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_line_cleans_up(tmp_path, number):
+    file, folder = tmp_path / "rig.json", tmp_path / "ports"
+    code = "import sys; from lrfcal_lib.drivers.emulators.run import main; sys.exit(main(sys.argv[1:]))"
+    call = [sys.executable, "-c", code, "--no-cameras", "--rig-file", str(file), "--folder", str(folder)]
+    run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
+    until(lambda: file.exists() or run.poll() is not None, "the rig file")
+    for _ in range(7):
+        line = run.stdout.readline()
+        if "boards" in line:
+            break
+    devices = json.loads(file.read_text())["devices"]
+    port = serial.Serial(devices["lrf"]["port"], 9600, timeout=DEADLINE)
+    port.write(bytes.fromhex("02 00 01 00 3A 1E 12"))
+    assert port.read(30)[5:6] == b"\xba"
+    assert ask(devices["control"], "place 1") == {}
+    run.send_signal(number)
+    assert "the emulated rig is gone" in run.communicate(timeout=DEADLINE)[0] and run.returncode == 0
+    assert not file.exists() and list(folder.iterdir()) == []
+    port.close()

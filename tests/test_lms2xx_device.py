@@ -1,0 +1,691 @@
+"""The LMS2xx on a port: finding it, setting it up, scans and their instants; against the emulated device."""
+
+import errno
+import os
+import threading
+import time
+import tty
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import serial
+
+from lrfcal_lib.drivers import lms2xx_link, serial_port
+from lrfcal_lib.drivers.emulators import EmulatedLms
+from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
+from lrfcal_lib.drivers.lms2xx_device import LMS2xx
+from lrfcal_lib.drivers.lms2xx_link import TURN_S, Link, interval_s, transfer_s
+from lrfcal_lib.drivers.lms2xx_replies import Configuration
+from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock
+from lrfcal_lib.drivers.serial_port import open_port, set_rate
+
+INDEXED = Configuration().changed(unit="mm", realtime_indices=True)
+DEADLINE_S = 30  # guards against hanging only; a loaded machine is slow
+
+
+@pytest.fixture
+def emulated(tmp_path):
+    """Function (**options) -> EmulatedLms that is running, at 38400 Bd with indices unless told otherwise."""
+    made = []
+
+    def make(**options):
+        options = {"baudrate": 38400, "configuration": INDEXED, "seed": 1, "boot_s": 0.5} | options
+        made.append(EmulatedLms(path=tmp_path / f"lrf{len(made)}", **options).start())
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def wire():
+    """A pseudo-terminal: descriptor of the far end, path of the near one."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    os.set_blocking(far, False)
+    yield far, os.ttyname(near)
+    for end in (far, near):
+        try:
+            os.close(end)
+        except OSError:  # a test closed it
+            continue
+
+
+def commands(device):
+    """Codes of the requests that an emulated device understood."""
+    return [raw[4] for _, raw in device.requests]
+
+
+def record_of(device, reading):
+    """The emulated device's own records of the telegrams of a reading."""
+    by_telegram = {one.telegram: one for one in device.scans}
+    return [by_telegram[raw] for raw in reading.telegrams]
+
+
+def wait_for(condition):
+    """Wait until a condition holds."""
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, "the condition never came true"
+        time.sleep(0.01)
+
+
+# ------------------------------------------------------------------------------------------------------- ports
+
+
+def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch):
+    with pytest.raises(PortError, match=r"there is no port .*nowhere: check cable and power; present are "):
+        open_port(tmp_path / "nowhere", 9600, timeout=0)
+    with pytest.raises(PortError, match="/dev/null is no serial line"):
+        open_port("/dev/null", 9600, timeout=0)
+    held = open_port(wire[1], 9600, timeout=0)
+    with pytest.raises(PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"):
+        open_port(wire[1], 9600, timeout=0)
+    held.close()
+    monkeypatch.setattr(serial_port, "_holder", lambda path: "another program")
+
+    def forbidden(*_, **__):
+        raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
+
+    monkeypatch.setattr(serial_port.serial, "Serial", forbidden)
+    with pytest.raises(PortError, match="no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout"):
+        open_port("/dev/ttyUSB0", 9600, timeout=0)
+
+
+def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wire, monkeypatch):
+    with open_port(wire[1], 19200, timeout=0) as port:
+        for rate in (9600, 38400, 500000, 19200):
+            set_rate(port, rate)
+        with pytest.raises(PortError, match="does not take 12345 Bd"):
+            set_rate(port, 12345)
+        with pytest.raises(PortError, match="cannot do -1 Bd"):
+            set_rate(port, -1)
+        real = serial_port.termios.tcgetattr
+        monkeypatch.setattr(serial_port.termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
+        with pytest.raises(PortError, match="does not take 500000 Bd.*RS-422 interface"):
+            set_rate(port, 500000)
+        assert port.baudrate == 19200
+
+
+def test_a_port_that_vanishes_is_a_lost_line(wire):
+    link = Link(wire[1], 38400, dict.fromkeys(("telegrams", "crc_errors", "resyncs"), 0))
+    os.close(wire[0])
+    for action in (link.receive, lambda: link.send(0x31), lambda: link.set_rate(9600)):
+        with pytest.raises(LineLost, match="is lost.*check plug and power"):
+            action()
+    link.close()
+
+
+# -------------------------------------------------------------------------------------------------------- link
+
+
+def make_link(path, rate=38400):
+    return Link(path, rate, dict.fromkeys(("telegrams", "crc_errors", "resyncs"), 0))
+
+
+def received(link, far, data):
+    """What the link makes of bytes."""
+    os.write(far, data)
+    out = []
+    while True:
+        found = link.receive()
+        out += found
+        if link.silent_s > 0.1 and not found:
+            return [one.raw for one in out]
+
+
+def test_telegrams_come_out_of_any_bytes(wire):
+    link, raw = make_link(wire[1]), encode_scan(np.linspace(1, 8, 181))
+    other = encode_telegram(0xB2, status=16, address=0x85)
+    bad = raw[:100] + bytes([raw[100] ^ 4]) + raw[101:]
+    assert received(link, wire[0], raw[50:] + b"\x06" + raw + b"\x02\x80" + bad + other + raw) == [raw, other, raw]
+    assert link.counts["crc_errors"] == 1 and link.counts["telegrams"] == 3
+    link.senders = {0x80}
+    assert received(link, wire[0], other + raw) == [raw]
+    assert received(link, wire[0], raw[:9]) == [] and received(link, wire[0], raw[9:]) == [raw]
+    link.close()
+
+
+def test_acknowledgements_count_only_where_they_can_be_ones(wire):
+    link = make_link(wire[1])
+    for data, acknowledged, declined in (
+        (b"\x06", True, False),
+        (b"\x15", False, True),
+        (b"\x33\x15", False, True),
+        (b"\x15\x33", False, False),
+        (encode_telegram(0x31) + b"\x06", True, False),  # an echo, which holds 15 itself
+        (encode_telegram(0xB2, b"\x15", status=0x15), False, False),
+        (b"\x15" + encode_telegram(0xB2, status=0x10)[:4], False, False),
+    ):
+        link.send(0x20, b"\x25")
+        received(link, wire[0], data)
+        assert (link.acknowledged, link.declined) == (acknowledged, declined), data
+    link.close()
+
+
+def test_bytes_are_paced_at_500000_baud_only(wire, monkeypatch):
+    for rate, writes in ((38400, 1), (500000, 8)):
+        link, times = make_link(wire[1], rate), []
+        write = link._port.write
+
+        def timed(data, times=times, write=write):
+            times.append(time.monotonic())
+            write(data)
+
+        monkeypatch.setattr(link._port, "write", timed)
+        link.send(0x20, b"\x25")
+        assert len(times) == writes and np.all(np.diff(times) >= 75e-6)
+        assert os.read(wire[0], 100) == encode_telegram(0x20, b"\x25")
+        link.close()
+
+
+def test_nobody_there_and_somebody_else_are_told_apart(wire):
+    begin = time.monotonic()
+    with pytest.raises(NoReply, match="no reply at 38400, 9600, 19200, 500000 Bd: check power.*crossed.*RS-422"):
+        LMS2xx.open(wire[1], find_s=1.2)
+    assert time.monotonic() - begin < DEADLINE_S
+    talking = threading.Event()
+
+    def talk():
+        while not talking.wait(0.05):
+            os.write(wire[0], b"$GPGGA,12,,*4A\r\n")
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    with pytest.raises(WrongDevice, match="bytes arrive, but no telegram of an LMS2xx"):
+        LMS2xx.open(wire[1], find_s=1.2)
+    talking.set()
+    thread.join()
+
+
+def test_a_device_of_another_type_is_refused(emulated):
+    with pytest.raises(WrongDevice, match="'LMX400' answers, not an LMS2xx"):
+        LMS2xx.open(emulated(model="LMX400;302063;X01.27 ").path)
+
+
+# ----------------------------------------------------------------------------------------------- finding the rate
+
+
+def _streaming(device, path):
+    with serial.Serial(path, device.baudrate) as port:
+        port.write(encode_telegram(0x20, b"\x24"))
+        wait_for(lambda: device.streaming)
+
+
+def _interlaced(device, path):
+    with serial.Serial(path, device.baudrate) as port:
+        port.write(encode_telegram(0x20, b"\x2a"))
+        wait_for(lambda: device.streaming)
+
+
+def _installing(device, path):
+    with serial.Serial(path, device.baudrate) as port:
+        port.write(encode_telegram(0x20, b"\x00SICK_LMS"))
+        wait_for(lambda: device.memory.mode == 0)
+
+
+def _half_a_telegram(device, path):
+    with serial.Serial(path, device.baudrate) as port:
+        port.write(encode_telegram(0x77, bytes(34))[:20])
+        port.flush()
+
+
+PAST = {"quiet": lambda *_: None, "stream": _streaming, "interlaced": _interlaced, "installation": _installing,
+        "half a telegram": _half_a_telegram}  # fmt: skip
+
+
+@pytest.mark.parametrize("rate", [9600, 19200, 38400, 500000])
+def test_the_device_is_found_at_any_rate_whatever_it_was_doing(emulated, rate):
+    def find(past, device):
+        PAST[past](device, device.path)
+        with LMS2xx.open(device.path) as lms:
+            assert (lms.baudrate, lms.type, lms.firmware, lms.variant) == (rate, "LMS221-302063", "X01.27", (180, 0.5))
+            return past, device.streaming, device.memory.mode
+
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(find, PAST, [emulated(baudrate=rate) for _ in PAST]))
+    assert found == [(past, False, 0x25) for past in PAST]
+
+
+def test_opening_switches_to_the_rate_wanted_and_no_flash_is_written(emulated):
+    device = emulated(baudrate=9600)
+    with LMS2xx.open(device.path, baudrate=500000) as lms:
+        assert lms.baudrate == device.baudrate == 500000
+        assert lms.read_status().baud == 500000 and lms.status.laser_on
+        assert lms.read_errors() == []
+    assert device.memory.flash_writes == 0
+
+
+def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(emulated):
+    device = emulated(address=3)
+    for address in (0, 3):
+        with LMS2xx.open(device.path, address=address) as lms:
+            assert lms.status.address == 3 and len(lms.request().ranges) == 361
+
+
+def test_bad_arguments_are_refused_before_the_port_is_touched():
+    for options, message in (
+        ({"baudrate": 57600}, "an LMS2xx has 9600, 19200, 38400, 500000 Bd, got 57600"),
+        ({"address": 128}, "an address is 0 to 127, got 128"),
+        ({"password": b"SICK"}, "a password has 8 bytes, got 4"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            LMS2xx.open("/dev/nowhere", **options)
+
+
+# ------------------------------------------------------------------------------------------------------ settings
+
+
+def test_only_what_differs_is_set(emulated):
+    device = emulated(configuration=Configuration())
+    with LMS2xx.open(device.path) as lms:
+        assert not lms.configure(unit="cm", measuring_mode=0, realtime_indices=False)
+        assert not lms.set_variant(180, 0.5)
+        assert not {0x77, 0x3B} & set(commands(device)) and device.memory.flash_writes == 0
+        block = device.memory.configuration.block
+        assert lms.configure(unit="mm", measuring_mode=4, realtime_indices=True)
+        assert not lms.configure(unit="mm", measuring_mode=4) and device.memory.flash_writes == 1
+        now = device.memory.configuration
+        assert (now.unit, now.measuring_mode, now.realtime_indices) == ("mm", 4, True) and now == lms.configuration
+        assert now.changed(unit="cm", measuring_mode=0, realtime_indices=False).block == block
+        assert device.memory.mode == 0x25
+        assert lms.set_variant(100, 1) and not lms.set_variant(100, 1)
+        assert lms.variant == (100, 1) and len(lms.request().ranges) == 101
+        with pytest.raises(ValueError, match="variants are 100/1.*got 180/0.25"):
+            lms.set_variant(180, 0.25)
+        with pytest.raises(ValueError, match="unit is one of .*got 'inch'"):
+            lms.configure(unit="inch")
+
+
+def test_what_the_device_declines_is_said(emulated):
+    device = emulated(model="LMS211;302063;X01.27 ", variant=(100, 50), baudrates=(9600, 19200, 38400))
+    with LMS2xx.open(device.path, password=b"WRONG_PW") as lms:
+        with pytest.raises(Refused, match=r"declines the password of the installation mode \(A0 01\)"):
+            lms.configure(unit="cm")
+        with pytest.raises(Refused, match="LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0.5"):
+            lms.set_variant(180, 0.5)
+        with pytest.raises(Refused, match=r"declines 500000 Bd \(A0 02\)"):
+            lms.set_baudrate(500000)
+        assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
+
+
+def test_a_configuration_that_is_not_taken_is_said(emulated, monkeypatch):
+    device = emulated()
+    monkeypatch.setattr(device.memory, "write_configuration", lambda data: False)
+    with LMS2xx.open(device.path) as lms, pytest.raises(Refused, match="does not take the configuration 00 00"):
+        lms.configure(unit="cm")
+    assert device.memory.mode == 0x25
+
+
+@pytest.mark.parametrize(("command", "call"), [
+    (0x77, lambda lms: lms.configure(unit="cm")), (0x3B, lambda lms: lms.set_variant(100, 0.5)),
+])  # fmt: skip
+def test_a_lost_reply_does_not_make_a_second_write(emulated, monkeypatch, command, call):
+    device = emulated()
+    monkeypatch.setattr(lms2xx_link, "PATIENCE", {command: (0.4, 0.4)})
+    with LMS2xx.open(device.path) as lms:
+        real = device._answer
+
+        def answer(at, code, *args, **options):
+            if code == command | 0x80:
+                device.faults.inject("silence")
+            real(at, code, *args, **options)
+
+        monkeypatch.setattr(device, "_answer", answer)
+        assert call(lms)
+    assert commands(device).count(command) == 1
+
+
+def test_a_rate_that_does_not_come_through_is_given_up(emulated, monkeypatch):
+    device = emulated()
+    with LMS2xx.open(device.path) as lms:
+        monkeypatch.setattr(device, "_change_baud", lambda rate, at: device._result(0, at))  # confirms, and stays
+        with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
+            lms.set_baudrate(500000)
+        assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
+
+
+def test_a_rate_that_this_end_cannot_do_changes_nothing(emulated, monkeypatch):
+    device = emulated()
+    with LMS2xx.open(device.path) as lms:
+        real = lms2xx_link.set_rate
+
+        def set_rate(port, rate):
+            if rate == 500000:
+                raise PortError("does not take 500000 Bd")
+            real(port, rate)
+
+        monkeypatch.setattr(lms2xx_link, "set_rate", set_rate)
+        asked = len(device.requests)
+        with pytest.raises(PortError, match="does not take 500000 Bd"):
+            lms.set_baudrate(500000)
+        assert len(device.requests) == asked and lms.baudrate == 38400
+
+
+# ------------------------------------------------------------------------------------------------- times of scans
+
+
+def test_the_transfer_is_that_of_the_manuals_table():
+    """Table 10-17: scan periods per telegram of 812 (0.25/100), 732 (0.5/180), 372 (1/180) bytes."""
+    table = {9600: (16, 29, 30), 19200: (8, 15, 15), 38400: (4, 8, 8), 500000: (1, 1, 1)}
+    for rate, periods in table.items():
+        for size, turns, n in zip((812, 732, 372), (4, 2, 1), periods, strict=True):
+            assert interval_s(size, rate, turns * TURN_S) == pytest.approx(n * turns * TURN_S)
+    assert transfer_s(732, 38400) == pytest.approx(7320 / 38400)
+    assert transfer_s(372, 500000) == pytest.approx(372 * 20e-6)
+    assert transfer_s(732, 500000) == pytest.approx(TURN_S + (732 - 508) * 20e-6)
+
+
+def test_late_arrivals_do_not_shift_scans():
+    rng, clock = np.random.default_rng(1), ScanClock()
+    true = 100.0 + np.cumsum(rng.integers(1, 40, 400)) * TURN_S  # over many rounds of the index
+    turns = np.rint((true - 100) / TURN_S).astype(int)
+    late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
+    late[0] = 0
+    placed = [clock.place(int(turn % 256), t) for turn, t in zip(turns, true + late, strict=True)]
+    off = np.array([instant for instant, _ in placed]) - true
+    assert np.median(off) == pytest.approx(0, abs=1e-9) and np.abs(off).max() < 0.01 < late.max()
+    assert [step for _, step in placed[1:]] == np.diff(turns).tolist()
+
+
+def test_instants_rise_even_if_the_first_scan_came_late():
+    rng = np.random.default_rng(2)
+    for first_late in (0.01, 0.3, 0.7):
+        clock, times = ScanClock(), 5.0 + np.arange(200) * 2 * TURN_S
+        late = np.where(np.arange(200) == 0, first_late, rng.exponential(0.005, 200))
+        instants = [clock.place(2 * k % 256, t + late[k])[0] for k, t in enumerate(times)]
+        told = np.array([i for i in instants if i is not None])
+        assert np.all(np.diff(told) > 0) and len(told) > 150
+        np.testing.assert_allclose(instants[-50:], times[-50:], atol=0.002)
+
+
+def test_old_and_repeated_scans_are_refused():
+    clock = ScanClock()
+    assert clock.place(250, 10.0) == (10.0, 0)
+    instant, step = clock.place(2, 10.0 + 8 * TURN_S)
+    assert step == 8 and instant == pytest.approx(10 + 8 * TURN_S)
+    assert clock.place(2, 10.2)[0] is None and clock.place(250, 10.4)[0] is None
+    assert clock.place(18, 10.0 + 24 * TURN_S)[1] == 16
+    assert clock.place(200, 100.0) == (100.0, 0)  # after a long pause nothing is known
+    refused = [clock.place((200 - k) % 256, 100.1 + k * TURN_S)[0] for k in range(1, 8)]
+    assert refused[:5] == [None] * 5 and refused[5] is not None  # a device that counts anew is believed in the end
+    assert ScanClock().place(-1, 3.0) == (3.0, 0)
+
+
+def test_beams_have_their_own_instants():
+    for variant, first_deg in (((180, 1.0), 0), ((180, 0.5), 0), ((100, 0.5), 40), ((100, 0.25), 40)):
+        counts = {"dropped": 0, "stale": 0}
+        one = Assembler(variant, INDEXED, 38400, False, counts)
+        count = round(variant[0] / variant[1]) + 1
+        raw = encode_scan(np.full(count, 2.0), indices=(0, 0))
+        reading = one.feed(raw, 50.0)
+        turns = round(1 / variant[1])
+        begin = 50.0 - len(raw) * 10 / 38400 - turns * TURN_S
+        bearing = np.degrees(reading.bearings)
+        np.testing.assert_allclose(bearing, first_deg + variant[1] * np.arange(count), atol=1e-9)
+        expected = begin + (np.arange(count) % turns + bearing / 360) * TURN_S
+        np.testing.assert_allclose(reading.beam_times_s, expected, atol=1e-9)
+        assert reading.time_s == reading.beam_times_s[0] and reading.scan_index == reading.telegram_index == 0
+
+
+def interlaced(partials, indexed=True):
+    """Telegrams of interlaced scans whose ranges tell where they belong."""
+    telegrams = []
+    for number, partial in enumerate(partials):
+        ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
+        indices = (number % 256, number % 256) if indexed else None
+        telegrams.append(encode_scan(ranges, partial=partial, indices=indices))
+    return telegrams
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_four_partial_scans_make_one(indexed):
+    configuration = Configuration().changed(unit="mm", realtime_indices=indexed)
+    one = Assembler((100, 0.25), configuration, 500000, True, {"dropped": 0, "stale": 0})
+    sent = enumerate(interlaced([2, 3, 0, 1, 2, 3, 0, 1, 2, 3], indexed))
+    made = [one.feed(raw, 9 + k * TURN_S + transfer_s(len(raw), 500000)) for k, raw in sent]
+    assert [k for k, reading in enumerate(made) if reading] == [5, 9]
+    reading = made[5]
+    np.testing.assert_allclose(np.degrees(reading.bearings), np.arange(721) / 4, atol=1e-9)
+    np.testing.assert_allclose(reading.ranges, 1 + np.arange(721) / 1000, atol=1e-9)
+    expected = reading.time_s + (np.arange(721) % 4 + np.arange(721) / 1440) * TURN_S
+    np.testing.assert_allclose(reading.beam_times_s, expected, atol=1e-9)
+    assert len(reading.telegrams) == 4 and reading.telegram_index == (2 if indexed else None)
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_sets_with_a_missing_part_are_no_scan(indexed):
+    configuration = Configuration().changed(unit="mm", realtime_indices=indexed)
+    for missing in range(4):
+        one = Assembler((100, 0.25), configuration, 500000, True, {"dropped": 0, "stale": 0})
+        sent = list(enumerate(interlaced([0, 1, 2, 3] * 3, indexed)))
+        made = [(k, one.feed(raw, 9 + k * TURN_S)) for k, raw in sent if k != 4 + missing]
+        assert [k for k, reading in made if reading] == [3, 11]
+    one = Assembler((100, 0.25), configuration, 500000, True, {"dropped": 0, "stale": 0})
+    sent = [(k, raw) for k, raw in enumerate(interlaced([0, 1, 2, 3] * 2, indexed)) if k not in (2, 3, 4, 5)]
+    assert not any(one.feed(raw, 9 + k * TURN_S) for k, raw in sent)  # 0, 1 of one set and 2, 3 of the next
+
+
+def test_telegrams_of_another_kind_are_no_scan():
+    one = Assembler((180, 0.5), INDEXED, 38400, False, {"dropped": 0, "stale": 0})
+    ranges = np.full(361, 2.0)
+    assert one.feed(encode_scan(ranges, indices=(1, 1)), 5.0) is not None
+    for raw in (
+        encode_scan(ranges),
+        encode_scan(ranges[:181], indices=(3, 2)),
+        encode_scan(ranges, unit="cm", indices=(3, 2)),
+        encode_scan(ranges[:181], partial=0, indices=(3, 2)),
+        encode_telegram(0xB0, b"\x05\x40\1\1", status=16),
+        encode_telegram(0xBA, b"LMS200", status=16),
+    ):
+        assert one.feed(raw, 5.1) is None
+
+
+def test_special_values_are_nan_with_a_reason():
+    one = Assembler((180, 1.0), INDEXED, 38400, False, {"dropped": 0, "stale": 0})
+    ranges = np.full(181, 2.0)
+    ranges[3], ranges[5] = np.inf, np.nan
+    reading = one.feed(encode_scan(ranges, indices=(1, 1)), 5.0)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(reading.ranges)), [3, 5])
+    assert reading.reasons[[2, 3, 5]].tolist() == [0, 6, 1]
+
+
+# ------------------------------------------------------------------------------------------------ scans of a device
+
+
+@pytest.mark.parametrize("rate", [38400, 500000])
+@pytest.mark.parametrize("variant", [(180, 0.5), (100, 0.25)])
+def test_scans_on_request_are_those_of_the_device(emulated, rate, variant):
+    device = emulated(baudrate=rate)
+    with LMS2xx.open(device.path) as lms:
+        lms.set_variant(*variant)
+        for _ in range(3):
+            reading = lms.request()
+            (truth,) = record_of(device, reading)
+            np.testing.assert_allclose(reading.beam_times_s, truth.beam_times_s, atol=0.5)
+            np.testing.assert_allclose(np.diff(reading.beam_times_s), np.diff(truth.beam_times_s), atol=1e-5)
+            assert (reading.scan_index, reading.telegram_index) == (truth.turn % 256, truth.telegram_index)
+            valid = reading.reasons == 0
+            counts = np.rint(reading.ranges[valid] * 1000).astype(int)
+            np.testing.assert_array_equal(counts, truth.words[valid])
+
+
+def test_streamed_scans_carry_the_instants_of_the_mirror(emulated):
+    device = emulated(baudrate=500000)
+    with LMS2xx.open(device.path) as lms:
+        for interlaced_too in (False, True):
+            lms.start(interlaced=interlaced_too)
+            readings = lms.take(20, timeout=DEADLINE_S)
+            lms.stop()
+            off = [r.time_s - record_of(device, r)[0].time_s for r in readings]
+            assert np.median(off) == pytest.approx(0, abs=0.005)
+            assert np.all(np.diff([r.time_s for r in readings]) > 0)
+            assert all(len(r.ranges) == (721 if interlaced_too else 361) for r in readings)
+        assert lms.variant == (100, 0.25)
+
+
+def test_a_slow_reader_gets_the_newest_scan_and_none_twice(emulated):
+    device = emulated(baudrate=500000)
+    with LMS2xx.open(device.path) as lms:
+        lms.start()
+        seen = []
+        for pause in (0, 0.6, 0, 0.6):
+            time.sleep(pause)
+            newest = device.scans[-1].number if device.scans else 0
+            seen.append(record_of(device, lms.newest(timeout=DEADLINE_S))[0].number)
+            assert seen[-1] >= newest - 18  # the machine may be busy, 0.6 s are 22 scans
+        assert np.all(np.diff(seen) > 0)
+        first = lms.newest(timeout=DEADLINE_S)
+        later = lms.newest(after=first.time_s + 0.3, timeout=DEADLINE_S)
+        assert later.time_s > first.time_s + 0.3
+        assert lms.newest(after=first.time_s, timeout=DEADLINE_S).time_s >= later.time_s
+        with pytest.raises(NoReply, match="no new scan within 0.2 s"):
+            lms.newest(after=later.time_s + 100, timeout=0.2)
+        run = lms.take(10, timeout=DEADLINE_S)
+        time.sleep(0.3)
+        run += lms.take(10, after=run[-1].time_s, timeout=DEADLINE_S)
+        numbers = [record_of(device, r)[0].number for r in run]
+        assert np.all(np.diff(numbers) == 1)
+
+
+def test_old_scans_are_not_handed_out(emulated):
+    device = emulated(baudrate=500000)
+    with LMS2xx.open(device.path) as lms:
+        lms.start()
+        lms.take(3, timeout=DEADLINE_S)
+        device.faults.inject("skip", seconds=DEADLINE_S)
+        time.sleep(0.9)
+        with pytest.raises(NoReply, match="no new scan within 0.3 s"):
+            lms.newest(timeout=0.3)
+        device.faults.clear()
+        begin = time.time()
+        assert lms.newest(after=begin, timeout=DEADLINE_S).time_s > begin
+
+
+def test_calls_at_the_wrong_time_say_so(emulated):
+    device = emulated()
+    lms = LMS2xx.open(device.path)
+    for call in (lms.newest, lambda: lms.take(1)):
+        with pytest.raises(DeviceError, match="does not stream; call start"):
+            call()
+    lms.stop()  # nothing to stop
+    lms.start()
+    calls = (lms.request, lms.read_status, lms.read_errors, lms.start, lms.reconnect, lms.configure)
+    for call in (*calls, lambda: lms.set_variant(180, 1), lambda: lms.set_baudrate(9600)):
+        with pytest.raises(DeviceError, match="streams; call stop"):
+            call()
+    lms.close()
+    assert not device.streaming
+    with pytest.raises(LineLost, match="is closed"):
+        lms.request()
+    lms.close()
+
+
+# -------------------------------------------------------------------------------------------- when things go wrong
+
+
+@pytest.mark.parametrize("fault", ["nak", "refused"])
+def test_a_request_declined_thrice_is_refused_and_once_is_not(emulated, fault):
+    device = emulated()
+    with LMS2xx.open(device.path) as lms:
+        device.faults.inject(fault, 2)
+        assert lms.read_status().unit == "mm"
+        device.faults.inject(fault, 3)
+        with pytest.raises(Refused, match="refuses command 31"):
+            lms.read_status()
+        assert device.faults.counts[fault] == 5
+
+
+def test_a_nak_is_not_answered_at_once(emulated):
+    device = emulated()
+    with LMS2xx.open(device.path) as lms:
+        sent = []
+        real = lms._link.send
+        lms._link.send = lambda *args: (sent.append(time.monotonic()), real(*args))
+        device.faults.inject("nak", 2)
+        lms.read_status()
+        assert len(sent) == 3 and np.all(np.diff(sent) >= 0.03)
+
+
+def test_replies_of_other_commands_and_the_power_on_string_are_skipped(emulated):
+    device = emulated()
+    with LMS2xx.open(device.path) as lms:
+        string = encode_telegram(0x90, b"LMS221;302063;X01.27 ", status=0x10)
+        real = device.prepare
+        device.prepare = lambda raw: string + real(raw)
+        device.faults.inject("foreign", 3)
+        assert lms.read_status().unit == "mm" and len(lms.request().ranges) == 361
+
+
+def test_a_silent_device_is_given_up_in_time(emulated, monkeypatch):
+    device = emulated()
+    lms = LMS2xx.open(device.path)
+    monkeypatch.setattr(lms2xx_link, "NO_ACK_S", 0.1)
+    device.faults.inject("deaf", seconds=1000)
+    for call in (lms.read_status, lms.request, lambda: lms.set_variant(100, 1), lambda: lms.configure(unit="cm")):
+        begin = time.monotonic()
+        with pytest.raises(NoReply, match="no reply to command .* at 38400 Bd; is the device on"):
+            call()
+        assert time.monotonic() - begin < DEADLINE_S
+    with pytest.raises(NoReply, match="command 30"):
+        lms.request(timeout=0.1)
+    lms.close()
+
+
+def test_the_line_comes_back_with_the_same_settings(emulated):
+    device = emulated(configuration=Configuration().changed(unit="mm"))
+    with LMS2xx.open(device.path) as lms:
+        lms.set_variant(100, 1)
+        lms.configure(realtime_indices=True)
+        writes = device.memory.flash_writes
+        device.faults.inject("unplug", seconds=0.3)
+        wait_for(lambda: device.faults.counts["unplug"])
+        with pytest.raises(LineLost):
+            lms.request()
+        device.memory.variant = (180, 50)  # as after a restart
+        lms.reconnect(deadline=DEADLINE_S)
+        assert len(lms.request().ranges) == 101 and device.memory.flash_writes == writes
+        assert lms.counts["reconnects"] == 1
+        device.close()
+        begin = time.monotonic()
+        with pytest.raises(LineLost, match="did not come back: there is no port"):
+            lms.reconnect(deadline=0.5)
+        assert time.monotonic() - begin < DEADLINE_S
+
+
+@pytest.mark.parametrize("fault", ["unplug", "reboot", "rate"])
+def test_a_stream_comes_back_by_itself_with_the_same_settings(emulated, fault):
+    device = emulated(baudrate=9600)
+    with LMS2xx.open(device.path, baudrate=500000) as lms:
+        lms.set_variant(100, 0.5)
+        lms.start()
+        lms.take(3, timeout=DEADLINE_S)
+        if fault == "unplug":
+            device.faults.inject(fault)
+            wait_for(lambda: device.faults.counts[fault])
+        else:
+            device.line.at(0, device._restart if fault == "reboot" else device._lose_rate)
+            device.line.wake()
+        wait_for(lambda: lms.counts["reconnects"])
+        reading = lms.newest(after=time.time(), timeout=DEADLINE_S)
+        assert len(reading.ranges) == 201 and record_of(device, reading)
+        assert device.baudrate == 500000 and device.memory.flash_writes == 0
+    assert not device.streaming
+
+
+def test_a_stream_on_a_lost_line_can_be_stopped(emulated):
+    device = emulated()
+    lms = LMS2xx.open(device.path)
+    lms.start()
+    lms.take(1, timeout=DEADLINE_S)
+    device.close()
+    with pytest.raises(NoReply, match="no new scan within 1.5 s: .*(lost|come back)"):
+        lms.newest(after=time.time(), timeout=1.5)
+    begin = time.monotonic()
+    with pytest.raises(LineLost, match="the device may still stream"):
+        lms.stop()
+    lms.close()
+    assert time.monotonic() - begin < DEADLINE_S

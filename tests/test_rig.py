@@ -1,0 +1,400 @@
+"""The rig file, and what a rig records of one placement: with devices that are not there."""
+
+import json
+import math
+import socket
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_rig import SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
+
+from lrfcal_lib.drivers import rig as rig_module
+from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
+from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, Configuration, parse_configuration
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
+from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
+
+# ------------------------------------------------------------------------------------------------------ rig file
+
+
+def changed(path, value):
+    """A rig file with one key changed (or removed, where the value is None)."""
+    data = rig_data()
+    *way, last = path.split(".")
+    at = data
+    for key in way:
+        at = at[key]
+    at[last] = value
+    if value is None:
+        del at[last]
+    return data
+
+
+def read(tmp_path, data):
+    file = tmp_path / "rig.json"
+    file.write_text(json.dumps(data))
+    return read_rig_file(file)
+
+
+def test_a_rig_file_is_read(tmp_path):
+    rig = read(tmp_path, rig_data(cameras=("left", "right"), mode="continuous"))
+    assert rig.lrf_device["port"] == "/dev/fake_lrf" and rig.head_device == "/dev/fake_head"
+    assert list(rig.cameras) == list(rig.camera_devices) == ["left", "right"]
+    assert rig.plan.mode == "continuous" and rig.with_mode("stop-and-go").plan.mode == "stop-and-go"
+    assert rig.with_mode(None) is rig and rig.control is None
+
+
+WRONG = {
+    r"devices\.lrf\.port is missing": ("devices.lrf.port", None),
+    r"devices\.lrf is missing": ("devices.lrf", None),
+    r"devices is missing": ("devices", None),
+    r"devices\.head\.port is missing": ("devices.head.port", None),
+    r"devices\.head\.adress is not known; known are port, address": ("devices.head.adress", 1),
+    r"devices\.head: tilt_speed of the head is 99": ("devices.head.tilt_speed", 99),
+    r"devices\.head: address of the head is 'one'": ("devices.head.address", "one"),
+    r"devices\.lrf\.unit is 'inch'": ("devices.lrf.unit", "inch"),
+    r"devices\.lrf\.variant is 180": ("devices.lrf.variant", 180),
+    r"devices\.lrf is 'COM1': an object": ("devices.lrf", "COM1"),
+    r"devices\.cameras\.left\.source is missing": ("devices.cameras.left.source", None),
+    r"devices\.cameras\.left\.focus is not known": ("devices.cameras.left.focus", 3),
+    r"devices\.cameras\.left\.size is \[640, 480\], rig\.cameras\.left states \[32, 24\]":
+        ("devices.cameras.left.size", [640, 480]),
+    r"devices\.cameras are none, rig\.cameras left": ("devices.cameras", {}),
+    r"plan\.mode is 'fast'": ("plan.mode", "fast"),
+    r"plan\.speed is not known": ("plan.speed", 3),
+    r"plan\.scans_per_stop is 0": ("plan.scans_per_stop", 0),
+    r"plan\.count is True": ("plan.count", True),
+    r"plan\.intrinsics_images is -1": ("plan.intrinsics_images", -1),
+    r"plan\.pitch_deg is \[-4, 4, 0\]: first, last, and a positive step": ("plan.pitch_deg", [-4, 4, 0]),
+    r"plan\.pitch_deg is \(-4, 4\): a list of 3 numbers": ("plan.pitch_deg", [-4, 4]),
+    r"plan\.pitch_deg is \[0, 0, 1\]": ("plan.pitch_deg", [0, 0, 1]),
+    r"plan\.image_pitch_deg is '0'": ("plan.image_pitch_deg", "0"),
+    r"plan\.image_pitch_deg is \('up',\)": ("plan.image_pitch_deg", ["up"]),
+    r"placement 1 asks for a pitch of -4 to 90 deg, .*pitch_limits_deg are -60 to 60": ("plan.image_pitch_deg", [90]),
+    r"plan\.placements\[0\]\.number is -3": ("plan.placements", [{"number": -3}]),
+    r"plan\.placements\[0\]\.pitch is not known": ("plan.placements", [{"pitch": 3}]),
+    r"plan\.placements: numbers must differ, got \[1, 1\]": ("plan.placements", [{"number": 1}, {"number": 1}]),
+    r"square_m": ("board.pattern.square_m", -1),
+    r"key 'board' is missing": ("board", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_wrong_rig_file_is_refused(tmp_path, message):
+    with pytest.raises(RigFileError, match=rf"rig\.json: .*{message}"):
+        read(tmp_path, changed(*WRONG[message]))
+
+
+def test_no_rig_file(tmp_path):
+    with pytest.raises(RigFileError, match=r"none\.json: No such file.*emulate --rig-file"):
+        read_rig_file(tmp_path / "none.json")
+    (tmp_path / "text.json").write_text("{")
+    with pytest.raises(RigFileError, match=r"text\.json: not JSON"):
+        read_rig_file(tmp_path / "text.json")
+    with pytest.raises(RigFileError, match="the file is .*: an object"):
+        read(tmp_path, [1, 2])
+
+
+def test_interlaced_scans_need_a_head_at_rest(tmp_path):
+    data = changed("devices.lrf.interlaced", True)
+    stated = read(tmp_path, data)
+    with pytest.raises(RigFileError, match=r"devices\.lrf\.interlaced is true"):
+        stated.with_mode("continuous")
+
+
+@pytest.mark.parametrize("step", [0.3, 1, 2.5, 7, 100])
+def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step):
+    odd, even = Plan((-10, 5, step), count=2).to_do()
+    np.testing.assert_allclose(np.degrees(odd.pitch[[0, -1]]), [-10, 5])
+    assert np.diff(odd.pitch).max() <= math.radians(step) + 1e-12
+    assert np.ptp(np.diff(odd.pitch)) < 1e-12
+    np.testing.assert_array_equal(even.pitch, odd.pitch[::-1])
+    assert (odd.direction, even.direction) == (1, -1)
+
+
+def test_a_step_that_divides_the_sweep_is_kept():
+    (placement,) = Plan((-10, 5, 0.1), count=1).to_do()
+    assert len(placement.pitch) == 151
+
+
+def test_listed_placements_come_as_they_are_listed():
+    listed = [{"number": 7, "pitch_deg": [4, -4, 1]}, {"number": 2, "board": False, "image_pitch_deg": [1, 2]}]
+    first, second = Plan(placements=tuple(listed)).to_do()
+    assert (first.number, first.direction, first.purpose) == (7, -1, "board")
+    assert (second.number, second.purpose) == (2, "scene")
+    np.testing.assert_allclose(np.degrees(second.image_pitch), [1, 2])
+    assert len(Plan(placements=tuple(listed)).to_do(1)) == 1
+
+
+# ------------------------------------------------------------------------------------------------- stop-and-go
+
+
+def events_of(rig, number=1):
+    placement = next(p for p in rig.stated.plan.to_do() if p.number == number)
+    return list(rig.acquire(placement))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_stops_scans_and_images_come_in_order(number):
+    rig = make_rig(rig_data(cameras=("left", "right"), image_pitch_deg=[-1.5, 2], scans_per_stop=2))
+    events = events_of(rig, number)
+    moves = [e for e in events if isinstance(e, Moved)]
+    wanted = sorted([*range(-4, 5), -1.5], reverse=number == 2)
+    np.testing.assert_allclose([math.degrees(m.commanded) for m in moves], wanted)
+    assert [m.number for m in moves] == list(range(1, 11)) and {m.of for m in moves} == {10}
+    scans = [e for e in events if isinstance(e, Scanned)]
+    assert [len(e.readings) for e in scans] == [2] * 9
+    images = [e for e in events if isinstance(e, Photographed)]
+    assert [(e.camera, round(math.degrees(e.pitch), 6)) for e in images] == [
+        (camera, pitch) for pitch in sorted([-1.5, 2], reverse=number == 2) for camera in ("left", "right")
+    ]
+    assert {e.purpose for e in images} == {"board"}
+
+
+def test_what_is_recorded_at_a_stop_is_later_than_its_rest():
+    settled = None
+    for event in events_of(make_rig()):
+        if isinstance(event, Moved):
+            settled = event
+        elif isinstance(event, Scanned):
+            assert min(r.time_s for r in event.readings) > settled.time_s
+            np.testing.assert_array_equal(event.pitch, settled.pitch)
+            assert event.readings[0].telegrams == (telegram(settled.pitch),)
+        else:
+            assert event.frame.time_s > settled.time_s
+            np.testing.assert_array_equal(event.frame.image, picture(settled.pitch))
+
+
+@pytest.mark.parametrize("device", ["lrf", "camera"])
+def test_what_is_older_than_the_rest_is_refused(device):
+    rig = make_rig()
+    if device == "lrf":
+        rig.lrf.stale = 0.5
+    else:
+        newest = rig.cameras["left"].newest
+        rig.cameras["left"].newest = lambda **options: replace(newest(), time_s=rig.clock() - 1)
+    with pytest.raises(DeviceError, match="older than"):
+        events_of(rig)
+
+
+def test_nothing_is_held_back():
+    rig = make_rig()
+    events = rig.acquire(rig.stated.plan.to_do()[0])
+    for _ in range(3):
+        at = rig.head.at
+        assert isinstance(next(events), Moved) and rig.head.at != at
+        made = len(rig.lrf.readings)
+        assert isinstance(next(events), Scanned) and len(rig.lrf.readings) == made + 1
+    events.close()
+
+
+def test_a_head_without_feedback_says_so():
+    assert not any(e.measured for e in events_of(make_rig(feedback=False)) if isinstance(e, Moved))
+    assert all(e.measured for e in events_of(make_rig()) if isinstance(e, Moved))
+
+
+class Boom(Exception):
+    pass
+
+
+@pytest.mark.parametrize("error", [DeviceError("gone"), KeyboardInterrupt(), Boom()])
+@pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
+def test_whatever_goes_wrong_the_head_and_the_scans_stop(mode, error):
+    rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]))
+    events = rig.acquire(rig.stated.plan.to_do()[0])
+    for _ in range(4):
+        next(events)
+    rig.head.fail = error
+    with pytest.raises(type(error)):
+        list(events)
+    assert rig.head.stops == 1 and not rig.lrf.streaming
+
+
+@pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
+def test_a_placement_that_is_broken_off_stops_the_head(mode):
+    rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]))
+    events = rig.acquire(rig.stated.plan.to_do()[0])
+    for _ in range(4):
+        next(events)
+    events.close()
+    assert rig.head.stops == 1 and not rig.lrf.streaming
+
+
+def test_the_scans_stop_also_where_the_head_cannot(caplog):
+    rig = make_rig()
+    events = rig.acquire(rig.stated.plan.to_do()[0])
+    next(events)
+
+    def gone():
+        raise DeviceError("the line is lost")
+
+    rig.head.stop = gone
+    events.close()
+    assert not rig.lrf.streaming
+    assert "the head could not be stopped (the line is lost): cut its power" in caplog.text
+
+
+def test_the_board_held_close_is_seen_from_pitch_zero():
+    rig = make_rig()
+    rig.head.at = 0.3
+    (event,) = rig.acquire_close("left")
+    assert event.purpose == "intrinsics" and event.placement == -1 and rig.head.at == event.pitch == 0.0
+
+
+# --------------------------------------------------------------------------------------------------- continuous
+
+
+def sweep_of(rig):
+    """Events of a continuous sweep, and true pitch of its scans at their middle beams."""
+    events = events_of(rig)
+    readings = [r for e in events if isinstance(e, Scanned) for r in e.readings]
+    pitch = np.concatenate([e.pitch for e in events if isinstance(e, Scanned)])
+    rig.head.sweep = rig.head.sweep_done
+    return events, readings, pitch, np.array([rig.head.true(np.mean(r.beam_times_s)) for r in readings])
+
+
+@pytest.mark.parametrize("heads", [{}, {"silent_moving": True}, {"feedback": False}])
+def test_scans_of_a_sweep_have_the_pitch_of_their_instant(heads):
+    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-10, 30, 1]), **heads)
+    events, readings, pitch, true = sweep_of(rig)
+    np.testing.assert_allclose(pitch, true, atol=math.radians(0.001))
+    times = [r.time_s for r in readings]
+    assert len(readings) > 40 and times == sorted(set(times))
+    assert [type(e) for e in events[:3]] == [Moved, Photographed, Moved] and isinstance(events[-1], Tracked)
+    assert np.ptp(pitch) > math.radians(38)
+
+
+def test_scans_of_a_sweep_are_handed_out_while_it_goes_on():
+    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-10, 50, 1]))
+    shares = [e.share for e in events_of(rig) if isinstance(e, Scanned)]
+    assert len(shares) > 2 and shares == sorted(shares) and shares[0] < 0.7 and shares[-1] == 1.0
+
+
+def test_a_sweep_without_scans_is_given_up(monkeypatch):
+    monkeypatch.setattr(rig_module, "GAP_S", 0.05)
+    monkeypatch.setattr(rig_module, "BATCH_S", 0.02)
+    rig = make_rig(rig_data(mode="continuous"))
+    newest = rig.lrf.newest
+
+    def once(**options):
+        found = newest(**options)
+        rig.lrf.silent = True
+        return found
+
+    rig.lrf.newest = once
+    rig.head.speed = 1e-6
+    rig.head.move_to = lambda pitch: setattr(rig.head, "at", pitch) or pitch
+    with pytest.raises(NoReply, match=r"no scan for 0\.05 s of the sweep"):
+        events_of(rig)
+    assert rig.head.stops == 1
+
+
+# --------------------------------------------------------------------------------------------- opening, the board
+
+
+def stated_rig(**plan):
+    return checked(rig_of(json.loads(json.dumps(rig_data(**plan)))))
+
+
+def fake_openers(monkeypatch, **instead):
+    """Let Rig.open make fakes; a device may be an error instead."""
+    clock, made = Clock(), []
+    head = Head(clock)
+
+    def opener(name, device):
+        def make(*arguments):
+            if name in instead:
+                raise instead[name]
+            made.append(name)
+            device.close = lambda: made.remove(name)
+            return device
+
+        monkeypatch.setattr(rig_module, f"_open_{name}", make)
+
+    for name, device in (("head", head), ("lrf", Lrf(head, clock)), ("camera", Camera("left", head, clock))):
+        opener(name, device)
+    return made
+
+
+def test_all_devices_are_closed_again(monkeypatch):
+    made = fake_openers(monkeypatch)
+    with Rig.open(stated_rig()) as rig:
+        assert sorted(made) == ["camera", "head", "lrf"] and list(rig.cameras) == ["left"]
+    assert made == []
+
+
+@pytest.mark.parametrize(("device", "message"), [("lrf", "lrf: there is no port"), ("camera", "camera 'left': there")])
+def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, device, message):
+    made = fake_openers(monkeypatch, **{device: PortError("there is no port")})
+    with pytest.raises(PortError, match=message):
+        Rig.open(stated_rig())
+    assert made == []
+
+
+def test_a_value_that_a_device_cannot_have_names_the_file(monkeypatch):
+    fake_openers(monkeypatch, lrf=ValueError("an LMS2xx has 9600 Bd, got 300"))
+    with pytest.raises(RigFileError, match=r"rig\.json: lrf: an LMS2xx has 9600 Bd, got 300"):
+        Rig.open(stated_rig())
+
+
+def test_what_the_device_says_about_itself_counts():
+    rig = make_rig()
+    rig.lrf.variant, rig.lrf.configuration = (180.0, 0.5), Configuration().changed(unit="cm")
+    info = rig.lrf_info
+    np.testing.assert_allclose(np.degrees(info.field_of_view), [0, 180])
+    assert math.degrees(info.bearing_step) == pytest.approx(0.5) and info.range_resolution == 0.01
+    rig.stated.lrf_device["interlaced"] = True
+    assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
+
+
+def test_a_recording_begins_with_the_configuration():
+    (raw,) = make_rig().begin_telegrams()
+    assert raw[4] == CONFIGURATION and parse_configuration(raw).measuring_mode == 0
+
+
+def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
+    rig = make_rig()
+    assert rig.move_board(1) is False and rig.hold_close("left", 0) is False
+    path, heard = str(tmp_path / "control"), []
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(path)
+    server.listen()
+
+    def serve():
+        for answer in (b'{"ok": true}\n', b'{"ok": false, "error": "no placement 9"}\n'):
+            link = server.accept()[0]
+            heard.append(json.loads(link.makefile().readline()))
+            link.sendall(answer)
+            link.close()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    object.__setattr__(rig.stated, "control", path)
+    assert rig.move_board(3) is True and heard == [{"command": "place", "arguments": [3]}]
+    with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
+        rig.move_board(9)
+    thread.join()
+    server.close()
+    with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
+        rig.move_board(3)
+
+
+def test_a_camera_of_another_size_is_refused(monkeypatch):
+    pytest.importorskip("lrfcal_lib.drivers.video")
+    closed = []
+
+    class Small:
+        settings = {"size": {"asked": SIZE, "got": (16, 12)}}
+
+        def close(self):
+            closed.append(self)
+
+    monkeypatch.setattr("lrfcal_lib.drivers.video.Camera.open", lambda *args, **options: Small())
+    monkeypatch.setattr(rig_module, "_open_head", lambda *args: Head(Clock()))
+    monkeypatch.setattr(rig_module, "_open_lrf", lambda *args: Lrf(None, None))
+    with pytest.raises(RigFileError, match=r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"):
+        Rig.open(stated_rig())
+    assert len(closed) == 1
+
