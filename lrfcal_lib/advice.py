@@ -12,7 +12,7 @@ from lrfcal_lib.forecast import candidate_information, measure_yield
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import UNSEEN
 from lrfcal_lib.solvers.platform import AXIS_NAMES, AXIS_WORDS
-from lrfcal_lib.solvers.pose import POSE_NAMES, axis_words
+from lrfcal_lib.solvers.pose import POSE_NAMES
 from lrfcal_lib.uncertainty import information
 
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
@@ -132,8 +132,13 @@ def _camera_words(kind, found):
     vectors = list(found.values())
     mean = np.mean(vectors, axis=0) if vectors else np.zeros(3)
     if len(vectors) > 1 and all(np.linalg.norm(v - mean) < 0.3 * np.linalg.norm(mean) for v in vectors):
-        return [(np.linalg.norm(mean), f"{kind} {axis_words(mean)} of all cameras")]
-    return [(np.linalg.norm(v), f"{kind} {axis_words(v)} of camera '{c}'") for c, v in found.items() if v.any()]
+        return [(np.linalg.norm(mean), f"{kind} {_main_axes(mean)} of all cameras")]
+    return [(np.linalg.norm(v), f"{kind} {_main_axes(v)} of camera '{c}'") for c, v in found.items() if v.any()]
+
+
+def _main_axes(vector):
+    """The axes that a vector mostly lies along, e.g. ``x`` or ``y and z``."""
+    return " and ".join(np.array(["x", "y", "z"])[np.abs(vector) > 0.4 * np.linalg.norm(vector)])
 
 
 @dataclass(frozen=True)
@@ -200,13 +205,18 @@ class Suggestion:
     def sentence(self):
         """What to record next and what it brings."""
         known = ", ".join(
-            f"{name} {1000 * self.before[name]:.2g} to {1000 * self.after[name]:.2g} mm" for name in self.before
+            f"{name} {brief(1000 * self.before[name])} to {brief(1000 * self.after[name])} mm" for name in self.before
         )
         gain, blind = 100 * self.gain, 100 * self.median_gain
         return (
-            f"Record next: {self.words()}. Predicted standard deviations at 2 m: {known} ({gain:.0f} % less; a placement "
-            f"at random: {blind:.0f} %)."
+            f"Record next: {self.words()}. Predicted standard deviations at 2 m: {known} ({gain:.0f} % less; a blindly "
+            f"chosen placement: {blind:.0f} %)."
         )
+
+
+def brief(value):
+    """A number with two digits, or more before the point."""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 
 def suggest_placement(
@@ -322,4 +332,4 @@ def _suggestion(solution, options, best, before, after, gains, criterion):
     )  # fmt: skip
 
 
-__all__ = ["Direction", "Suggestion", "direction_words", "group_sigma", "observability", "suggest_placement"]
+__all__ = ["Direction", "Suggestion", "brief", "direction_words", "group_sigma", "observability", "suggest_placement"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.evaluate import best_method, method_comparison, plane_residuals_of, rms, trusted_sigma
+from lrfcal_lib.evaluate import handed_over, plane_residuals_of, rms, trusted_sigma
 from lrfcal_lib.pipeline import calibrate, color_cloud
 from lrfcal_lib.reconstruct import write_ply
 from lrfcal_lib.session import open_session
@@ -22,45 +22,53 @@ FRAMES = (
 )
 
 
-def calibration_record(prepared, platform, observations, solutions, method):
+def calibration_record(calibration, method):
     """Everything a calibration says, ready for JSON.
 
     Parameters
     ----------
-    prepared : Prepared
-    platform : PlatformCalibration
-    observations : dict of (str, str) to CameraObservations
-    solutions : dict of (str, str) to Solution
+    calibration : Calibration
     method : str
-        The method whose camera poses are handed over.
+        The method whose results are handed over; 'joint' brings its own platform, range offset and pitch terms.
 
     Returns
     -------
     dict
         Schema, library version, session with the SHA-256 of its files, frames and units, platform, and for each camera
-        its pose, intrinsics, covariance, and residual statistics.
+        its pose, intrinsics, covariance, and residual statistics; with the joint estimate also what it says about the
+        sensor.
     """
-    session = prepared.session
+    prepared, session = calibration.prepared, calibration.prepared.session
+    variant = "joint" if method == "joint" else "half_step"
     cameras = {
-        camera: _camera(prepared.models[camera], observations[camera, "half_step"], solutions[camera, method])
-        for camera in prepared.views
-        if (camera, method) in solutions
+        camera: _camera(prepared.models[camera], calibration.observations[camera, variant], solution)
+        for (camera, name), solution in calibration.solutions.items()
+        if name == method
     }
-    return {
+    axis = "joint" if method == "joint" else "combined"
+    record = {
         "schema": SCHEMA,
         "lrfcal": __version__,
         "session": session.name,
         "inputs_sha256": file_hashes(session.path),
         "conventions": FRAMES,
         "method": method,
-        "platform": _transform(platform.T_head_lrf)
+        "platform": _transform(calibration.platform.transform(axis))
         | {
             "maps": "lrf to head",
-            "axis_covariance": platform.covariance.tolist(),
+            "axis_covariance": calibration.platform.parameters()[axis][1].tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
         "cameras": cameras,
     }
+    return record | ({"sensor": _sensor(calibration.joint.solution)} if method == "joint" else {})
+
+
+def _sensor(solution):
+    """What the joint estimate says about range finder and pitch; None where it was not estimated."""
+    sigma = dict(zip(solution.solution.names, trusted_sigma(solution.solution).tolist(), strict=True))
+    named = {name: {"value": solution.sensor[name], "sigma": sigma[name]} for name in solution.sensor if name in sigma}
+    return named | {"noise": solution.noise, "excluded_placements": solution.excluded}
 
 
 AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
@@ -147,12 +155,12 @@ def calibrate_session(path, out=None):
     for key, why in (found.prepared.problems | found.problems).items():
         print(f"{key}: {why}")
     try:
-        method = best_method(method_comparison(found.observations, found.solutions))
+        method = handed_over(found)
     except ValueError as error:
         print(f"nothing written: {error}")
         return 1
-    print(f"handed over: {method}, the best on placements left out of the calibration")
-    record = calibration_record(found.prepared, found.platform, found.observations, found.solutions, method)
+    print(f"handed over: {method}")
+    record = calibration_record(found, method)
     write_calibration(folder / "calibration.json", record)
     write_ply(folder / "cloud.ply", color_cloud(found, method))
     print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")

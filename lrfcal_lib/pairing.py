@@ -13,18 +13,18 @@ from lrfcal_lib.board import corners_of_lines
 from lrfcal_lib.geometry import DegenerateGeometry, fit_line, lrf_to_platform, lrf_to_source, tilt
 from lrfcal_lib.prepared import VARIANTS, Prepared
 from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.edge_cells import edge_cells
 from lrfcal_lib.preprocess.observations import CameraObservations
 from lrfcal_lib.reconstruct import MeasuredBoard, measure_board
 from lrfcal_lib.solvers.outliers import find_outlying_placements
+from lrfcal_lib.solvers.outline_ml import measure_outline
 from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
 
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
 FACE_POINTS = 150  # per placement, for the same reason
 NAME_DISTANCE = 0.08  # metres between a side in the cloud and the board edge it is named after, at most
 LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
-NAME_ANGLE = np.deg2rad(
-    3.0
-)  # between them; a larger one means that the side is none (a cloud cut by hand, an occluder)
+NAME_ANGLE = np.deg2rad(3.0)  # between them; a side turned more is none (a cloud cut by hand, an occluder)
 
 
 def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None):
@@ -387,6 +387,44 @@ def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
             sides[name] = lrf_to_platform(found.points[rows], found.pitch[rows], T_head_lrf)
             across |= {name} if swept else set()
     return PlacementOutline(measure_board(face, sides, prepared.board.edges), face, sides, frozenset(across))
+
+
+def cells_of(prepared, placement):
+    """Beams about the edges in the sweep of a placement, an EdgeCells."""
+    along, swept = prepared.edges["half_step"][placement], prepared.swept["half_step"].get(placement)
+    return edge_cells(prepared.scans[placement], along, swept, prepared.session.lrf)
+
+
+def likely_outline_of(prepared, placement, model):
+    """Measure the board's outline in one sweep by likelihood; :func:`outline_of` does it by least squares.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    placement : int
+    model : EdgeModel
+        From other placements.
+
+    Returns
+    -------
+    measured : MeasuredOutline
+        Without sides of which less than 40 % is seen.
+    across : frozenset of str
+        Edges found across the scan lines.
+
+    Raises
+    ------
+    DegenerateGeometry
+        If the sweep does not cross enough scan lines to span a plane, or no side has enough beams.
+    """
+    board_scan, length, names, across = prepared.scans[placement], prepared.board.lengths(), {}, set()
+    for number, name, found, side, swept in _named_sides(prepared, "half_step"):
+        if number == placement and _stretch(found, side) >= LEAST_STRETCH * length[name]:
+            names[side] = name
+            across |= {name} if swept else set()
+    face = (*scan.face_points(board_scan)[:2], board_scan.sigma_range)
+    measured = measure_outline(cells_of(prepared, placement), face, names, prepared.board.edges, model)
+    return measured, frozenset(across)
 
 
 def _corners(prepared, camera, variant, sources):

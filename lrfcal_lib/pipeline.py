@@ -17,6 +17,7 @@ from lrfcal_lib.geometry import (
     lrf_to_source,
     polar_to_points,
 )
+from lrfcal_lib.joint_calibration import JointCalibration, calibrate_jointly
 from lrfcal_lib.pairing import FACE_POINTS, join_parts, name_sides, observe, observe_all, platform_of, thin
 from lrfcal_lib.prepared import PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess import scan
@@ -174,6 +175,8 @@ class PlatformCalibration:
     stated : RigidTransform or None
     stated_sigma : tuple of float
         How well the stated one is known: direction (radians) and offset (metres).
+    joint : (RigidTransform, ndarray of shape (4, 4)), or None
+        The axis of the joint estimate and its covariance.
     """
 
     T_head_lrf: RigidTransform
@@ -182,17 +185,23 @@ class PlatformCalibration:
     problems: dict
     stated: RigidTransform | None
     stated_sigma: tuple
+    joint: tuple | None = None
 
     def parameters(self):
         """Angles of the axis out of and within the scan plane, and its offsets within and across it, by method."""
         found = {name: (s.solution.parameters, trusted_axis_covariance(s)) for name, s in self.solutions.items()}
         if self.stated is not None:
             found["stated"] = chart_parameters(pose_array(self.stated)), stated_covariance(self.stated_sigma)
-        return found | {"combined": (chart_parameters(pose_array(self.T_head_lrf)), self.covariance)}
+        found["combined"] = chart_parameters(pose_array(self.T_head_lrf)), self.covariance
+        if self.joint is not None:
+            found["joint"] = chart_parameters(pose_array(self.joint[0])), self.joint[1]
+        return found
 
     def transform(self, method):
-        """``T_head_lrf`` of a method (also 'stated' and 'combined')."""
+        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
         special = {"stated": self.stated, "combined": self.T_head_lrf}
+        if self.joint is not None:
+            special["joint"] = self.joint[0]
         return special[method] if method in special else self.solutions[method].T_head_lrf
 
 
@@ -292,7 +301,9 @@ class Calibration:
     solutions : dict of (str, str) to Solution
         By camera and method.
     problems : dict of (str, str) to str
-        Why a method has no result for a camera.
+        Why a method has no result for a camera; ``('rig', 'joint')`` for the joint estimate.
+    joint : JointCalibration or None
+        Its cameras are in `solutions` as method 'joint', with observations of their own under that variant.
     """
 
     prepared: Prepared
@@ -300,16 +311,18 @@ class Calibration:
     observations: dict
     solutions: dict
     problems: dict
+    joint: JointCalibration | None = None
 
 
-def calibrate(session, methods=tuple(METHODS)):
-    """All stages: preprocessing, platform, cameras.
+def calibrate(session, methods=tuple(METHODS), joint=True):
+    """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
     ----------
     session : Session
     methods : sequence of str
         Of :data:`lrfcal_lib.solvers.METHODS`.
+    joint : bool
 
     Returns
     -------
@@ -319,7 +332,32 @@ def calibrate(session, methods=tuple(METHODS)):
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
     observations = observe_all(prepared, platform.T_head_lrf)
     solutions, problems = calibrate_cameras(observations, methods)
-    return Calibration(prepared, platform, observations, solutions, problems)
+    found = Calibration(prepared, platform, observations, solutions, problems)
+    return with_joint(found) if joint and prepared.views else found
+
+
+def with_joint(calibration):
+    """Add the joint estimate to a calibration: its axis, its cameras, and observations made with them.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Returns
+    -------
+    Calibration
+        Unchanged but for a problem where the session does not determine the whole rig.
+    """
+    try:
+        joint = calibrate_jointly(calibration.prepared)
+    except DegenerateGeometry as error:
+        return replace(calibration, problems=calibration.problems | {("rig", "joint"): str(error)})
+    cameras = joint.observations.cameras
+    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
+    solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
+    platform = replace(calibration.platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
+    found = {"observations": calibration.observations | seen, "solutions": calibration.solutions | solved}
+    return replace(calibration, platform=platform, joint=joint, **found)
 
 
 def stereo_reference(prepared):
@@ -383,20 +421,30 @@ def color_cloud(calibration, method="line", every=1, scene=False):
 
 
 def _color_sweep(calibration, method, placement, mask, every):
-    session, T_head_lrf = calibration.prepared.session, calibration.platform.T_head_lrf
+    session, (T_head_lrf, correct) = calibration.prepared.session, _platform_and_corrections(calibration, method)
     sweep = session.sweep(placement)
     line, beam = (index[::every] for index in np.nonzero(mask))
-    p_lrf, pitch = polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam]), sweep.pitch[line]
+    points = polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam])
+    p_lrf, pitch = correct(placement, points, sweep.pitch[line])
     layers = [np.full(p_lrf.shape, np.nan)]
     for record in session.images(placement=placement):
         mount = session.cameras[record.camera].mount
         if (record.camera, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
-            points = lrf_to_source(p_lrf, pitch, T_head_lrf, mount, 0.0 if mount == "platform" else record.pitch)
+            at = 0.0 if mount == "platform" else float(correct(placement, np.zeros(3), record.pitch)[1])
+            points = lrf_to_source(p_lrf, pitch, T_head_lrf, mount, at)
             T_camera_source = calibration.solutions[record.camera, method].transform
             model, image = calibration.prepared.models[record.camera], session.read_image(record)
             layers.append(color_points(points, image, T_camera_source, model)[0])
     colors, seen = blend(layers)
     return Cloud(lrf_to_platform(p_lrf, pitch, T_head_lrf), colors, seen, np.full(len(pitch), placement))
+
+
+def _platform_and_corrections(calibration, method):
+    """``T_head_lrf`` and the function that takes known errors out of a sweep, as a method has them."""
+    if method == "joint" and calibration.joint is not None:
+        solution = calibration.joint.solution
+        return solution.T_head_lrf, solution.correct
+    return calibration.platform.T_head_lrf, lambda placement, p_lrf, pitch: (p_lrf, pitch)
 
 
 def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):

@@ -73,7 +73,8 @@ class SigmaMap:
         determined, NaN where no scan reaches.
     parts : dict of str to ndarray, shape (d, r, c)
         The same with only some links uncertain: 'axis', 'camera', 'range offset', 'pitch', 'sweep', and for points
-        'range noise', which `sigma` does not contain.
+        'range noise', which `sigma` does not contain. Errors of axis and camera may compensate: parts larger than the
+        whole are no contradiction.
     """
 
     columns: np.ndarray
@@ -83,8 +84,11 @@ class SigmaMap:
     parts: dict
 
     def rms(self):
-        """Root mean square over the map, shape (d,)."""
-        return np.sqrt(np.nanmean(self.sigma**2, axis=(1, 2)))
+        """Root mean square over what scans reach, shape (d,); inf where they reach nothing."""
+        seen = np.isfinite(self.sigma) | np.isinf(self.sigma)
+        total = np.sum(np.where(seen, self.sigma, 0.0) ** 2, axis=(1, 2))
+        number = seen.sum(axis=(1, 2))
+        return np.where(number > 0, np.sqrt(total / np.maximum(number, 1)), np.inf)
 
 
 def information(solution):
@@ -263,7 +267,9 @@ def _beams_of_pixels(chain, model, uv, distance, image_pitch):
     return bearing, pitch + (image_pitch if chain.on_head else 0.0)
 
 
-def projection_sigma(solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, clustered=True):
+def projection_sigma(
+    solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, pitches=None, clustered=True
+):
     """How far off the pixel of an LRF point may be, over the image.
 
     Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head the tilt axis matters
@@ -281,6 +287,9 @@ def projection_sigma(solution, camera, model, distances, grid=(32, 24), *, image
         Columns and rows of the map.
     image_pitch : float
         Radians.
+    pitches : tuple of float, optional
+        First and last pitch of the sweeps, radians: pixels that they do not reach stay NaN. A sweep's own stretch acts
+        about their middle (cameras on the base).
     clustered : bool
         See :func:`chain_of`.
 
@@ -295,13 +304,15 @@ def projection_sigma(solution, camera, model, distances, grid=(32, 24), *, image
     v = (np.arange(grid[1]) + 0.5) * model.height / grid[1] - 0.5
     uv = np.stack(np.meshgrid(u, v), axis=-1)
     sigma, parts = [], []
+    low, high = (-np.inf, np.inf) if pitches is None else pitches
+    middle = image_pitch if chain.on_head or pitches is None else np.mean(pitches)
     for distance in distances:
         bearing, pitch = _beams_of_pixels(chain, model, uv, distance, image_pitch)
         points, J, by_pitch = carried(chain, bearing, pitch, distance, image_pitch)
         P = project_jacobians(points, model)[0]
         by_pitch = (P @ by_pitch[..., None])[..., 0]
-        parts.append(_parts(chain, P @ J) | {"sweep": _sweep(chain, by_pitch, pitch - image_pitch, chain.on_head)})
-        lost = np.isnan(pitch)
+        parts.append(_parts(chain, P @ J) | {"sweep": _sweep(chain, by_pitch, pitch - middle, chain.on_head)})
+        lost = ~((pitch >= low) & (pitch <= high))
         sigma.append(np.where(lost, np.nan, np.hypot(spread(chain, P @ np.nan_to_num(J)), parts[-1]["sweep"])))
     return SigmaMap(u, v, distances, np.array(sigma), {k: np.array([p[k] for p in parts]) for k in parts[0]})
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lrfcal_lib.advice import Suggestion, group_sigma, suggest_placement
+from lrfcal_lib.advice import Suggestion, brief, group_sigma, suggest_placement
 from lrfcal_lib.candidates import outline
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.platform import AXIS_NAMES
@@ -20,10 +20,11 @@ SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
 SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
 MISFIT = 4.0  # normalised squared residual, relative to the median placement's
 MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
-STATED = 2.0  # residuals in units of the stated noise
+STATED = 2.5  # residuals in units of the stated noise
 POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
-FIELD = (np.radians(np.linspace(60, 120, 7)), np.radians(np.linspace(-20, 20, 9)))
+BEARINGS = np.radians(np.linspace(60, 120, 7))
+LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'convergence', 'unobservable', 'cameras', 'placements', 'parallel', 'distance', 'pitch', 'image pitch',
-        'misfit', 'excluded', 'model error', 'noise', 'error'.
+        'misfit', 'excluded', 'model error', 'noise', 'warning', 'error'.
     words : str
     """
 
@@ -58,6 +59,8 @@ class Verdict:
         the field), errors of the model included as far as they scatter over placements; inf where nothing bounds them.
     range_noise_mm : float
         Of every single point, on top.
+    sweep_mm : float
+        What the pitch error that every sweep has of its own adds to the cloud at 2 m; 0 where not estimated.
     suggestion : Suggestion or None
     no_suggestion : str
         Why there is none.
@@ -67,6 +70,7 @@ class Verdict:
     reasons: tuple
     errors: dict
     range_noise_mm: float
+    sweep_mm: float
     suggestion: Suggestion | None
     no_suggestion: str = ""
 
@@ -87,8 +91,10 @@ class Verdict:
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
         out.append(
             "These are single standard deviations of the calibration, with errors of the model as they show between "
-            f"placements; each range has {self.range_noise_mm:.2g} mm of noise of its own."
+            f"placements; each range has {brief(self.range_noise_mm)} mm of noise of its own."
         )
+        if self.sweep_mm:
+            out.append(f"Of the cloud's error at 2 m, {brief(self.sweep_mm)} mm come from the pitch of single sweeps.")
         out.append(self.suggestion.sentence() if self.suggestion else self.no_suggestion)
         return [sentence for sentence in out if sentence]
 
@@ -98,7 +104,7 @@ def _error_words(errors):
     for name, value in errors.items():
         what, unit = name.rsplit("_", 1)
         where = "in the cloud" if what == "cloud" else f"in the image of '{what}'"
-        words.append(f"{value:.2g} {unit} {where}" if np.isfinite(value) else f"no bound {where}")
+        words.append(f"{brief(value)} {unit} {where}" if np.isfinite(value) else f"no bound {where}")
     return ", ".join(words)
 
 
@@ -131,27 +137,42 @@ def verdict(solution, models, *, distances=(1.0, 2.0, 5.0), suggest=True, **opti
             suggestion = suggest_placement(solution, models, **options)
         except DegenerateGeometry as error:
             problem = f"No placement can be suggested: {error}."
-    noise = 1000 * range_noise(solution)
-    return Verdict(answer, tuple(reasons), errors, noise, suggestion, problem)
+    sweep = 1000 * float(np.sqrt(np.mean(_cloud(solution, 2.0).parts["sweep"] ** 2)))
+    return Verdict(answer, tuple(reasons), errors, 1000 * range_noise(solution), sweep, suggestion, problem)
 
 
 def expected_errors(solution, models, distance):
     """Standard deviations at one distance: 'cloud_mm', and '<camera>_px' of each camera."""
-    out = {"cloud_mm": 1000 * float(point_sigma(solution, *FIELD, distance).rms()[0])}
-    for camera in solution.transforms:
-        out[f"{camera}_px"] = float(projection_sigma(solution, camera, models[camera], distance, (12, 9)).rms()[0])
+    low, high = field_pitches(solution)
+    out = {"cloud_mm": 1000 * float(_cloud(solution, distance).rms()[0])}
+    for camera, model in ((c, models[c]) for c in solution.transforms):
+        found = projection_sigma(
+            solution, camera, model, distance, (12, 9), image_pitch=(low + high) / 2, pitches=(low, high)
+        )
+        out[f"{camera}_px"] = float(found.rms()[0])
     return out
+
+
+def _cloud(solution, distance):
+    low, high = field_pitches(solution)
+    return point_sigma(solution, BEARINGS, np.linspace(low, high, 9), distance, reference=(low + high) / 2)
+
+
+def field_pitches(solution):
+    """First and last pitch over which errors are judged: as recorded, but not a narrow strip; radians."""
+    groups = (solution.data.face, solution.data.beam)
+    pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
+    low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
+    return min(low, (low + high) / 2 - LEAST_FIELD), max(high, (low + high) / 2 + LEAST_FIELD)
 
 
 def error_reasons(errors):
     """Errors at 2 m that are too large for anybody."""
-    reasons = []
-    for name, value in errors.items():
-        unit = name.rsplit("_", 1)[1]
-        if not value <= POOR[unit]:
-            answer = CARE if value <= BAD[unit] else NO
-            reasons.append(Reason(answer, "error", f"the expected error at 2 m is {_error_words({name: value})}"))
-    return reasons
+    large = {name: value for name, value in errors.items() if not value <= POOR[name.rsplit("_", 1)[1]]}
+    if not large:
+        return []
+    bad = any(not value <= BAD[name.rsplit("_", 1)[1]] for name, value in large.items())
+    return [Reason(NO if bad else CARE, "error", f"the expected error at 2 m is {_error_words(large)}")]
 
 
 def diagnose(solution):
@@ -167,7 +188,7 @@ def diagnose(solution):
     """
     checks = (
         _convergence, _cameras, _unobservable, _placements, _pitch, _parallel, _distances, _misfit, _excluded,
-        _model_error, _noise,
+        _model_error, _noise, _warnings,
     )  # fmt: skip
     return [reason for check in checks for reason in check(solution)]
 
@@ -179,13 +200,11 @@ def _convergence(solution):
 
 
 def _cameras(solution):
-    """Cameras that see no board, or hardly any."""
+    """Cameras that hardly see a board (those that never do are left out by name)."""
     view = solution.data.view
     for number, name in enumerate(solution.transforms):
         seen = int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
-        if seen == 0:
-            yield Reason(NO, "cameras", f"camera '{name}' never sees the board: nothing is known about it")
-        elif seen < FEWEST:
+        if seen < FEWEST:
             yield Reason(CARE, "cameras", f"camera '{name}' sees the board in {seen} placements only")
 
 
@@ -202,23 +221,27 @@ def _placements(solution):
 
 
 def _pitch(solution):
-    """Range of the pitch in the whole recording, and among the images of a placement."""
+    """Range of the pitch that shows the axis: of each placement, of the recording where a camera stands on the base."""
     if not any(name in solution.solution.names for name in AXIS_NAMES):
         return
     data = solution.data
-    head_views = data.view["used"] & data.on_head[data.view["camera"]] if len(data.on_head) else data.view["used"]
-    parts = [(data.face["pitch"], data.face["used"]), (data.view["pitch"], head_views)]
-    pitches = np.concatenate([pitch[used] for pitch, used in parts])
-    if len(pitches) == 0 or np.ptp(pitches) < SMALL_PITCH:
-        span = np.degrees(np.ptp(pitches)) if len(pitches) else 0.0
-        words = f"the recorded pitch ranges over {span:.1f} deg only: the tilt axis is hardly determined"
-        yield Reason(NO, "pitch", words)
-        return
-    if head_views.any():
-        spans = [np.ptp(p[u]) for p, u in zip(data.view["pitch"], head_views, strict=True) if u.any()]
-        if max(spans) < SMALL_IMAGE_PITCH:
-            words = "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"
-            yield Reason(CARE, "image pitch", words)
+    on_head = data.view["used"] & (data.on_head[data.view["camera"]] if len(data.on_head) else False)
+    pitch = np.hstack([data.face["pitch"], data.beam["pitch"], data.view["pitch"]])
+    used = np.hstack([data.face["used"], data.beam["used"], on_head])
+    spans = _ranges(pitch, used)
+    span, where = (spans.max(), "within a placement") if np.all(data.on_head) else (np.ptp(pitch[used]), "")
+    if span < SMALL_PITCH:
+        words = f"the recorded pitch ranges over {np.degrees(span):.1f} deg only {where}".strip()
+        yield Reason(NO, "pitch", f"{words}: the tilt axis is hardly determined")
+    elif on_head.any() and _ranges(data.view["pitch"], on_head).max() < SMALL_IMAGE_PITCH:
+        words = "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"
+        yield Reason(CARE, "image pitch", words)
+
+
+def _ranges(values, used):
+    """Range of the used values in each row, 0 where there are none."""
+    high, low = np.max(values, axis=1, where=used, initial=-np.inf), np.min(values, axis=1, where=used, initial=np.inf)
+    return np.where(used.any(axis=1), high - low, 0.0)
 
 
 def _parallel(solution):
@@ -272,20 +295,24 @@ def _model_error(solution):
     ratio = scatter[worst] / max(plain[worst], 1e-12)
     if ratio > MODEL_ERROR:
         what = "the axis" if worst == "axis" else f"camera '{worst}'"
-        words = f"placements disagree about {what} {ratio:.1f} times more than the noise explains: an error of the model"
+        words = f"placements disagree about {what} {ratio:.1f} times more than noise explains: an error of the model"
         yield Reason(CARE, "model error", words)
 
 
 def _noise(solution):
-    """Residuals much larger than the stated noise."""
+    """Noise estimated much larger than stated."""
     found = {"ranges": solution.noise.get("face_scale", 1.0)}
     found |= {f"images of '{c}'": solution.noise.get(f"view_scale_{c}", 1.0) for c in solution.transforms}
-    overall = np.sqrt(np.median(list(solution.misfit.values()))) if solution.misfit else 1.0
     large = [f"{name} {scale:.1f} times" for name, scale in found.items() if scale > STATED]
-    if not large and overall > STATED:
-        large = [f"all together {overall:.1f} times"]
     if large:
         yield Reason(CARE, "noise", "residuals are larger than the stated noise (" + ", ".join(large) + ")")
+
+
+def _warnings(solution):
+    """What the solver itself finds suspicious, as far as no other check says it."""
+    for words in solution.warnings:
+        if not words.startswith(("not converged", "the data do not determine")):
+            yield Reason(CARE, "warning", words)
 
 
 __all__ = ["CARE", "NO", "Reason", "Verdict", "YES", "board_middles", "diagnose", "expected_errors", "verdict"]

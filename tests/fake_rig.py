@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lrfcal_lib.drivers.errors import DeviceError, NoReply
+from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.lms2xx import encode_words, scan_quarters
 from lrfcal_lib.drivers.lms2xx_replies import Configuration
 from lrfcal_lib.drivers.rig import Rig
@@ -139,7 +139,7 @@ class Lrf(Device):
     def __init__(self, head, clock):
         self.head, self.clock, self.streaming, self.silent, self.stale = head, clock, False, False, 0.0
         self.configuration = Configuration().changed(measuring_mode=0, unit="mm")
-        self.readings, self.wait = [], None
+        self.readings, self.wait, self.lost, self.reconnects = [], None, 0, 0
 
     def start(self, interlaced=False):
         self.streaming = True
@@ -162,6 +162,21 @@ class Lrf(Device):
 
     def newest(self, after=None, timeout=2.0):
         return self.take(1, after)[0]
+
+    def request(self):
+        if self.streaming:
+            raise DeviceError("the device streams; call stop() first")
+        if self.lost:
+            raise LineLost("the line is lost")
+        self.streaming = True
+        try:
+            return self.take(1)[0]
+        finally:
+            self.streaming = False
+
+    def reconnect(self, deadline=10.0):
+        self.reconnects += 1
+        self.lost -= 1
 
     def take(self, count, after=None, timeout=None):
         if not self.streaming:
@@ -220,7 +235,9 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
     stated = checked(rig_of(json.loads(json.dumps(data or rig_data()))))
     head = Head(clock, feedback, silent_moving)
     cameras = {name: Camera(name, head, clock) for name in stated.cameras}
-    return Rig(stated, Lrf(head, clock), head, cameras, clock=clock)
+    rig = Rig(stated, Lrf(head, clock), head, cameras, clock=clock)
+    rig._closing.callback(head.close)
+    return rig
 
 
 def opened(rig):

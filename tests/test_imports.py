@@ -15,9 +15,11 @@ RANKS = [
     {"session"},
     {"preprocess", "importers"},
     {"solvers"},
-    {"uncertainty", "candidates", "forecast", "advice", "verdict"},
+    {"uncertainty", "candidates", "forecast", "advice", "residuals", "verdict"},
     {"reconstruct", "prepared"},
     {"pairing"},
+    {"joint_pairing"},
+    {"joint_calibration"},
     {"pipeline"},
     {"evaluate"},
     {"notebook", "plots", "export", "report", "acquisition", "drivers"},  # drivers: seen from above, see APART

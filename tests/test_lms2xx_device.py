@@ -237,17 +237,19 @@ PAST = {"quiet": lambda *_: None, "stream": _streaming, "interlaced": _interlace
         "half a telegram": _half_a_telegram}  # fmt: skip
 
 
-@pytest.mark.parametrize("rate", [9600, 19200, 38400, 500000])
-def test_the_device_is_found_at_any_rate_whatever_it_was_doing(emulated, rate):
-    def find(past, device):
-        PAST[past](device, device.path)
-        with LMS2xx.open(device.path) as lms:
-            assert (lms.baudrate, lms.type, lms.firmware, lms.variant) == (rate, "LMS221-302063", "X01.27", (180, 0.5))
-            return past, device.streaming, device.memory.mode
+@pytest.mark.parametrize("rates", [(9600, 500000), (19200, 38400)])
+def test_the_device_is_found_at_any_rate_whatever_it_was_doing(emulated, rates):
+    cases = [(past, rate) for past in PAST for rate in rates]
 
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(find, PAST, [emulated(baudrate=rate) for _ in PAST]))
-    assert found == [(past, False, 0x25) for past in PAST]
+    def find(case, device):
+        PAST[case[0]](device, device.path)
+        with LMS2xx.open(device.path) as lms:
+            assert (lms.type, lms.firmware, lms.variant) == ("LMS221-302063", "X01.27", (180, 0.5))
+            return case[0], lms.baudrate, device.streaming, device.memory.mode
+
+    with ThreadPoolExecutor(len(cases)) as pool:
+        found = list(pool.map(find, cases, [emulated(baudrate=rate) for _, rate in cases]))
+    assert found == [(past, rate, False, 0x25) for past, rate in cases]
 
 
 def test_opening_switches_to_the_rate_wanted_and_no_flash_is_written(emulated):
@@ -656,24 +658,32 @@ def test_the_line_comes_back_with_the_same_settings(emulated):
         assert time.monotonic() - begin < DEADLINE_S
 
 
-@pytest.mark.parametrize("fault", ["unplug", "reboot", "rate"])
-def test_a_stream_comes_back_by_itself_with_the_same_settings(emulated, fault):
-    device = emulated(baudrate=9600)
-    with LMS2xx.open(device.path, baudrate=500000) as lms:
-        lms.set_variant(100, 0.5)
-        lms.start()
-        lms.take(3, timeout=DEADLINE_S)
-        if fault == "unplug":
-            device.faults.inject(fault)
-            wait_for(lambda: device.faults.counts[fault])
-        else:
-            device.line.at(0, device._restart if fault == "reboot" else device._lose_rate)
-            device.line.wake()
-        wait_for(lambda: lms.counts["reconnects"])
-        reading = lms.newest(after=time.time(), timeout=DEADLINE_S)
-        assert len(reading.ranges) == 201 and record_of(device, reading)
-        assert device.baudrate == 500000 and device.memory.flash_writes == 0
-    assert not device.streaming
+def _disturb(device, fault):
+    """Let a fault happen that ends a stream."""
+    if fault == "unplug":
+        device.faults.inject(fault)
+        wait_for(lambda: device.faults.counts[fault])
+    else:
+        device.line.at(0, device._restart if fault == "reboot" else device._lose_rate)
+        device.line.wake()
+
+
+def test_a_stream_comes_back_by_itself_with_the_same_settings(emulated):
+    def interrupt(fault, device):
+        with LMS2xx.open(device.path, baudrate=500000) as lms:
+            lms.set_variant(100, 0.5)
+            lms.start()
+            lms.take(3, timeout=DEADLINE_S)
+            _disturb(device, fault)
+            wait_for(lambda: lms.counts["reconnects"])
+            reading = lms.newest(after=time.time(), timeout=DEADLINE_S)
+            assert len(reading.ranges) == 201 and record_of(device, reading)
+            assert device.baudrate == 500000 and device.memory.flash_writes == 0
+        assert not device.streaming
+
+    faults = ("unplug", "reboot", "rate")
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(interrupt, faults, [emulated(baudrate=9600) for _ in faults]))
 
 
 def test_a_stream_on_a_lost_line_can_be_stopped(emulated):

@@ -46,9 +46,9 @@ class Campaign:
             self.survive(self.lms.stop)
             for kind in requested:
                 self.disturb(kind)
-                self.survive(self.some_call())  # may fail, within its deadline
+                worked = self.survive(self.some_call())  # may fail, within its deadline
                 self.over(kind)
-                self.recovers(kind, self.request)
+                self.recovers(kind, self.request, worked)
         return self
 
     # ------------------------------------------------------------------------------------------ causing a fault
@@ -108,12 +108,12 @@ class Campaign:
         finally:
             self.calls.append(time.monotonic() - begin)
 
-    def recovers(self, kind, call):
-        """Time until a call works, with the one remedy that the driver offers."""
+    def recovers(self, kind, call, worked=True):
+        """Time until a call works; after one that failed comes the one remedy that the driver offers."""
         begin = time.monotonic()
-        while not self.survive(call):
+        while not (worked and self.survive(call)):
             assert time.monotonic() < begin + HANG_S, f"no recovery from {kind}"
-            self.survive(lambda: self.lms.reconnect(deadline=10))
+            worked = self.survive(lambda: self.lms.reconnect(deadline=10))
         self.recoveries.append((kind, time.monotonic() - begin))
 
     def accept(self, readings):
@@ -164,10 +164,8 @@ def test_no_wrong_scan_is_accepted(campaigns):
 
 
 def test_everything_works_again_soon(campaigns):
-    recoveries = [pair for one in campaigns for pair in one.recoveries]
-    for kind in KINDS:
-        times = [seconds for name, seconds in recoveries if name == kind]
-        assert np.median(times) < RECOVERY_S, kind
+    seconds = [seconds for one in campaigns for _, seconds in one.recoveries]
+    assert np.percentile(seconds, 90) < RECOVERY_S  # all of them where the machine is not busy
 
 
 def test_what_the_checksum_cannot_see():

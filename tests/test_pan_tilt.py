@@ -39,7 +39,7 @@ class PtyHead(threading.Thread):
         self.acknowledges, self.short, self.watchdog_s = acknowledges, short, watchdog_s
         self.fastest, self.down, self.sign, self.delay_s = fastest, down, sign, delay_s
         self.deaf = self.stuck = False
-        self.lies, self.ends = [], (-90.0, 90.0)
+        self.lies, self.ends, self.late = [], (-90.0, 90.0), None
         self.frames, self._segment, self._heard = [], (0.0, 0.0, at, at), math.inf
         self.path, self._lock, self._quit = path, threading.Lock(), False
         self.plug()
@@ -116,7 +116,10 @@ class PtyHead(threading.Thread):
         if self.tells and (self.tells_moving or not self.moves()):
             value = pelco_d.encode_tilt(math.radians(self.lies.pop() if self.lies else self.elevation()))
             raw = pelco_d.encode_extended(1, pelco_d.TILT, value)
-            os.write(self.master, bytes([*raw[2:6], sum(raw[2:6]) & 0xFF]) if self.short else raw)
+            raw = bytes([*raw[2:6], sum(raw[2:6]) & 0xFF]) if self.short else raw
+            if self.late is not None:  # this one comes after the next query, in place of its answer
+                raw, self.late = self.late, raw if not self.late else None
+            os.write(self.master, raw)
 
     def close(self):
         self._quit = True
@@ -141,6 +144,14 @@ def opened(make, settings=FAST, **habits):
     """A head and its driver."""
     device = make(**habits)
     return device, make.stack.enter_context(PanTilt.open(device.path, settings))
+
+
+def wait_until(holds):
+    """What the head does a moment later."""
+    deadline = time.monotonic() + 5
+    while not holds() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert holds()
 
 
 def near(degrees, tolerance=0.6):
@@ -247,6 +258,15 @@ def test_readings_that_jump_are_not_believed(make):
     device.lies = [20.0]
     assert head.pitch() == (near(10), True)
     assert not device.lies
+
+
+def test_late_reply_is_not_taken_for_the_next(make):
+    device, head = opened(make)
+    device.late = b""
+    assert head._line.tilt(0) is None
+    device._segment = (0.0, 0.0, 2.0, 2.0)
+    assert head._line.tilt(0)[1] == near(2, 0.01)
+    assert device.late is None
 
 
 def test_speed_nought_is_not_stop(make):
@@ -364,6 +384,15 @@ def _interpolate(times, pitches, instant):
     return np.interp(instant, times, pitches)
 
 
+def test_sweep_of_a_silent_head_with_a_wrong_speed_is_drawn_to_where_it_ends(make):
+    settings = dataclasses.replace(SLOW, degrees_per_second=24.0)
+    device, head = opened(make, settings, tells_moving=False)
+    head.start_sweep(15 * DEGREE)
+    track = head.finish_sweep(20)
+    assert device.elevation() == pytest.approx(20, abs=3)
+    assert [pitch for _, pitch, measured in track if not measured][-1] == near(device.elevation(), 2)
+
+
 def test_sweep_downwards_at_another_speed_learns_it(make):
     _, head = opened(make)
     head.move_to(20 * DEGREE)
@@ -478,20 +507,21 @@ def test_the_end_of_the_process_stops_the_head(make, way):
     head = PanTilt.open({str(device.path)!r}, HeadSettings(baudrate=38400, gap_s=0.005))
     head.start_sweep(1.0, speed=1)
     print("moving", flush=True)
-    time.sleep({0 if way == "exit" else 30})
+    try:
+        time.sleep({0 if way == "exit" else 30})
+    finally:
+        print("files closed", flush=True)
     """
     process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True,
                                stderr=subprocess.DEVNULL)  # fmt: skip
     assert process.stdout.readline() == "moving\n"
     if way != "exit":
-        assert device.moves()
+        wait_until(device.moves)
         process.send_signal(getattr(signal, way))
     assert process.wait(20) == {"exit": 0, "SIGTERM": 143, "SIGHUP": 129, "SIGINT": -signal.SIGINT}[way]
+    assert process.stdout.read() == "files closed\n"
     process.stdout.close()
-    deadline = time.monotonic() + 2
-    while device.moves() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not device.moves()
+    wait_until(lambda: not device.moves())
 
 
 def test_signal_handlers_are_put_back(make):
@@ -519,6 +549,16 @@ def test_line_that_comes_back_during_a_move(make):
     threading.Timer(0.5, device.plug).start()
     assert head.move_to(40 * DEGREE) == near(40)
     assert head._line.counts["reconnects"] == 1
+
+
+def test_line_that_comes_back_finds_the_head_stopped(make):
+    device, head = opened(make)
+    device._go(80.0, 4.0)
+    device.unplug()
+    device.plug()
+    with contextlib.suppress(NoReply):
+        head.pitch()
+    assert not device.moves()
 
 
 def test_line_that_stays_away(make):

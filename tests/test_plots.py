@@ -1,5 +1,6 @@
 """Figures show what they are given: in the right place, in the right colour, with units."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -9,9 +10,11 @@ from matplotlib.colors import to_hex
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib import plots
+from lrfcal_lib.advice import Direction
 from lrfcal_lib.board import Board, Chessboard, outline_lines
 from lrfcal_lib.camera import CameraModel, pinhole, project, undistort
 from lrfcal_lib.session import Sweep
+from lrfcal_lib.uncertainty import SigmaMap
 
 MODEL = CameraModel(640, 480, 500.0, 505.0, 320.0, 240.0, np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
 
@@ -315,3 +318,71 @@ def test_look_at_refuses_an_impossible_view(eye, target):
 def test_every_sensor_has_one_colour_of_its_own():
     assert len(set(plots.COLORS.values())) == len(plots.COLORS)
     assert plots.color_of("left") == plots.COLORS["left"] and plots.color_of("cam0", 9) == plots.SERIES[1]
+
+
+SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2.0]), np.array([
+    [[1.0, 2, 3], [4, 5, 6]], [[np.inf, np.inf, np.inf], [2, 2, 2]]]), {"axis": np.full((2, 2, 3), 1e-3),
+    "range noise": np.zeros((2, 2, 3))})  # fmt: skip
+
+
+def test_map_of_projection_sigma(ax):
+    plots.projection_map(ax, SIGMA, 0, "left")
+    assert labels(ax) == ("u [px]", "v [px]") and ax.get_aspect() == 1
+    assert ax.get_ylim()[0] > ax.get_ylim()[1]  # v points down
+    assert ax.get_title() == "left at 1 m: 3.9 px rms"
+    mesh = ax.collections[0]
+    assert mesh.get_clim() == (0.0, 6.0) and np.allclose(mesh.get_array().ravel(), [1, 2, 3, 4, 5, 6])
+
+
+def test_map_says_where_there_is_no_bound(ax):
+    plots.projection_map(ax, SIGMA, 1, largest=5.0)
+    assert ax.get_title() == "at 2 m: no bound"
+    assert ax.collections[0].get_array().count() == 3 and ax.collections[0].get_clim() == (0.0, 5.0)
+
+
+def test_map_of_points_in_degrees_and_millimetres(ax):
+    plots.point_map(ax, replace(SIGMA, columns=np.radians([80.0, 90, 100]), rows=np.radians([-5.0, 5])))
+    assert labels(ax) == ("bearing [deg]", "pitch [deg]") and ax.get_title() == "cloud at 1 m: 3.9e+03 mm rms"
+    assert ax.get_xlim()[0] > ax.get_xlim()[1]  # bearings grow to the left, as one sees them
+
+
+def test_parts_of_a_point_by_distance(ax):
+    plots.point_parts(ax, replace(SIGMA, sigma=SIGMA.sigma[:, 1:]))
+    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
+    assert set(drawn) == {"axis", "calibration"} and np.allclose(drawn["axis"], 1.0)
+    assert labels(ax) == ("distance [m]", "standard deviation [mm]")
+
+
+def test_observability_bars_name_what_is_lost(ax):
+    known = [Direction(0.0, "the range offset", np.inf), Direction(500.0, "the edge bias", 0.002)]
+    plots.observability_bars(ax, known)
+    assert [t.get_text() for t in ax.texts] == [" not determined", " 2 mm"]
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["the range offset", "the edge bias"]
+    assert ax.get_title() == "1 motions are not determined"
+    assert [to_hex(p.get_facecolor()) for p in ax.patches] == [plots.COLORS["outlier"], plots.COLORS["fit"]]
+
+
+def test_misfit_bars_mark_outliers(ax):
+    plots.misfit_bars(ax, {1: 1.0, 4: 0.9, 7: 9.0})
+    assert [to_hex(p.get_facecolor()) for p in ax.patches][2] == plots.COLORS["outlier"]
+    assert ax.get_title() == "1 of 3 placements fit much worse than the others"
+
+
+def test_residuals_by_range_show_a_trend(ax):
+    distance = np.linspace(1, 3, 200)
+    plots.residuals_by_range(ax, distance, 0.001 * (distance - 2))
+    x, y = ax.lines[1].get_data()
+    assert np.allclose(y, x - 2, atol=1e-9) and labels(ax) == ("range [m]", "predicted - measured [mm]")
+    assert ax.get_title() == "ranges: 0.58 mm rms"
+
+
+def test_residuals_by_region_are_arrows(ax):
+    plots.residuals_by_region(ax, np.array([[100.0, 50.0]]), np.array([[3.0, 4.0]]), MODEL, "left")
+    arrows = ax.collections[0]
+    assert np.allclose([arrows.U, arrows.V], [[3.0], [4.0]]) and arrows.scale == pytest.approx(5 / 80)
+    assert ax.get_title() == "left: 5 px rms, predicted - seen" and ax.get_ylim() == (480, 0)
+
+
+def test_residuals_of_a_camera_without_boards(ax):
+    plots.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
+    assert ax.get_title() == "right: no board in any image"

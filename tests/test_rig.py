@@ -167,16 +167,51 @@ def test_what_is_recorded_at_a_stop_is_later_than_its_rest():
             np.testing.assert_array_equal(event.frame.image, picture(settled.pitch))
 
 
-@pytest.mark.parametrize("device", ["lrf", "camera"])
-def test_what_is_older_than_the_rest_is_refused(device):
+@pytest.mark.parametrize("interlaced", [False, True])
+def test_what_is_older_than_the_rest_is_refused(interlaced, monkeypatch):
+    monkeypatch.setattr(rig_module, "SCAN_S", 0.05)
     rig = make_rig()
-    if device == "lrf":
-        rig.lrf.stale = 0.5
-    else:
-        newest = rig.cameras["left"].newest
-        rig.cameras["left"].newest = lambda **options: replace(newest(), time_s=rig.clock() - 1)
-    with pytest.raises(DeviceError, match="older than"):
+    rig.stated.lrf_device["interlaced"] = interlaced
+    newest = rig.cameras["left"].newest
+    rig.cameras["left"].newest = lambda **options: replace(newest(), time_s=rig.clock() - 1)
+    with pytest.raises(DeviceError, match="image of camera 'left' is .* older than the stop"):
         events_of(rig)
+    rig.lrf.stale = 1e6
+    with pytest.raises(DeviceError, match="scan is .* older than the stop" if interlaced else "no scan later than"):
+        events_of(rig)
+
+
+def test_scans_that_began_before_the_rest_are_asked_for_again():
+    rig = make_rig()
+    scan, begun = rig.lrf._scan, []
+
+    def sometimes_early(instant):
+        begun.append(instant)
+        return scan(instant - 3.0 * (len(begun) % 3 == 1))
+
+    rig.lrf._scan = sometimes_early
+    settled = None
+    for event in events_of(rig):
+        settled = event.time_s if isinstance(event, Moved) else settled
+        assert not isinstance(event, Scanned) or event.readings[0].time_s > settled
+    assert len(begun) > 9
+
+
+def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
+    rig = make_rig()
+    rig.lrf.lost = 1
+    assert len([e for e in events_of(rig) if isinstance(e, Scanned)]) == 9
+    assert rig.lrf.reconnects == 1 and "the line is lost; looking for" in caplog.text
+    rig.lrf.lost = 2
+    with pytest.raises(DeviceError, match="the line is lost"):
+        events_of(rig)
+
+
+def test_interlaced_scans_are_streamed():
+    rig = make_rig(rig_data(scans_per_stop=2))
+    rig.stated.lrf_device["interlaced"] = True
+    assert [len(e.readings) for e in events_of(rig) if isinstance(e, Scanned)] == [2] * 9
+    assert not rig.lrf.streaming
 
 
 def test_nothing_is_held_back():

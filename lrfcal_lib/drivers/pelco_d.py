@@ -331,7 +331,7 @@ def _may_grow(rest, sent):
         return not sent.startswith(rest[:FRAME])
     if rest[0] == SYNC:
         return len(rest) < GENERAL or len(rest) < FRAME and rest[2] == 0 and rest[3] in ANSWERS
-    return rest == b"\x01" or rest[0] == 0 and len(rest) < SHORT and (len(rest) < 2 or rest[1] in ANSWERS)
+    return rest == b"\x01"
 
 
 def _echo_at(data, at, sent, first):

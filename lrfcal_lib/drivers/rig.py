@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.drivers.control import ask
-from lrfcal_lib.drivers.errors import DeviceError, NoReply
+from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
 from lrfcal_lib.drivers.rig_file import RigFileError
 
@@ -254,19 +254,43 @@ class Rig:
                 LOG.error("the %s could not be stopped (%s): cut its power if it moves", name, error)
 
     def _stop_and_go(self, placement):
-        stops = _stops(placement)
-        self.lrf.start(interlaced=bool(self.stated.lrf_device.get("interlaced")))
+        stops, interlaced = _stops(placement), bool(self.stated.lrf_device.get("interlaced"))
+        if interlaced:
+            self.lrf.start(interlaced=True)
         for number, (pitch, scan, photo) in enumerate(stops, 1):
             moved = self._move(placement.number, pitch, number, len(stops))
             yield moved
             if scan:
-                count = self.stated.plan.scans_per_stop
-                readings = self.lrf.take(count, after=moved.time_s, timeout=SCAN_S * count)
+                readings = self._take(moved.time_s) if interlaced else self._request(moved.time_s)
                 _later(readings[0].time_s, moved, "scan")
-                yield Scanned(placement.number, tuple(readings), np.full(count, moved.pitch))
+                yield Scanned(placement.number, tuple(readings), np.full(len(readings), moved.pitch))
             if photo:
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
         self.lrf.stop()
+
+    def _take(self, after):
+        """Scans of a stream, all later than an instant."""
+        count = self.stated.plan.scans_per_stop
+        return self.lrf.take(count, after=after, timeout=SCAN_S * count)
+
+    def _request(self, after):
+        """Scans one by one, all later than an instant; a line that was lost is given one chance to come back."""
+        found, mended, end = [], False, time.monotonic() + SCAN_S
+        while len(found) < self.stated.plan.scans_per_stop:
+            try:
+                reading = self.lrf.request()
+            except (LineLost, NoReply) as error:
+                if mended:
+                    raise
+                LOG.warning("%s; looking for the laser range finder", error)
+                self.lrf.reconnect()
+                mended = True
+                continue
+            if reading.time_s > after:
+                found, after, end = [*found, reading], reading.time_s, time.monotonic() + SCAN_S
+            elif time.monotonic() > end:
+                raise NoReply(f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s")
+        return found
 
     def _move(self, placement, pitch, number, of):
         reached = self.head.move_to(pitch)

@@ -7,6 +7,7 @@ from lrfcal_lib.evaluate.tables import (
     camera_calibration_table,
     edge_lengths,
     edge_summary,
+    handed_over,
     intrinsics_table,
     left_out_residuals,
     method_comparison,
@@ -27,7 +28,8 @@ from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, edge_po
 
 __all__ = [
     "PAPER_EDGES_MM", "Truth", "axis_errors", "axis_knowledge_table", "best_method", "camera_calibration_table",
-    "camera_errors", "edge_lengths", "edge_point_table", "edge_summary", "intrinsics_table", "left_out_residuals",
+    "camera_errors", "edge_lengths", "edge_point_table", "edge_summary", "handed_over", "intrinsics_table",
+    "left_out_residuals",
     "method_comparison", "outline_table", "pitch_errors_table", "pitch_models_table", "placements_table",
     "plane_residuals_of", "platform_calibration_table", "poses_under", "read_truth", "rms", "scans_table",
     "stereo_check", "sweeps_table", "trusted_sigma",

@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
 from lrfcal_lib.geometry import DegenerateGeometry, paper_parameters, transform_difference
-from lrfcal_lib.pairing import outline_of
+from lrfcal_lib.joint_calibration import left_out_residuals as jointly_left_out
+from lrfcal_lib.pairing import likely_outline_of, outline_of
 from lrfcal_lib.prepared import VARIANTS
 from lrfcal_lib.solvers import METHODS
 from lrfcal_lib.solvers.camera import edge_residuals_px, plane_residuals_m
@@ -147,7 +148,7 @@ def left_out_residuals(obs, judge, solve, full):
     return edge_px, plane_m
 
 
-def method_comparison(observations, solutions, left_out=True, truth=None):
+def method_comparison(observations, solutions, left_out=True, truth=None, joint=None):
     """Every method judged on the same crossings and face points, and on placements it has not seen.
 
     Parameters
@@ -161,6 +162,9 @@ def method_comparison(observations, solutions, left_out=True, truth=None):
         Also leave out one placement after another (one more solve for each).
     truth : Truth, optional
         Of a simulated session.
+    joint : JointCalibration, optional
+        With its estimates without each placement (:func:`lrfcal_lib.joint_calibration.leave_one_out`): the left-out
+        columns of the method 'joint'. It is judged on the same beams, with its own platform and range offset.
 
     Returns
     -------
@@ -170,18 +174,26 @@ def method_comparison(observations, solutions, left_out=True, truth=None):
     """
     rows = []
     for (camera, name), solution in solutions.items():
-        method, judge = METHODS[name], observations[camera, "half_step"].along()
-        own = observations[camera, method.variant]
+        variant, uses = ("joint", "plane") if name == "joint" else (METHODS[name].variant, METHODS[name].uses)
+        own, judge = observations[camera, variant], _judge(observations, camera, name)
         edge = edge_residuals_px(judge, solution.transform, solution.model)
-        nothing = np.zeros(0), np.zeros(0)
-        held_edge, held_plane = left_out_residuals(own, judge, method.solve, solution) if left_out else nothing
-        row = {"camera": camera, "method": name, "n_placements": len(np.unique(getattr(own, USED[method.uses])))}
+        held_edge, held_plane = np.zeros(0), np.zeros(0)
+        if left_out and name == "joint" and joint is not None:
+            held_edge, held_plane = jointly_left_out(joint, camera)
+        elif left_out and name != "joint":
+            held_edge, held_plane = left_out_residuals(own, judge, METHODS[name].solve, solution)
+        row = {"camera": camera, "method": name, "n_placements": len(np.unique(getattr(own, USED[uses])))}
         row["edge_median_px"] = float(np.median(np.abs(edge))) if len(edge) else np.nan
         row["edge_rms_px"] = rms(edge)
         row["plane_rms_mm"] = 1000 * rms(plane_residuals_of(judge, solution))
         row["left_out_edge_rms_px"], row["left_out_plane_rms_mm"] = rms(held_edge), 1000 * rms(held_plane)
         rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
+
+
+def _judge(observations, camera, name):
+    """The points that methods are judged on; the joint estimate has its own platform."""
+    return observations[camera, "joint" if name == "joint" else "half_step"].along()
 
 
 def best_method(comparison, among=("line", "zhang_pless")):
@@ -213,6 +225,29 @@ def best_method(comparison, among=("line", "zhang_pless")):
     if score.empty:
         raise ValueError(f"none of {', '.join(among)} was judged on left-out placements; it takes more of them")
     return score.idxmin()
+
+
+def handed_over(calibration):
+    """The method whose result goes into ``calibration.json`` and colours the cloud.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Returns
+    -------
+    str
+        'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
+
+    Raises
+    ------
+    ValueError
+        If no method was judged on left-out placements.
+    """
+    joint = calibration.joint
+    if joint is not None and joint.solution.converged and not joint.solution.unobservable:
+        return "joint"
+    return best_method(method_comparison(calibration.observations, calibration.solutions))
 
 
 def camera_calibration_table(solutions):
@@ -450,7 +485,7 @@ def stereo_check(solutions, cameras, T_second_first):
     first, second = cameras
     baseline = np.linalg.norm(T_second_first.translation)
     rows = []
-    for method in METHODS:
+    for method in (*METHODS, "joint"):
         if (first, method) not in solutions or (second, method) not in solutions:
             continue
         found = solutions[second, method].transform * solutions[first, method].transform.inv()
@@ -461,14 +496,17 @@ def stereo_check(solutions, cameras, T_second_first):
     return pd.DataFrame(rows)
 
 
-def edge_lengths(prepared, T_head_lrf=None):
+def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None):
     """Edges of the board measured in the cloud of every placement, beside the paper's own row.
 
     Parameters
     ----------
     prepared : Prepared
     T_head_lrf : RigidTransform, optional
-        The session's own platform when left out.
+        For the least-squares variants; the session's own platform when left out.
+    edge_model_of : callable, optional
+        ``edge_model_of(placement) -> EdgeModel``, from a calibration that has not seen the placement. Adds the variant
+        'likelihood', which does not know the board's size.
 
     Returns
     -------
@@ -477,28 +515,36 @@ def edge_lengths(prepared, T_head_lrf=None):
         sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams decide both
         ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines).
     """
+    ways = {v: lambda placement, v=v: _by_least_squares(prepared, placement, v, T_head_lrf) for v in VARIANTS}
+    if edge_model_of is not None:
+        ways["likelihood"] = lambda placement: likely_outline_of(prepared, placement, edge_model_of(placement))
     rows = []
-    for variant in VARIANTS:
+    for variant, measure in ways.items():
         for placement in prepared.session.board_placements:
-            rows += _placement_lengths(prepared, placement, variant, T_head_lrf)
+            rows += _placement_lengths(prepared, placement, variant, measure)
     rows += [("paper", np.nan, name, "scan", "last_beam", *PAPER_EDGES_MM[name]) for name in PAPER_EDGES_MM]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
 
 
-def _placement_lengths(prepared, placement, variant, T_head_lrf):
+def _by_least_squares(prepared, placement, variant, T_head_lrf):
+    outline = outline_of(prepared, placement, variant, T_head_lrf)
+    return outline.measured, outline.across
+
+
+def _placement_lengths(prepared, placement, variant, measure):
     """Rows of one placement: every edge that a camera sees, NaN where the cloud does not show both its ends."""
     try:
-        outline = outline_of(prepared, placement, variant, T_head_lrf) if placement in prepared.names else None
+        measured, across = measure(placement) if placement in prepared.names else (None, frozenset())
     except DegenerateGeometry:
-        outline = None
+        measured, across = None, frozenset()
     rows = []
     for name, true in prepared.board.lengths().items():
-        length = np.nan if outline is None else outline.measured.lengths.get(name, np.nan)
+        length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):
-            ends = "pitch" if _neighbours(prepared.board.edges, name) & outline.across else "scan"
+            ends = "pitch" if _neighbours(prepared.board.edges, name) & across else "scan"
         if _seen_in_image(prepared, placement, name):
             rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
     return rows

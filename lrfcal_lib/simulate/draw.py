@@ -25,6 +25,10 @@ def _board():
     return triangle_board(pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
 
 
+def _camera():
+    return CameraModel(1280, 960, 1000.0, 1000.0, 639.5, 479.5, np.zeros(5))
+
+
 @dataclass(frozen=True)
 class ShotSetup:
     """What single shots are drawn from: the paper's devices.
@@ -58,7 +62,7 @@ class ShotSetup:
     softness: float = 0.03
     distances: tuple[float, float] = (1.0, 2.5)
     board: Board = field(default_factory=_board)
-    model: CameraModel = field(default_factory=lambda: CameraModel(1280, 960, 1000.0, 1000.0, 639.5, 479.5, np.zeros(5)))
+    model: CameraModel = field(default_factory=_camera)
 
     def bearings(self):
         """From 40 to 140 deg, radians, shape (B,)."""

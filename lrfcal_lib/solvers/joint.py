@@ -19,6 +19,7 @@ from lrfcal_lib.solvers.joint_noise import (
     rough_misses,
 )
 from lrfcal_lib.solvers.joint_start import start_states
+from lrfcal_lib.solvers.joint_warnings import joint_warnings
 from lrfcal_lib.solvers.least_squares import minimise, solve, whiten
 from lrfcal_lib.solvers.platform import AXIS_NAMES, AXIS_WORDS
 from lrfcal_lib.solvers.platform_blocks import chart_parameters
@@ -34,7 +35,8 @@ LEVELS = (
     "prior",
 )  # fmt: skip
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
-GOOD_START = 25.0  # half a squared residual; a start value this good is not searched further
+GOOD_START = 5.0  # mean half squared residual; a start value this good is not searched further
+LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 
@@ -61,10 +63,13 @@ class JointSolution:
         Factors on the stated standard deviations, and shares of independent errors, as estimated.
     misfit : dict of int to float
         Normalised squared residuals of each placement (1 is what the noise explains).
-    excluded : dict of int to str
-        Placements left out, with the reason.
+    excluded : dict of int or str to str
+        Placements (and cameras) left out, with the reason.
     unobservable : tuple of str
         Motions that the data do not determine, in words.
+    warnings : tuple of str
+        What is suspicious: no convergence, noise that contradicts what is stated, a weak axis, errors of the pitch that
+        the data ask for.
     solution : Solution
         Of the shared unknowns (covariances, names, convergence).
     state : JointState
@@ -82,6 +87,7 @@ class JointSolution:
     misfit: dict
     excluded: dict
     unobservable: tuple
+    warnings: tuple
     solution: Solution
     state: JointState
     unknowns: Unknowns
@@ -221,21 +227,33 @@ def solve_joint(
         For unknown names, contradictory noise settings, or observations that are not finite.
     """
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
+    obs, blind = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
-    excluded = {}
+    excluded = blind
     if start is None:
-        obs, start, excluded = best_start(obs, unknowns, sweep_sigma, T0)
+        obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
+        excluded = excluded | bad
     data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), side_sigma=side_sigma, prior=prior)
-    state = _converge(start, data, unknowns, max_iterations)
+    state = _converge(start, data, coarse(unknowns), max_iterations)
+    state = _converge(state, data, unknowns, max_iterations)
     data = replace(data, lapse=lapse)
     if noise == "estimate":
         state, data = settle(state, data, unknowns, max_iterations)
         obs, state, data, bad = drop_contradictions(obs, state, data, unknowns)
-        excluded |= bad
+        excluded = excluded | bad
         if bad:
             state, data = settle(state, data, unknowns, max_iterations)
     found = _solve(obs, data, in_stated_gauge(state, obs), unknowns, required, max_iterations)
     return _wrap(obs, data, unknowns, found, excluded)
+
+
+def without_blind_cameras(obs, required):
+    """Leave out cameras that never see a board, by name; refuse them where everything is required."""
+    blind = [name for i, name in enumerate(obs.cameras) if not (obs.view_camera == i).any()]
+    words = {f"camera {name}": f"camera '{name}' never sees the board: its pose stays open" for name in blind}
+    if blind and required:
+        raise DegenerateGeometry("; ".join(words.values()) + "; leave it out with obs.with_cameras")
+    return (obs.with_cameras([n for n in obs.cameras if n not in blind]) if blind else obs), words
 
 
 def settle(state, data, unknowns, iterations):
@@ -335,11 +353,18 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = replace(gather(kept) if bad else data, sweep_sigma=tuple(sweep_sigma))
         state, cost = a_few_steps(fitting, cut, unknowns)
-        if best is None or cost < least:
-            best, least = (kept, state, bad), cost
-        if least < GOOD_START * count_rows(cut):
+        badness = cost / count_rows(cut) + LEFT_OUT * len(bad) / len(obs.placements)
+        if best is None or badness < least:
+            best, least = (kept, state, bad), badness
+        if least < GOOD_START:
             break
     kept, state, bad = best
+    miss = np.median(rough_misses(state, gather(kept)))
+    if miss > ROUGH_MISS:
+        raise DegenerateGeometry(
+            f"images and scans contradict each other: in the middle of the placements the board lies {1000 * miss:.0f} mm "
+            "off where the images put it; check that images and scans carry the right numbers, and the board's size"
+        )
     if len(bad) > LARGEST_SHARE * len(obs.placements):
         raise DegenerateGeometry(
             f"{len(bad)} of {len(obs.placements)} placements contradict the others: their images put the board "
@@ -365,9 +390,14 @@ def without_contradictions(obs, state, data):
 
 def a_few_steps(state, data, unknowns):
     """A state after a few steps with soft edges, and its cost."""
-    coarse = replace(unknowns, sensor=tuple(n for n in unknowns.sensor if n == "range_offset"), sides=False)
-    state = _converge(state, data, coarse, START_STEPS)
-    return state, total_cost(state, data, coarse)
+    few = coarse(unknowns)
+    state = _converge(state, data, few, START_STEPS)
+    return state, total_cost(state, data, few)
+
+
+def coarse(unknowns):
+    """The unknowns without those of the edges: from far away, beams on the wrong side would blow up the softness."""
+    return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
 
 
 def count_rows(data):
@@ -458,7 +488,8 @@ def _wrap(obs, data, unknowns, found, excluded):
         dict(zip(obs.edges, state.size.tolist(), strict=True)),
         noise_levels(data, obs.cameras),
         dict(zip(obs.placements.tolist(), misfits(state, data, unknowns).tolist(), strict=True)),
-        excluded, found.unobservable, found, state, unknowns, data,
+        excluded, found.unobservable, joint_warnings(state, data, unknowns, found, obs.cameras), found, state, unknowns,
+        data,
     )  # fmt: skip
 
 

@@ -21,6 +21,8 @@ from lrfcal_lib.solvers.pose import POSE_NAMES, cross, move_pose
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
 EXTRA = ("size",)  # one unknown an edge
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
+LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
+USUAL_SOFTNESS, SOFTNESS_SPREAD = 0.15, 1.0  # spot radii, and how widely its logarithm may differ
 SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
 AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
 
@@ -415,6 +417,17 @@ def prior_block(state, data, unknowns):
     return Block(np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=cost)
 
 
+def softness_block(state, unknowns):
+    """A weak expectation of the softness, for data that do not show it; every placement holds a part."""
+    p, c = len(state.boards), unknowns.cameras
+    full = np.zeros(len(unknowns.mask))
+    full[4 + 6 * c + SENSOR.index("edge_log_softness")] = 1.0
+    J = np.zeros((p, 1, unknowns.shared + unknowns.own))
+    J[:, 0, : unknowns.shared] = full[unknowns.mask]
+    away = state.sensor[2] - np.log(USUAL_SOFTNESS)
+    return Block(np.full((p, 1), away), J, np.full((p, 1), 1 / (SOFTNESS_SPREAD * np.sqrt(p))))
+
+
 def joint_blocks(state, data, unknowns):
     """All residuals of the joint estimate.
 
@@ -433,13 +446,16 @@ def joint_blocks(state, data, unknowns):
 
 
 def named_blocks(state, data, unknowns):
-    """Residuals by name: 'face' (metres), 'beam' (likelihoods), 'view' (radians and metres), 'sweep', 'side', 'prior'."""
+    """Residuals by name: 'face' (metres), 'beam' (likelihoods), 'view' (radians and metres), 'sweep', 'side', 'softness',
+    'prior'."""
     makers = {"face": face_block, "beam": beam_block, "view": view_block}
     blocks = {n: make(state, data, unknowns) for n, make in makers.items() if getattr(data, n)["used"].any()}
     if SWEEPS[unknowns.sweep]:
         blocks["sweep"] = sweep_block(state, data, unknowns)
     if unknowns.sides:
         blocks["side"] = side_block(state, data, unknowns)
+    if "edge_log_softness" in unknowns.sensor:
+        blocks["softness"] = softness_block(state, unknowns)
     if data.prior is not None and unknowns.axis:
         blocks["prior"] = prior_block(state, data, unknowns)
     return blocks
@@ -465,6 +481,7 @@ def move_state(state, step, unknowns):
     head = np.zeros(6)
     head[AXIS_COLUMNS] = full[:4]
     sensor = state.sensor + full[4 + 6 * c : 9 + 6 * c]
+    sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
     sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
     count = SWEEPS[unknowns.sweep]
     sweeps = state.sweeps.copy()

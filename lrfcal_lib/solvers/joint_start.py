@@ -40,6 +40,8 @@ def start_states(obs, T0=None):
     DegenerateGeometry
         When no placement gives the pose of a board.
     """
+    if len(obs.face_range) == 0:
+        raise DegenerateGeometry("no ranges on the boards' faces: a start value needs them; give one as start=")
     reasons, made = [], 0
     direct = _cameras_at_image_pitch(obs)
     heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
@@ -220,7 +222,8 @@ def board_from_scan(obs, placement, head):
     axes = np.stack([np.cross([0.0, 0.0, 1.0], normal), np.cross(normal, np.cross([0.0, 0.0, 1.0], normal)), normal])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     rotation, shift = _turn_in_plane(obs, placement, head, axes, centre)
-    return RigidTransform.from_components(centre + axes.T @ np.append(shift, 0.0), axes.T @ rotation)
+    rotation = Rotation.from_matrix(axes.T @ rotation)
+    return RigidTransform.from_components(centre + axes.T @ np.append(shift, 0.0), rotation)
 
 
 def _turn_in_plane(obs, placement, head, axes, centre):

@@ -19,7 +19,13 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.solvers.observability import by_placement, name_words, placement_covariance, unobservable_motions
+from lrfcal_lib.solvers.observability import (
+    by_placement,
+    name_words,
+    placement_covariance,
+    unobservable_motions,
+    with_infinities,
+)
 from lrfcal_lib.solvers.solution import Solution
 
 HUBER, CAUCHY = 1.345, 2.385  # 95 % efficiency for normal errors
@@ -359,6 +365,7 @@ def solve(
     inflation = _inflation(chi2, freedom)
     unit = np.asarray(scales)[:, None] * np.asarray(scales)
     covariance = np.linalg.pinv(hessian * unit, rcond=1e-14, hermitian=True) * unit * inflation[..., None, None]
+    covariance = with_infinities(covariance, hessian, scales)
     clustered, _ = placement_covariance(hessians, scores) if (groups is not None or shared) else (None, None)
     transform, parameters = read(state)
     iterations, history = _with_earlier(iterations, history, earlier)

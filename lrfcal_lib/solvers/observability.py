@@ -55,6 +55,29 @@ def unobservable_motions(hessian, scales, words, limit):
     return tuple(words(direction) for direction in null_space(hessian, scales, limit)[0])
 
 
+def with_infinities(covariance, hessian, scales):
+    """Covariances in which unknowns that take part in an undetermined direction have an infinite variance.
+
+    Parameters
+    ----------
+    covariance, hessian : ndarray, shape (..., k, k)
+    scales : array_like, shape (k,)
+
+    Returns
+    -------
+    ndarray, shape (..., k, k)
+        A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to zero.
+    """
+    if hessian.ndim > 2:
+        return covariance
+    lost = null_space(hessian, scales, np.inf)[0]
+    taking_part = np.any(np.abs(lost) > 0.05, axis=0)
+    if not taking_part.any():
+        return covariance
+    covariance = np.where(taking_part[:, None] | taking_part, 0.0, covariance)
+    return covariance + np.diag(np.where(taking_part, np.inf, 0.0))
+
+
 def name_words(direction, names):
     large = [name for name, value in zip(names, direction, strict=True) if abs(value) > 0.05]
     return " with ".join(large)

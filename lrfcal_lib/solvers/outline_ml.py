@@ -320,6 +320,7 @@ def _lengths(found, lines, edges):
     line = dict(zip(found, lines, strict=True))
     before = dict(zip(edges, edges[-1:] + edges[:-1], strict=True))
     after = dict(zip(edges, edges[1:] + edges[:1], strict=True))
-    corners = {n: corners_of_lines(np.stack([line[before[n]], line[n]]))[1] for n in edges if {n, before[n]} <= set(line)}
+    both = [name for name in edges if name in line and before[name] in line]
+    corners = {name: corners_of_lines(np.stack([line[before[name]], line[name]]))[1] for name in both}
     pairs = {n: (corners[n], corners[after[n]]) for n in edges if n in corners and after[n] in corners}
     return corners, {n: float(np.linalg.norm(b - a)) for n, (a, b) in pairs.items()}

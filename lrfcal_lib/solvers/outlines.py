@@ -15,11 +15,12 @@ from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
 from lrfcal_lib.solvers.least_squares import Block, minimise
 from lrfcal_lib.solvers.observability import reduced_hessian
-from lrfcal_lib.solvers.outline_ml import LAPSE, EdgeModel, face_surface, find_rays, start_lines
+from lrfcal_lib.solvers.outline_ml import LAPSE, face_surface, find_rays, start_lines
 
 SPREAD = 0.2  # of the log odds from side to side, scale of a Cauchy distribution
 GAUGE = np.array([0.1, 0.3])  # metres, radians: how far an outline may be from its start
-UNKNOWN = 5.0  # standard deviation of log odds that nothing is known about
+UNKNOWN = 2.0  # standard deviation of log odds that nothing is known about: edges anywhere within the spot
+WEAK = 1.0  # standard deviation of log odds from which on sweeps say nothing about them
 ROUNDS = 4
 
 
@@ -57,11 +58,11 @@ def fit_edge_model(sweeps, board, model):
     Raises
     ------
     DegenerateGeometry
-        If fewer than two sweeps show three sides: then the board's size says nothing about the edges.
+        If the sweeps say nothing about the log odds: none shows enough sides for the board's size to tell.
     """
     fit = _fit(sweeps, outline_lines(board.known_corners()), board.edges, model, free=False)
-    if fit["full"] < 2:
-        raise DegenerateGeometry(f"{fit['full']} sweeps show three sides of the board; an edge model takes two at least")
+    if not fit["log_odds_sigma"] < WEAK:
+        raise DegenerateGeometry(f"{len(sweeps)} sweeps cross too few sides of the board to tell how large edges look")
     deviation = np.median(np.abs(fit["deviations"])) * 1.4826
     found = {"log_odds": fit["log_odds"], "log_odds_sigma": fit["log_odds_sigma"], "softness": fit["softness"]}
     return replace(model, **found, spread=max(float(deviation), SPREAD))
@@ -235,7 +236,7 @@ def _fit(sweeps, lines, edges, model, free):
     return {
         "log_odds": float(state[0]), "log_odds_sigma": float(np.sqrt(covariance[0, 0])), "softness": float(softness),
         "lines": state[1], "covariance": covariance[1:, 1:], "deviations": state[3][there],
-        "full": sum(len(found) >= 3 for found in seen), "seen": set().union(*seen),
+        "seen": set().union(*seen),
     }  # fmt: skip
 
 

@@ -1,0 +1,412 @@
+"""The joint estimate: derivatives, invariances, recovery of the truth, subsets of the data, and far starts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joint_draws import draw, none
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.evaluate.monte_carlo import bound, state_errors
+from lrfcal_lib.geometry import DegenerateGeometry, axis_difference, transform_difference
+from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint, total_cost
+from lrfcal_lib.solvers.joint_blocks import SENSOR, JointState, Unknowns, gather, move_state, named_blocks
+from lrfcal_lib.solvers.joint_observations import JointObservations
+from lrfcal_lib.solvers.least_squares import whiten
+from lrfcal_lib.solvers.pose import pose_array, pose_transform
+
+MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
+SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
+PLAIN = ("range_offset", "edge_log_odds", "edge_log_softness")
+
+
+def rng(seed=3):
+    return np.random.default_rng(seed)
+
+
+def apart(a, b):
+    """Largest of the angle (rad) and the distance (m) between two transforms."""
+    return max(transform_difference(a, b))
+
+
+def scores(found, truth):
+    """Errors of an estimate in its own standard deviations."""
+    return state_errors(found.state, truth, found.unknowns) / found.solution.sigma
+
+
+# derivatives
+
+
+def random_pose(rng, spread=0.3, at=(0, 1.5, 0)):
+    turn = Rotation.from_rotvec(rng.normal(0, spread, 3))
+    return RigidTransform.from_components(np.array(at) + rng.normal(0, 0.2, 3), turn)
+
+
+def random_problem(rng, placements=3):
+    """Observations and a state that do not fit each other, every group at odd places, one camera on either mount."""
+
+    def rows(n):
+        return {"bearing": rng.uniform(1.2, 1.9, n), "pitch": rng.uniform(-0.2, 0.2, n)} | place(n)
+
+    def place(n):
+        return {"placement": rng.integers(0, placements, n)}
+
+    roots = rng.normal(size=(9, 6, 6))
+    groups = {
+        "face": rows(20) | {"range": rng.uniform(1, 2, 20), "sigma": np.full(20, 0.01)},
+        "beam": rows(25)
+        | {"hit": rng.random(25) < 0.5, "edge": rng.integers(0, 3, 25)}
+        | {"radius": np.full(25, 0.3), "background": rng.normal(0, 0.5, 25)},
+        "view": {"camera": rng.integers(0, 2, 9), "pitch": rng.uniform(-0.2, 0.2, 9)}
+        | {"pose": np.stack([random_pose(rng, 0.1, (0, 0, 1.5)).as_matrix() for _ in range(9)])}
+        | {"covariance": roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(6)}
+        | place(9),
+    }
+    flat = {f"{name}_{key}": value for name, group in groups.items() for key, value in group.items()}
+    obs = JointObservations(
+        placements=np.arange(1, placements + 1), direction=np.resize([1, -1], placements),
+        middle=rng.normal(0, 0.1, placements), edges=("ab", "bc", "ca"), cameras=("left", "right"),
+        corners=np.array([[0, 0], [0.315, 0], [0, 0.38]]), mounts=("head", "platform"), **flat,
+    )  # fmt: skip
+    facing = RigidTransform.from_rotation(Rotation.from_euler("x", 90, degrees=True))
+    state = JointState(
+        pose_array(random_pose(rng, 0.2, (0, 0, 0.1))),
+        np.stack([pose_array(random_pose(rng, 0.2)) for _ in range(2)]),
+        np.array([0.01, 0.3, np.log(0.4), 0.02, 0.01]),
+        rng.normal(0, 0.01, 3),
+        np.stack([pose_array(random_pose(rng) * facing) for _ in range(placements)]),
+        rng.normal(0, 0.02, (placements, 2)),
+        rng.normal(0, 0.2, (placements, 3)),
+    )
+    return obs, state
+
+
+EVERY = Unknowns(2, 3, sensor=SENSOR, size=True, sweep="offset_stretch", sides=True)
+
+
+def moved(state, column, amount):
+    """The state after a step of one unknown: a shared one, or the same one of every placement."""
+    shared, own = np.zeros(EVERY.shared), np.zeros((len(state.boards), EVERY.own))
+    if column < EVERY.shared:
+        shared[column] = amount
+    else:
+        own[:, column - EVERY.shared] = amount
+    return move_state(state, (shared, own), EVERY)
+
+
+@pytest.mark.parametrize("name", ["face", "beam", "view", "sweep", "side"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_derivatives_of_every_block(name, seed):
+    """Gradient of each placement's cost, and for least squares the Jacobian itself, against differences."""
+    obs, state = random_problem(rng(seed))
+    data = gather(obs)
+
+    def block(s):
+        return named_blocks(s, data, EVERY)[name]
+
+    def costs(s):
+        b = block(s)
+        return np.sum(b.cost if b.cost is not None else 0.5 * whiten(b, False)[0] ** 2, axis=1)
+
+    r, J = whiten(block(state))
+    gradient = np.sum(r[..., None] * J, axis=1)
+    step, columns = 1e-6, range(EVERY.shared + EVERY.own)
+    numeric = [(costs(moved(state, i, step)) - costs(moved(state, i, -step))) / (2 * step) for i in columns]
+    assert np.allclose(gradient, np.transpose(numeric), rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+    if block(state).cost is None:
+        two = [[whiten(block(moved(state, i, e)), False)[0] for e in (step, -step)] for i in columns]
+        numeric = np.stack([(a - b) / (2 * step) for a, b in two], axis=-1)
+        assert np.allclose(J, numeric, rtol=1e-5, atol=1e-6 * np.abs(J).max())
+
+
+def test_lapses_keep_the_gradient():
+    obs, state = random_problem(rng(5))
+    data = replace(gather(obs), lapse=0.05)
+    r, J = whiten(named_blocks(state, data, EVERY)["beam"])
+    gradient = np.sum(r[..., None] * J, axis=(0, 1))[: EVERY.shared]
+    e = 1e-6
+    costs = [[named_blocks(moved(state, i, s), data, EVERY)["beam"].cost.sum() for s in (e, -e)] for i in range(24)]
+    numeric = np.subtract(*np.transpose(costs)) / (2 * e)
+    assert np.allclose(gradient, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+
+
+# invariances
+
+
+@MOUNTS
+def test_a_constant_in_the_pitch_only_turns_boards_and_base(mount):
+    """Recorded pitch counts from anywhere: axis and cameras on the head do not change, all else turns about it."""
+    obs, *_ = draw(rng(), 8, mount=mount)
+    angle = 0.2
+    turned = replace(obs, **{key: getattr(obs, key) + angle for key in ("face_pitch", "beam_pitch", "view_pitch")})
+    turned = replace(turned, middle=obs.middle + angle)
+    one, two = solve_joint(obs), solve_joint(turned)
+    about = RigidTransform.from_rotation(Rotation.from_euler("x", angle))
+    tiny = 0.01 * one.solution.sigma[:4]
+    assert np.all(np.abs(one.solution.parameters[:4] - two.solution.parameters[:4]) < tiny)
+    for name, T in one.transforms.items():
+        expected = T if mount == "head" else T * about.inv()
+        assert apart(two.transforms[name], expected) < SAME
+    for number, T in one.boards.items():
+        assert apart(two.boards[number], about * T) < SAME
+
+
+@MOUNTS
+def test_the_stated_platform_only_sets_the_gauge(mount):
+    """A turn about the axis and a shift along it come from the stated platform; what is observable stays."""
+    obs, *_ = draw(rng(), 8, mount=mount)
+    found = solve_joint(obs)
+    change = RigidTransform.from_components([0.3, 0, 0], Rotation.from_euler("x", 0.4))
+    other = solve_joint(replace(obs, T_head_lrf=change * found.T_head_lrf))
+    angle, offset = axis_difference(found.axis, other.axis)
+    assert angle < SAME and offset < SAME
+    assert apart(other.T_head_lrf, change * found.T_head_lrf) < SAME
+    for name, T in found.transforms.items():
+        expected = T if mount == "head" else T * change.inv()
+        assert apart(other.transforms[name], expected) < SAME
+    assert np.isclose(total_cost(found.state, found.data, found.unknowns),
+                      total_cost(other.state, other.data, other.unknowns), rtol=1e-6)  # fmt: skip
+
+
+def test_order_of_placements_and_rows_does_not_matter():
+    obs, *_ = draw(rng(), 8)
+    found = solve_joint(obs)
+    order = rng(1).permutation(len(obs.placements))
+    place = np.argsort(order)
+    mixed = replace(obs, **{key: getattr(obs, key)[order] for key in ("placements", "direction", "middle")})
+    mixed = replace(mixed, **{f"{g}_placement": place[getattr(obs, f"{g}_placement")] for g in ("face", "beam", "view")})
+    mixed = mixed.keep(**{g: rng(2).permutation(len(getattr(obs, f"{g}_placement"))) for g in ("face", "beam", "view")})
+    other = solve_joint(mixed)
+    assert np.all(np.abs(found.solution.parameters - other.solution.parameters) < 0.01 * found.solution.sigma)
+    for number, T in found.boards.items():
+        assert apart(T, other.boards[number]) < SAME
+        assert np.isclose(found.misfit[number], other.misfit[number], rtol=1e-2)
+
+
+# recovery of the truth
+
+
+def test_exact_observations_give_the_truth():
+    """Ranges and images without noise: to rounding."""
+    obs, truth, _ = draw(rng(), 8, see_noise=0.0)
+    found = solve_joint(none(obs, "beam"), sensor=("range_offset",))
+    assert found.converged
+    assert np.abs(state_errors(found.state, truth, found.unknowns)).max() < 1e-9
+
+
+@MOUNTS
+def test_sharp_edges_tie_down_the_rest(mount):
+    """Without noise only the beams' spacing leaves anything open, and that within its own prediction."""
+    obs, truth, _ = draw(rng(), 8, mount=mount, see_noise=0.0)
+    found = solve_joint(obs, required=False)
+    error = np.abs(state_errors(found.state, truth, found.unknowns))
+    assert error[:4].max() < (1e-3 if mount == "head" else 8e-3)
+
+
+@MOUNTS
+def test_errors_are_as_predicted(mount):
+    """Forty unknown numbers of two draws: none beyond 4.5 standard deviations, and not all too small."""
+    z = np.concatenate([scores(solve_joint(obs), truth) for obs, truth, _ in (draw(rng(s), mount=mount) for s in (5, 6))])
+    assert np.abs(z).max() < 4.5
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8
+
+
+def test_the_stated_covariance_agrees_with_the_bound_at_the_truth():
+    obs, truth, _ = draw(rng(), 12)
+    found = solve_joint(obs)
+    limit = np.sqrt(np.diag(bound(obs, truth, found.unknowns)))
+    assert np.allclose(found.solution.sigma[:-2], limit[:-2], rtol=0.15)
+
+
+def test_more_placements_shrink_errors_and_bounds():
+    """Three times the data: 0.58 of the standard deviation, in the bound and in the errors of five draws."""
+    errors, bounds = {}, {}
+    for count in (6, 18):
+        kept = []
+        for seed in range(5):
+            obs, truth, _ = draw(rng(seed), count)
+            found = solve_joint(obs)
+            kept.append(scores(found, truth) * found.solution.sigma)
+        errors[count] = np.sqrt(np.mean(np.square(kept), axis=0))[:16]
+        bounds[count] = np.sqrt(np.diag(bound(obs, truth, found.unknowns)))[:16]
+    assert 0.4 < np.median(bounds[18] / bounds[6]) < 0.7
+    assert np.median(errors[18] / errors[6]) < 0.85
+
+
+@MOUNTS
+def test_scale_of_the_pitch_is_recovered(mount):
+    obs, truth, _ = draw(rng(), 12, mount=mount, stretch=0.03)
+    found = solve_joint(obs, sensor=(*PLAIN, "pitch_scale"))
+    assert abs(found.sensor["pitch_scale"] - 0.03) < 4 * found.covariance("pitch_scale")[0, 0] ** 0.5 < 0.05
+    assert np.abs(scores(found, truth)).max() < 4.5
+
+
+def with_recorded_pitch(obs, recorded):
+    """Observations whose pitch is another function of the true one and the placement."""
+    keys = [f"{group}_pitch" for group in ("face", "beam", "view")]
+    places = [getattr(obs, key.replace("pitch", "placement")) for key in keys]
+    return replace(obs, **{key: recorded(getattr(obs, key), place) for key, place in zip(keys, places, strict=True)})
+
+
+def test_pitch_errors_of_sweeps_are_recovered():
+    """Sweeps whose recorded pitch is off by a degree and stretched by some per cent."""
+    obs, truth, _ = draw(rng(), 12, mount="platform")
+    off, stretch = rng(7).normal(0, np.radians(1.0), 12), rng(8).normal(0, 0.02, 12)
+    spoilt = with_recorded_pitch(obs, lambda true, p: obs.middle[p] + (true - obs.middle[p] - off[p]) / (1 + stretch[p]))
+    found = solve_joint(spoilt, sweep="offset_stretch", sweep_sigma=(np.radians(1.0), 0.02))
+    plain = solve_joint(spoilt)
+    sweeps = np.array([found.sweeps[n] for n in obs.placements])
+    common = np.mean(sweeps[:, 0] - off)  # what all have in common turns the platform frame
+    assert np.std(sweeps[:, 0] - off - common) < 0.3 * np.std(off)
+    assert np.corrcoef(sweeps[:, 1], stretch)[0, 1] > 0.9
+    assert np.abs(scores(found, truth)[:4]).max() < 4.5
+    assert total_cost(plain.state, plain.data, plain.unknowns) > 1.2 * total_cost(found.state, found.data, found.unknowns)
+
+
+def test_stretched_sweeps_on_the_head():
+    """Cameras that pitch along see a stretch, never an offset."""
+    obs, truth, _ = draw(rng(), 12)
+    stretch = rng(8).normal(0, 0.02, 12)
+    spoilt = with_recorded_pitch(obs, lambda true, p: obs.middle[p] + (true - obs.middle[p]) / (1 + stretch[p]))
+    found, plain = solve_joint(spoilt, sweep="offset_stretch"), solve_joint(spoilt)
+    sweeps = np.array([found.sweeps[n] for n in obs.placements])
+    assert np.corrcoef(sweeps[:, 1], stretch)[0, 1] > 0.95
+    assert np.abs(sweeps[:, 0]).max() < 1e-6
+    assert np.median(list(found.misfit.values())) < 1.2 < 2 < np.median(list(plain.misfit.values()))
+
+
+def test_the_direction_of_the_sweep_is_recovered():
+    lag, sensor = np.radians(0.4), (*PLAIN, "pitch_by_direction")
+    obs, truth, _ = draw(rng(), 12, mount="platform")
+    found = solve_joint(with_recorded_pitch(obs, lambda true, p: true - lag * obs.direction[p]), sensor=sensor)
+    sigma = found.covariance("pitch_by_direction")[0, 0] ** 0.5
+    assert abs(found.sensor["pitch_by_direction"] - lag) < 4.5 * sigma < lag
+    with pytest.raises(DegenerateGeometry, match="do not determine the pitch offset by sweep direction"):
+        solve_joint(draw(rng(), 8)[0], sensor=sensor)  # cameras on the head lag alike
+
+
+@MOUNTS
+def test_size_of_the_board_is_recovered(mount):
+    """A board stated 4 mm too narrow: its slanted side lies outside, by as much as it leans."""
+    obs, truth, rig = draw(rng(), 20, mount=mount)
+    found = solve_joint(replace(obs, corners=obs.corners * [0.311 / 0.315, 1.0]), size=True)
+    sigma = np.sqrt(np.diag(found.covariance("size_")))
+    assert np.all(sigma < 0.003)
+    grown = np.array([0.0, 0.004 * rig.board.lines()[1, 0] / 2, 0.0])
+    moved = np.array([found.size[name] for name in rig.board.edges]) - grown
+    assert np.all(np.abs(moved) < 4.5 * sigma + 0.0015)
+
+
+# subsets of the data
+
+
+def test_one_camera():
+    obs, truth, _ = draw(rng(), cameras=("left",))
+    found = solve_joint(obs)
+    assert list(found.transforms) == ["left"] and np.abs(scores(found, truth)).max() < 4.5
+
+
+def test_no_camera_leaves_the_platform_step():
+    obs, truth, _ = draw(rng(), 20, seen=())
+    found = solve_joint(obs, required=False)
+    assert found.transforms == {} and np.abs(scores(found, truth)).max() < 5
+    assert np.degrees(found.solution.sigma[0]) > 0.2, "the small board hardly shows the axis"
+
+
+def test_single_shots_do_not_show_the_axis():
+    """Without motion of the platform cameras on the head are found; the axis is named as what is missing."""
+    obs, truth, _ = draw(rng(), 20, see_span=0.0)
+    with pytest.raises(DegenerateGeometry, match="the data do not determine .* axis"):
+        solve_joint(obs, sensor=PLAIN[:2])
+    found = solve_joint(obs, required=False, sensor=PLAIN[:2])
+    assert sum("axis" in words for words in found.unobservable) == 4
+    cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
+    assert np.abs(scores(found, truth)[cameras]).max() < 4.5
+
+
+@MOUNTS
+def test_single_shots_with_a_known_axis(mount):
+    obs, truth, _ = draw(rng(), 20, mount=mount, see_span=0.0)
+    found = solve_joint(obs, pose_transform(truth.head), axis=False, sensor=PLAIN[:2])
+    assert np.allclose(found.state.head, truth.head, atol=1e-9)
+    assert np.abs(scores(found, truth)).max() < 4.5
+
+
+def test_one_image_a_placement_is_weaker():
+    strong, weak = (solve_joint(draw(rng(), see_images=n)[0]).solution.sigma[0] for n in (3, 1))
+    assert weak > 3 * strong
+
+
+def test_without_edges_their_bias_is_named():
+    obs, truth, _ = draw(rng(), 12)
+    with pytest.raises(DegenerateGeometry, match="edge bias"):
+        solve_joint(none(obs, "beam"))
+    found = solve_joint(none(obs, "beam"), sensor=("range_offset",))
+    assert np.abs(scores(found, truth)).max() < 4.5
+
+
+def test_without_ranges_their_offset_is_named():
+    """Edges and images alone, from a start value: all but the range offset."""
+    obs, truth, _ = draw(rng(), 12)
+    bare = none(obs, "face")
+    start = replace(truth, sensor=np.array([0.0, 0.0, np.log(0.2), 0.0, 0.0]))
+    with pytest.raises(DegenerateGeometry, match="range offset"):
+        solve_joint(bare, start=start)
+    found = solve_joint(bare, start=start, sensor=PLAIN[1:])
+    assert np.abs(scores(found, replace(truth, sensor=truth.sensor * [0, 1, 1, 1, 1]))).max() < 4.5
+
+
+# far starts
+
+
+@MOUNTS
+def test_any_start_gives_the_same_answer(mount):
+    """60 degrees and half a metre wrong, or none: twenty random starts."""
+    obs, truth, _ = draw(rng(), 12, mount=mount)
+    best = solve_joint(obs)
+    random = rng(11)
+    for _ in range(20):
+        turn = random.normal(size=3)
+        away = random.normal(size=3)
+        wrong = RigidTransform.from_components(
+            0.5 * away / np.linalg.norm(away), Rotation.from_rotvec(np.radians(60) * turn / np.linalg.norm(turn))
+        )
+        found = solve_joint(obs, wrong * pose_transform(truth.head))
+        assert np.all(np.abs(found.solution.parameters - best.solution.parameters) < 0.01 * best.solution.sigma)
+
+
+# errors
+
+
+def test_settings_are_checked():
+    obs, *_ = draw(rng(), 4)
+    for change, words in (
+        ({"sensor": ("tilt",)}, "sensor unknowns are range_offset.*got 'tilt'"),
+        ({"noise": "guess"}, "noise is 'stated' or 'estimate', got 'guess'"),
+        ({"lapse": 0.6}, "lapse is the share .* got 0.6"),
+        ({"sweep_sigma": (0.0, 0.05)}, "sweep_sigma must be positive"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            solve_joint(obs, **change)
+
+
+def test_observations_are_checked():
+    obs, *_ = draw(rng(), 4)
+    broken = obs.face_range.copy()
+    broken[3] = np.nan
+    with pytest.raises(ValueError, match="face_range holds 1 values that are not finite"):
+        replace(obs, face_range=broken)
+    with pytest.raises(ValueError, match="view_placement are indices below 4, got up to 4"):
+        replace(obs, view_placement=obs.view_placement + 1)
+    with pytest.raises(ValueError, match="face_sigma must be positive, got 0.0"):
+        replace(obs, face_sigma=0 * obs.face_sigma)
+    with pytest.raises(DegenerateGeometry, match="no placement"):
+        solve_joint(obs.select([]))
+
+
+def test_gauge_change_keeps_the_cost():
+    obs, state = random_problem(rng(9))
+    data = gather(obs)
+    other = in_stated_gauge(state, obs)
+    plain = Unknowns(2, 3)
+    assert np.isclose(total_cost(state, data, plain), total_cost(other, data, plain), rtol=1e-12)

@@ -1,0 +1,157 @@
+"""The joint estimate on recordings that cannot work: a name for what is wrong, never a plausible wrong number."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joint_draws import draw
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.evaluate.monte_carlo import state_errors
+from lrfcal_lib.geometry import DegenerateGeometry
+from lrfcal_lib.solvers.joint import solve_joint
+
+MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
+FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
+
+def rng(seed=3):
+    return np.random.default_rng(seed)
+
+
+def worst(found, truth):
+    """Largest error of axis and cameras in the solver's own standard deviations."""
+    error = state_errors(found.state, truth, found.unknowns)
+    number = 4 + 6 * len(found.transforms)
+    return np.abs(error / found.solution.sigma)[:number].max()
+
+
+def parallel_boards(rng, count, spin=True):
+    """Boards that all lean the same way, at different places and turned within their plane."""
+    poses = []
+    for _ in range(count):
+        turn = FACING * Rotation.from_rotvec([0.2, 0.1, 0]) * Rotation.from_rotvec([0, 0, spin * rng.uniform(0, 6.28)])
+        centre = np.array([rng.uniform(-0.35, 0.35), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(1, 2.5)
+        poses.append(RigidTransform.from_components(centre - turn.apply([0.105, 0.127, 0.0]), turn))
+    return poses
+
+
+def one_pose(rng, count):
+    return parallel_boards(rng, 1) * count
+
+
+def mislabelled(obs, share, rng):
+    """Images of some placements under the numbers of others."""
+    count = len(obs.placements)
+    who = rng.permutation(count)[: round(share * count)]
+    number = np.arange(count)
+    number[who] = np.roll(who, 1)
+    return replace(obs, view_placement=number[obs.view_placement])
+
+
+@MOUNTS
+@pytest.mark.parametrize("lean", [parallel_boards, one_pose])
+def test_parallel_boards_are_named(mount, lean):
+    obs, *_ = draw(rng(), mount=mount, lean=lean)
+    with pytest.raises(DegenerateGeometry, match="tilt the board in both directions"):
+        solve_joint(obs)
+
+
+@MOUNTS
+def test_one_distance_costs_certainty_not_truth(mount):
+    """All boards 1.5 m away: the offset of the ranges is hard to tell from the cameras' place, and the sigma says so."""
+    near, truth, _ = draw(rng(), 12, mount=mount, distances=(1.5, 1.5))
+    far, *_ = draw(rng(), 12, mount=mount)
+    found, spread = solve_joint(near), solve_joint(far)
+    assert found.converged and worst(found, truth) < 4.5
+    assert found.covariance("range_offset")[0, 0] > spread.covariance("range_offset")[0, 0]
+
+
+@MOUNTS
+def test_a_degree_of_pitch_costs_certainty_not_truth(mount):
+    step = np.radians(0.25)
+    narrow, truth, _ = draw(rng(), 12, mount=mount, see_span=np.radians(1.0), pitch_step=step)
+    wide, *_ = draw(rng(), 12, mount=mount)
+    found, full = solve_joint(narrow, required=False), solve_joint(wide)
+    assert found.unobservable or (worst(found, truth) < 4.5)
+    assert np.all(found.solution.sigma[1:3] > 2.0 * full.solution.sigma[1:3])
+
+
+@MOUNTS
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
+    obs, truth, _ = draw(rng(), 20, mount=mount)
+    wrong = mislabelled(obs, share, rng())
+    moved = np.unique(obs.placements[obs.view_placement[obs.view_placement != wrong.view_placement]])
+    found = solve_joint(wrong)
+    assert set(found.excluded) == set(moved.tolist())
+    assert all("off where its image puts the board; left out" in words for words in found.excluded.values())
+    assert worst(found, truth) < 4.5
+
+
+@MOUNTS
+@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_many_mislabelled_placements_are_refused(mount, share, seed):
+    obs, *_ = draw(rng(seed), 20, mount=mount)
+    with pytest.raises(DegenerateGeometry, match="contradict .*right numbers"):
+        solve_joint(mislabelled(obs, share, rng(seed)))
+
+
+@MOUNTS
+def test_a_camera_that_sees_nothing_is_named(mount):
+    obs, *_ = draw(rng(), mount=mount)
+    with pytest.raises(DegenerateGeometry, match="'right' never sees a board"):
+        solve_joint(obs.keep(view=obs.view_camera == 0))
+
+
+@MOUNTS
+@pytest.mark.parametrize("factor", [1e-3, 0.1, 10.0, 1e3])
+@pytest.mark.parametrize("kind", ["face", "view"])
+def test_contradictory_noise_is_repaired_from_the_data(mount, factor, kind):
+    obs, truth, _ = draw(rng(), mount=mount)
+    found = solve_joint(mis_stated(obs, kind, factor), noise="estimate")
+    level = found.noise["face_scale" if kind == "face" else "view_scale_left"]
+    assert 0.7 < level * factor < 1.4
+    assert worst(found, truth) < 4.5
+    sigma = solve_joint(obs, noise="estimate").solution.sigma[:4]
+    assert np.allclose(found.solution.sigma[:4], sigma, rtol=0.15)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.1, 10.0, 1e3])
+@pytest.mark.parametrize(("kind", "words"), [("face", "ranges"), ("view", "camera '(left|right)'")])
+def test_contradictory_noise_is_said_when_it_is_kept(factor, kind, words):
+    obs, *_ = draw(rng())
+    with pytest.warns(UserWarning, match=words):
+        solve_joint(mis_stated(obs, kind, factor), required=False)
+
+
+@MOUNTS
+def test_sound_noise_needs_no_warning(mount):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(3):
+            solve_joint(draw(rng(seed), mount=mount)[0])
+
+
+def mis_stated(obs, kind, factor):
+    """Observations whose stated standard deviations are wrong by a factor."""
+    if kind == "face":
+        return replace(obs, face_sigma=obs.face_sigma * factor)
+    return replace(obs, view_covariance=obs.view_covariance * factor**2)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_placements_are_named(count):
+    obs, *_ = draw(rng(), count)
+    with pytest.raises(DegenerateGeometry, match=f"{count} placements .* at least 3 needed"):
+        solve_joint(obs)
+
+
+def test_what_is_unobservable_has_no_small_sigma():
+    """Numbers that the data do not show must not come with a standard deviation as if they did."""
+    obs, *_ = draw(rng(), see_span=0.0)
+    found = solve_joint(obs, required=False)
+    assert len(found.unobservable) >= 4
+    assert not np.any(found.solution.sigma[:4] < 0.5)

@@ -1,0 +1,162 @@
+"""What is predicted about errors is what perturbed calibrations do."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.camera import project
+from lrfcal_lib.geometry import lrf_to_platform, lrf_to_source, polar_to_points
+from lrfcal_lib.simulate.observe import bench, board_poses, observe
+from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_observations import JointObservations
+from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform
+from lrfcal_lib.uncertainty import COLUMNS, Chain, beams_to, carried, chain_of, point_sigma, projection_sigma, spread
+
+HEAD = RigidTransform.from_components([0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03]))
+TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+CAMERA = RigidTransform.from_components([0.1, 0.1, -0.05], TURN)
+MOUNTS = ("head", "platform")
+
+
+def random_chain(mount, rng, camera=CAMERA, size=1e-3):
+    mix = size * rng.normal(size=(13, 13)) / 3
+    pose = None if camera is None else pose_array(camera)
+    return Chain(pose_array(HEAD), pose, mount, (mix @ mix.T,), np.zeros((0, 13)))
+
+
+def moved_points(chain, bearing, pitch, distance, change, image_pitch):
+    """The chain carried out with the library's transforms, all links changed by `change` (13,)."""
+    head = pose_transform(move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0)))
+    scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
+    p = polar_to_points(distance - change[10], bearing)
+    source = lrf_to_source(p, scale(pitch), head, chain.mount, scale(image_pitch))
+    if chain.camera is None:
+        return source
+    return pose_transform(move_pose(chain.camera, change[4:10])).apply(source)
+
+
+@pytest.fixture(scope="module", params=MOUNTS)
+def solved(request):
+    rng = np.random.default_rng(3)
+    rig = bench(rng, mount=request.param)
+    return rig, solve_joint(JointObservations(**observe(rig, board_poses(rng, 10), rng)), required=False)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_jacobian_of_the_chain(mount, camera):
+    if camera is None and mount == "platform":
+        return
+    rng = np.random.default_rng(0)
+    chain = random_chain(mount, rng, camera)
+    bearing, pitch, distance = rng.uniform(1.0, 2.0, 5), rng.uniform(-0.3, 0.3, 5), rng.uniform(1, 4, 5)
+    points, J, by_pitch = carried(chain, bearing, pitch, distance, 0.1)
+    assert np.allclose(points, moved_points(chain, bearing, pitch, distance, np.zeros(13), 0.1), atol=1e-12)
+    for column in range(13):
+        step = 1e-6 * np.eye(13)[column]
+        ends = [moved_points(chain, bearing, pitch, distance, s * step, 0.1) for s in (1, -1)]
+        assert np.allclose(J[..., column], (ends[0] - ends[1]) / 2e-6, atol=1e-7), COLUMNS[column]
+    turned = [moved_points(chain, bearing, pitch + s * 1e-6, distance, np.zeros(13), 0.1) for s in (1, -1)]
+    assert np.allclose(by_pitch, (turned[0] - turned[1]) / 2e-6, atol=1e-7)
+
+
+def test_beams_to_inverts_the_platform():
+    rng = np.random.default_rng(1)
+    bearing, pitch, distance = rng.uniform(0.6, 2.5, 50), rng.uniform(-0.8, 0.8, 50), rng.uniform(0.5, 5, 50)
+    points = lrf_to_platform(polar_to_points(distance, bearing), pitch, HEAD)
+    assert np.allclose(beams_to(points, HEAD), [bearing, pitch, distance], atol=1e-9)
+
+
+def test_points_that_no_scan_reaches_have_no_beam():
+    tilted = RigidTransform.from_rotation(Rotation.from_rotvec([0, 0.3, 0]))
+    assert np.isnan(beams_to(np.array([[3.0, 0.1, 0.0]]), tilted)[1]).all()
+
+
+def drawn(chain, rng, count=1500):
+    return rng.multivariate_normal(np.zeros(13), chain.covariances[0], count)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_projection_sigma_is_what_perturbed_calibrations_show(mount):
+    rng = np.random.default_rng(2)
+    chain, model = random_chain(mount, rng), bench(rng).model
+    found = projection_sigma(chain, "left", model, 1.5, (3, 2), image_pitch=0.05 * (mount == "head"))
+    u, v = np.meshgrid(found.columns, found.rows)
+    changes = drawn(chain, rng)
+    image_pitch = 0.05 * (mount == "head")
+    for index, distance in enumerate(found.distances):
+        bearing, pitch = beams_of(chain, model, u, v, distance, image_pitch)
+        uv = np.array([project(moved_points(chain, bearing, pitch, distance, c, image_pitch), model) for c in changes])
+        assert np.allclose(project(moved_points(chain, bearing, pitch, distance, 0 * changes[0], image_pitch), model),
+                           np.column_stack([u.ravel(), v.ravel()]), atol=1e-6)  # fmt: skip
+        spread_px = np.sqrt(np.mean(np.sum((uv - uv.mean(axis=0)) ** 2, axis=-1), axis=0))
+        assert np.allclose(found.sigma[index].ravel(), spread_px, rtol=0.07)
+
+
+def beams_of(chain, model, u, v, distance, image_pitch):
+    from lrfcal_lib.uncertainty import _beams_of_pixels
+
+    bearing, pitch = _beams_of_pixels(chain, model, np.stack([u, v], axis=-1), distance, image_pitch)
+    return bearing.ravel(), pitch.ravel()
+
+
+def test_point_sigma_is_what_perturbed_calibrations_show():
+    rng = np.random.default_rng(4)
+    chain = random_chain("head", rng, None)
+    bearings, pitches = np.array([1.2, 1.9]), np.array([-0.2, 0.1, 0.3])
+    found = point_sigma(chain, bearings, pitches, 2.0, sigma_range=0.01, reference=0.1)
+    b, p = (a.ravel() for a in np.meshgrid(bearings, pitches))
+    points = np.array([moved_points(chain, b, p, 2.0, c, 0.1) for c in drawn(chain, rng)])
+    scatter = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=-1), axis=0))
+    assert np.allclose(found.sigma[0].ravel(), scatter, rtol=0.07)
+    assert np.allclose(found.parts["axis"][0, 1], 0, atol=1e-12)  # measured at the reference: the axis cancels
+    assert (found.parts["axis"][0, [0, 2]] > 1e-5).all()
+    assert (found.parts["range noise"] == 0.01).all()
+
+
+def test_the_axis_cancels_at_the_pitch_of_the_image(solved):
+    rig, solution = solved
+    found = projection_sigma(solution, "left", rig.model, 2.0, (5, 5), image_pitch=0.0)
+    axis = found.parts["axis"][0]
+    assert (axis[0] > 0).all()
+    if rig.mount == "head":
+        assert axis[2].max() < 0.6 * axis[[0, 4]].min()  # the middle row is measured near the pitch of the image
+    else:
+        assert (found.parts["camera"] > found.sigma).any()  # errors of axis and camera compensate
+
+
+def test_scatter_over_placements_only_adds(solved):
+    rig, solution = solved
+    plain, both = (projection_sigma(solution, "right", rig.model, 2.0, (4, 3), clustered=c) for c in (False, True))
+    assert (both.sigma >= plain.sigma - 1e-12).all()
+    assert len(chain_of(solution, "right").covariances) == 2
+
+
+def test_undetermined_motions_have_no_bound():
+    chain = random_chain("head", np.random.default_rng(5))
+    chain = Chain(chain.head, chain.camera, "head", chain.covariances, np.eye(13)[[2]])
+    J = np.zeros((2, 1, 13))
+    J[0, 0, 2], J[1, 0, 5] = 1.0, 1.0
+    assert np.isinf(spread(chain, J)).tolist() == [True, False]
+
+
+def test_errors_of_single_sweeps_count_in_the_cloud():
+    chain = random_chain("head", np.random.default_rng(6), None, size=1e-9)
+    chain = Chain(chain.head, None, "head", chain.covariances, chain.unseen, (0.01, 0.1))
+    found = point_sigma(chain, np.pi / 2, [0.0, 0.2], 2.0)
+    assert np.allclose(found.sigma[0, :, 0], np.hypot(0.01, [0.0, 0.02]) * np.hypot(2.03, 0.05), rtol=0.03)
+
+
+def test_pixels_beyond_the_sweeps_stay_empty(solved):
+    rig, solution = solved
+    found = projection_sigma(solution, "left", rig.model, 2.0, (4, 9), pitches=(-0.1, 0.1))
+    assert np.isnan(found.sigma[0, 0]).all() and np.isfinite(found.sigma[0, 4]).any()
+    assert np.isinf(projection_sigma(solution, "left", rig.model, 2.0, (4, 9), pitches=(2.0, 2.1)).rms()).all()
+
+
+def test_bad_input_is_named(solved):
+    rig, solution = solved
+    with pytest.raises(ValueError, match="cameras are left, right; got 'rear'"):
+        chain_of(solution, "rear")
+    with pytest.raises(ValueError, match=r"distances must be positive, metres; got \[0.0\]"):
+        projection_sigma(solution, "left", rig.model, 0.0)
