@@ -51,7 +51,7 @@ class JointCalibration:
         whole[:2, :2], whole[2:, 2:] = covariance
         return chart_parameters(pose_array(self.solution.T_head_lrf)), whole
 
-    def seen_by(self, camera, solution=None):
+    def seen_by(self, camera, solution=None, **options):
         """Observations of a camera made with the platform, range offset and pitch of the joint estimate.
 
         Parameters
@@ -59,9 +59,11 @@ class JointCalibration:
         camera : str
         solution : JointSolution, optional
             Another one than the whole session's (without a placement).
+        **options
+            Of :func:`lrfcal_lib.pairing.observe`.
         """
         solution = solution or self.solution
-        return observe(self.prepared, camera, "half_step", solution.T_head_lrf, solution.correct)
+        return observe(self.prepared, camera, "half_step", solution.T_head_lrf, solution.correct, **options)
 
     def edge_model(self, placement=None):
         """What the estimate knows about how the sensor sees edges, from all placements but one.
@@ -151,15 +153,16 @@ def calibrate_jointly(prepared, views=None):
     Returns
     -------
     JointCalibration
+        What the session does not determine is in `solution.unobservable` and `solution.warnings`, in words.
 
     Raises
     ------
     DegenerateGeometry
-        When the session does not determine the rig, with the motions in words.
+        When there is no start value, or most placements contradict each other.
     """
     observations = observe_joint(prepared, all_views(prepared) if views is None else views)
     settings = joint_settings(prepared, observations)
-    solution = solve_joint(observations, **settings)
+    solution = solve_joint(observations, required=False, **settings)
     return JointCalibration(prepared, observations, solution, settings, {})
 
 

@@ -48,7 +48,7 @@ STYLE = {
     "image.cmap": "viridis",
 }
 
-_found = {"figures": [], "tables": [], "findings": []}
+_found = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
 def set_up():
@@ -234,6 +234,19 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     entry = {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main}
     _record("findings", entry)
     print(f"{text}: {shown}")
+
+
+def verdict(title, sentences):
+    """Print sentences, and put them on the first page of the report before anything else.
+
+    Parameters
+    ----------
+    title : str
+    sentences : sequence of str
+        The most important one first.
+    """
+    _record("verdicts", {"title": title, "sentences": list(sentences)})
+    print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
 def _shell():

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.board import corners_of_lines
-from lrfcal_lib.geometry import DegenerateGeometry, fit_line, lrf_to_platform, lrf_to_source, tilt
+from lrfcal_lib.geometry import DegenerateGeometry, fit_line, lrf_to_platform, lrf_to_source, polar_to_points, tilt
 from lrfcal_lib.prepared import VARIANTS, Prepared
 from lrfcal_lib.preprocess import scan
 from lrfcal_lib.preprocess.edge_cells import edge_cells
@@ -27,7 +27,7 @@ LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decide
 NAME_ANGLE = np.deg2rad(3.0)  # between them; a side turned more is none (a cloud cut by hand, an occluder)
 
 
-def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None):
+def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None, crossings=CROSSINGS_PER_EDGE):
     """Pair what the LRF and one camera saw of the board.
 
     Parameters
@@ -41,6 +41,8 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None
     correct : callable, optional
         ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
+    crossings : int
+        Kept of each edge of a placement, evenly spread.
 
     Returns
     -------
@@ -63,7 +65,7 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=None
         pattern_pixels=_stack(pixels, (k, 2)),
         pattern_sigma_px=max(prepared.models[camera].rms_px or 0.0, 0.05),
         **_planes(prepared, sources),
-        **_crossings(prepared, camera, variant, sources),
+        **_crossings(prepared, camera, variant, sources, crossings),
         **_corners(prepared, camera, variant, sources),
     )
 
@@ -185,7 +187,7 @@ def _planes(prepared, sources):
     }
 
 
-def _crossings(prepared, camera, variant, sources):
+def _crossings(prepared, camera, variant, sources, count):
     """Crossings of named sides with the image line of the same edge, thinned evenly along each edge."""
     parts = {key: [] for key in _CROSSING}
     for placement, name, found, side, across in _named_sides(prepared, variant):
@@ -193,7 +195,7 @@ def _crossings(prepared, camera, variant, sources):
         edge = None if view is None else view.edge(name)
         if edge is None:
             continue
-        rows = thin(np.flatnonzero(found.side == side), CROSSINGS_PER_EDGE)
+        rows = thin(np.flatnonzero(found.side == side), count)
         here = {"placement": placement, "edge": name, "across": across, "line_sigma": np.sqrt(edge.covariance[0, 0])}
         here = {key: np.full(len(rows), value) for key, value in here.items()}
         here["lines"] = np.tile(edge.line, (len(rows), 1))
@@ -422,9 +424,12 @@ def likely_outline_of(prepared, placement, model):
         if number == placement and _stretch(found, side) >= LEAST_STRETCH * length[name]:
             names[side] = name
             across |= {name} if swept else set()
-    face = (*scan.face_points(board_scan)[:2], board_scan.sigma_range)
-    measured = measure_outline(cells_of(prepared, placement), face, names, prepared.board.edges, model)
-    return measured, frozenset(across)
+    points, pitch, _ = scan.face_points(board_scan)
+    face = points, model.pitch(placement, points, pitch), board_scan.sigma_range
+    cells = cells_of(prepared, placement)
+    on_board = polar_to_points(cells.range_m, cells.bearing)
+    cells = replace(cells, pitch=model.pitch(placement, on_board, cells.pitch))
+    return measure_outline(cells, face, names, prepared.board.edges, model), frozenset(across)
 
 
 def _corners(prepared, camera, variant, sources):

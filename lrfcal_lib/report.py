@@ -315,6 +315,7 @@ def _write_index(out, session, runs, found, seconds):
         seconds=seconds,
         failed=[run for run in runs if run.error],
         findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
+        verdicts=[entry for run in runs for entry in found[run.name].get("verdicts", [])],
         thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
         rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
         files=[name for name in ("calibration.json", "cloud.ply", "findings.json") if (out / name).is_file()],

@@ -1,6 +1,5 @@
 """The joint estimate on recordings that cannot work: a name for what is wrong, never a plausible wrong number."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -60,12 +59,13 @@ def test_parallel_boards_are_named(mount, lean):
 
 @MOUNTS
 def test_one_distance_costs_certainty_not_truth(mount):
-    """All boards 1.5 m away: the offset of the ranges is hard to tell from the cameras' place, and the sigma says so."""
+    """All boards 1.5 m away: hard to tell the cameras' turn from their place, and the sigma says so."""
     near, truth, _ = draw(rng(), 12, mount=mount, distances=(1.5, 1.5))
     far, *_ = draw(rng(), 12, mount=mount)
     found, spread = solve_joint(near), solve_joint(far)
     assert found.converged and worst(found, truth) < 4.5
-    assert found.covariance("range_offset")[0, 0] > spread.covariance("range_offset")[0, 0]
+    cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
+    assert np.max(found.solution.sigma[cameras] / spread.solution.sigma[cameras]) > 2
 
 
 @MOUNTS
@@ -102,7 +102,7 @@ def test_many_mislabelled_placements_are_refused(mount, share, seed):
 @MOUNTS
 def test_a_camera_that_sees_nothing_is_named(mount):
     obs, *_ = draw(rng(), mount=mount)
-    with pytest.raises(DegenerateGeometry, match="'right' never sees a board"):
+    with pytest.raises(DegenerateGeometry, match="'right' never sees the board"):
         solve_joint(obs.keep(view=obs.view_camera == 0))
 
 
@@ -120,19 +120,19 @@ def test_contradictory_noise_is_repaired_from_the_data(mount, factor, kind):
 
 
 @pytest.mark.parametrize("factor", [1e-3, 0.1, 10.0, 1e3])
-@pytest.mark.parametrize(("kind", "words"), [("face", "ranges"), ("view", "camera '(left|right)'")])
+@pytest.mark.parametrize(("kind", "words"), [("face", "ranges scatter"), ("view", "camera 'left' scatter")])
 def test_contradictory_noise_is_said_when_it_is_kept(factor, kind, words):
     obs, *_ = draw(rng())
-    with pytest.warns(UserWarning, match=words):
-        solve_joint(mis_stated(obs, kind, factor), required=False)
+    found = solve_joint(mis_stated(obs, kind, factor), required=False)
+    assert any(words in warning and "noise='estimate'" in warning for warning in found.warnings)
 
 
 @MOUNTS
-def test_sound_noise_needs_no_warning(mount):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for seed in range(3):
-            solve_joint(draw(rng(seed), mount=mount)[0])
+def test_sound_recordings_need_no_warning(mount):
+    """Cameras on the base hardly show the axis of a small board's sweep, which may be said; nothing else."""
+    for seed in range(3):
+        found = solve_joint(draw(rng(seed), 12, mount=mount, pitch_step=np.radians(0.5))[0])
+        assert all(mount == "platform" and "weakly known" in words for words in found.warnings)
 
 
 def mis_stated(obs, kind, factor):

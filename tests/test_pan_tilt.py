@@ -506,8 +506,8 @@ def test_the_end_of_the_process_stops_the_head(make, way):
     from lrfcal_lib.drivers.pan_tilt import HeadSettings, PanTilt
     head = PanTilt.open({str(device.path)!r}, HeadSettings(baudrate=38400, gap_s=0.005))
     head.start_sweep(1.0, speed=1)
-    print("moving", flush=True)
     try:
+        print("moving", flush=True)
         time.sleep({0 if way == "exit" else 30})
     finally:
         print("files closed", flush=True)

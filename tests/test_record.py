@@ -31,6 +31,7 @@ from lrfcal_lib.acquisition import (
 )
 from lrfcal_lib.acquisition.checks import edge_rise
 from lrfcal_lib.board import Chessboard
+from lrfcal_lib.camera import CameraModel
 from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.rig import Moved, Scanned
 from lrfcal_lib.session import SessionError, SessionRecorder, finish, open_session, validate
@@ -304,11 +305,12 @@ def test_twenty_kills_lose_nothing_that_was_finished(tmp_path):
         read_end, write_end = os.pipe()
         child = in_child(record_slowly, data, path, write_end)
         os.close(write_end)
-        time.sleep(rng.uniform(0.0, 0.12))
-        os.kill(child, signal.SIGKILL)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL, "it ended before it was killed"
-        with os.fdopen(read_end, "rb") as stream:
+        with os.fdopen(read_end, "rb", buffering=0) as stream:
+            known |= set(stream.read(rng.integers(3)))  # waits for none to two placements
+            time.sleep(rng.uniform(0.0, 0.1))
+            os.kill(child, signal.SIGKILL)
             known |= set(stream.read())
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL, "it ended before it was killed"
         if not known:
             continue
         finished = set(open_session(path).placements)
@@ -317,7 +319,7 @@ def test_twenty_kills_lose_nothing_that_was_finished(tmp_path):
         known = finished
         for number in finished:
             assert contents(path, number) == expected(rig, plan[number])
-    assert 3 < len(known) < len(plan) and lost > 3
+    assert 5 < len(known) < len(plan) and lost > 3
     recording = write(rig, path, resume=True, count=max(known) + 1)
     recording.finish()
     assert validate(path) == [] and len(recording.finished) == max(known) + 1
@@ -629,9 +631,10 @@ def test_a_scene_is_checked_for_returns_alone(quick):
 
 def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick):
     sweep = quick.sweep(2)
-    none = replace(sweep, ranges=np.full_like(sweep.ranges, 6.0))
-    assert check_scan(none, quick.board, quick.T_head_lrf)[0].state == "bad"
-    assert check_scan(None, quick.board)[0] == Light("scan", "bad", check_scan(None, quick.board)[0].text)
+    none = replace(sweep, ranges=np.random.default_rng(1).uniform(1, 9, sweep.ranges.shape))
+    for seen, text in ((none, "no board: "), (None, "no scan line with a range")):
+        (light,) = check_scan(seen, quick.board, quick.T_head_lrf)
+        assert light.state == "bad" and light.text.startswith(text)
     half = _rows(sweep, slice(None, len(sweep.pitch) // 2))
     first, _ = check_scan(half, quick.board, quick.T_head_lrf)
     assert first.state == "warn" and "line hits it: sweep farther" in first.text
@@ -647,7 +650,7 @@ def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick):
     image = quick.read_image(quick.images("left", 2)[0])
     assert check_image(image, quick.board).state == "ok"
     wrong = {
-        "blurred": cv2.GaussianBlur(image, (0, 0), 2.0),
+        "blurred": cv2.GaussianBlur(image, (0, 0), 2.5),
         "too dark": (image * 0.12).astype(np.uint8),
         "overexposed": np.clip(image * 2.5, 0, 255).astype(np.uint8),
         "little contrast": (image * 0.1 + 100).astype(np.uint8),
@@ -663,15 +666,8 @@ def test_a_board_without_a_pattern_needs_intrinsics(quick):
     bare = replace(quick.board, pattern=None)
     image = quick.read_image(quick.images("left", 2)[0])
     assert check_image(image, bare).state == "warn"
-    light = check_image(np.zeros_like(image), bare, quick.cameras["left"].guess and _model(image))
-    assert light.state == "bad"
-
-
-def _model(image):
-    from lrfcal_lib.camera import CameraModel
-
-    height, width = image.shape[:2]
-    return CameraModel(width, height, 670.0, 670.0, width / 2, height / 2, np.zeros(5))
+    light = check_image(np.zeros_like(image), bare, CameraModel(640, 480, 670.0, 670.0, 320.0, 240.0, np.zeros(5)))
+    assert light.state == "bad" and light.text
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.5, 2.5, 4.0])

@@ -16,7 +16,7 @@ STATES = ("ok", "warn", "bad")
 FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about it
 PARALLEL = np.cos(np.radians(20))  # two sides that include less give one constraint, not two
 FEWEST_LINES = 8  # scan lines on the board
-BLURRED_PX = 4.0  # rise of a chessboard's edges from 10 to 90 %; about 2 in a sharp image
+BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; about 2 in a sharp image
 DARK, CLIPPED = 30, 250  # grey levels of a white square
 LOW_CONTRAST = 25  # grey levels between white and dark squares
 

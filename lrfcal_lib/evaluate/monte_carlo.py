@@ -139,7 +139,8 @@ def monte_carlo(draw, solve, seeds, *, bounds=True):
         limit = bound(obs, truth, found.unknowns) if bounds else None
         rows.append((int(seed), state_errors(found.state, truth, found.unknowns), found.solution.covariance, limit))
     if not rows:
-        raise ValueError(f"all {len(failed)} draws were refused, the last one: {next(reversed(failed.values()), 'none')}")
+        last = list(failed.values())[-1] if failed else "no seed given"
+        raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
     kept, errors, covariances, limits = (list(column) for column in zip(*rows, strict=True))
     limits = np.stack(limits) if bounds else None
     return Trials(names, np.array(kept), np.stack(errors), np.stack(covariances), limits, failed)

@@ -117,7 +117,7 @@ def observability_bars(ax, directions, count=6):
     ax.set_yticklabels(words, fontsize="small")
     ax.set_xlabel("standard deviation at 2 m [mm]")
     lost = int(np.isinf(sigma).sum())
-    ax.set_title(f"{lost} motions are not determined" if lost else f"known least: {sigma[0]:.2g} mm at 2 m")
+    ax.set_title(f"{lost} motions are not determined" if lost else f"least known: {sigma[0]:.2g} mm at 2 m")
     ax.grid(False, axis="y")
 
 

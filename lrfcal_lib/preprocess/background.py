@@ -45,5 +45,6 @@ def background_odds(here, behind):
         ``2 ln(here / behind)``, the inverse square law; 0 where nothing is seen behind, or so close behind that both
         give one echo.
     """
+    behind = np.asarray(behind, float)
     apart = np.isfinite(behind) & (behind - here >= MIXING)
     return 2 * np.log(np.where(apart, here / np.where(apart, behind, 1.0), 1.0))

@@ -15,7 +15,14 @@ from lrfcal_lib.board import Board, triangle_board
 from lrfcal_lib.camera import CameraModel, project_jacobians
 from lrfcal_lib.geometry import lrf_to_platform, tilt
 
+# of the pattern
+CORNERS = np.array([[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7])
+MARGIN = 6  # beams beyond the board
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # a camera that looks along y of the LRF
+
+
+def _camera():
+    return CameraModel(1280, 960, 1000.0, 1000.0, 639.5, 479.5, np.zeros(5))
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class Bench:
     T_head_lrf: RigidTransform
     cameras: dict
     mount: str = "head"
-    model: CameraModel = field(default_factory=lambda: CameraModel(1280, 960, 1000.0, 1000.0, 639.5, 479.5, np.zeros(5)))
+    model: CameraModel = field(default_factory=_camera)
     board: Board = field(default_factory=triangle_board)
     step: float = np.radians(0.5)
     pitch_step: float = np.radians(0.5)
@@ -145,21 +152,20 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0, reach=2):
 def _placement(bench, pose, rng, images, span, noise, reach):
     pitch = _pitches(bench, pose, span)
     true = pitch * (1 + bench.stretch)
-    bearings = np.arange(np.radians(20), np.radians(160), bench.step)
+    bearings = _bearings(bench, pose, true)
     hit, u, edge, r = _cast(bench, pose, true, bearings, rng, noise)
     line, beam = np.nonzero(hit)
     near = _near_edges(hit, u, reach)
-    l, b = np.nonzero(near)
+    row, b = np.nonzero(near)
     face = {
         "range": r[line, beam] + bench.range_offset + noise * bench.sigma_range * rng.standard_normal(len(line)),
         "bearing": bearings[beam], "pitch": pitch[line], "sigma": np.full(len(line), bench.sigma_range),
     }  # fmt: skip
     beams = {
-        "bearing": bearings[b], "pitch": pitch[l], "hit": hit[l, b], "edge": edge[l, b],
-        "radius": _radius(bench, r[l, b]), "background": np.zeros(len(l)),
+        "bearing": bearings[b], "pitch": pitch[row], "hit": hit[row, b], "edge": edge[row, b],
+        "radius": _radius(bench, r[row, b]), "background": np.zeros(len(row)),
     }  # fmt: skip
-    at = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1] if images > 1 else pitch[len(pitch) // 2 : len(pitch) // 2 + 1]
-    at = at if images else np.zeros(0)
+    at = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1]
     views = _views(bench, pose, at, rng, noise)
     return {"face": face, "beam": beams, "view": views, "middle": float(pitch.mean())}
 
@@ -172,6 +178,16 @@ def _pitches(bench, pose, span):
     half = span / 2 if span is not None else max(up.max() - middle, middle - up.min()) + 6 * bench.pitch_step
     steps = int(half / bench.pitch_step)
     return middle + bench.pitch_step * np.arange(-steps, steps + 1)
+
+
+def _bearings(bench, pose, pitch):
+    """Beams that pass the board or come near it."""
+    corners = pose.apply(np.column_stack([bench.board.corners, np.zeros(len(bench.board.corners))]))
+    p_head = tilt(corners[:, None], -pitch)
+    p = bench.T_head_lrf.inv().apply(p_head.reshape(-1, 3))
+    bearing = np.arctan2(p[:, 1], p[:, 0])
+    first, last = (round(b / bench.step) for b in (bearing.min(), bearing.max()))
+    return bench.step * np.arange(first - MARGIN, last + MARGIN + 1)
 
 
 def _radius(bench, distance):
@@ -200,7 +216,8 @@ def _cast(bench, pose, pitch, bearings, rng, noise):
     u, edge = distances.max(axis=-1), distances.argmax(axis=-1)
     second = np.sort(distances, axis=-1)[..., -2]
     hit = (u + jitter < bench.bias * radius[..., 0]) & (r > 0.2) & (r < 30)
-    u = np.where((second > -2 * radius[..., 0]) | (r < 0.2) | (r > 30), np.nan, u)  # near a corner two edges cut the spot
+    corner = second > -2 * radius[..., 0]  # where two edges cut the spot
+    u = np.where(corner | (r < 0.2) | (r > 30), np.nan, u)
     return hit, u, edge, r
 
 
@@ -219,27 +236,29 @@ def _near_edges(hit, u, reach):
 
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras, with errors drawn from what 0.3 px do to a pattern's corners."""
-    corners = np.array([[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7])
-    out = {"camera": [], "pitch": [], "pose": [], "covariance": []}
-    for number, T in enumerate(bench.cameras.values()):
-        for pitch in at:
-            T_cb = T * pose
-            if bench.mount == "head":
-                turn = RigidTransform.from_rotation(Rotation.from_rotvec([-pitch * (1 + bench.stretch), 0, 0]))
-                T_cb = T * bench.T_head_lrf.inv() * turn * pose
-            J = _corner_jacobian(T_cb, corners, bench.model)
-            information = np.einsum("nik,nil->kl", J, J) / bench.sigma_px**2
-            covariance = np.linalg.inv(information)
-            error = noise * np.linalg.cholesky(covariance) @ rng.standard_normal(6)
-            moved = RigidTransform.from_components(T_cb.translation + error[3:], Rotation.from_rotvec(error[:3]) * T_cb.rotation)
-            for key, value in zip(out, (number, pitch, moved.as_matrix(), covariance), strict=True):
-                out[key].append(value)
-    shapes = {"camera": (0,), "pitch": (0,), "pose": (0, 4, 4), "covariance": (0, 6, 6)}
-    return {k: np.array(v) if v else np.zeros(shapes[k], int if k == "camera" else float) for k, v in out.items()}
+    true = np.concatenate([_seen(bench, T, pose, at) for T in bench.cameras.values()] or [np.zeros((0, 4, 4))])
+    J = _corner_jacobians(true, bench.model)
+    covariance = np.linalg.inv(np.einsum("vnik,vnil->vkl", J, J) / bench.sigma_px**2)
+    error = noise * (np.linalg.cholesky(covariance) @ rng.standard_normal((len(true), 6, 1)))[..., 0]
+    drawn = true.copy()
+    drawn[:, :3, :3] = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[:, :3, :3]
+    drawn[:, :3, 3] += error[:, 3:]
+    camera, pitch = np.repeat(np.arange(len(bench.cameras)), len(at)), np.tile(at, len(bench.cameras))
+    return {"camera": camera, "pitch": pitch, "pose": drawn, "covariance": covariance}
 
 
-def _corner_jacobian(T_camera_board, corners, model):
-    """Derivatives of the corners' pixels by the pose's increments ``[w, v]``, shape (k, 2, 6)."""
-    turned = T_camera_board.rotation.apply(corners)
-    by_point = project_jacobians(turned + T_camera_board.translation, model)[0]
-    return np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
+def _seen(bench, T_camera, pose, at):
+    """``T_camera_board`` at each recorded pitch, shape (v, 4, 4)."""
+    turn = np.zeros((len(at), 4, 4)) + np.eye(4)
+    if bench.mount == "platform":
+        return T_camera.as_matrix() @ turn @ pose.as_matrix()
+    turn[:, :3, :3] = Rotation.from_rotvec(np.outer(-at * (1 + bench.stretch), [1.0, 0.0, 0.0])).as_matrix()
+    return (T_camera * bench.T_head_lrf.inv()).as_matrix() @ turn @ pose.as_matrix()
+
+
+def _corner_jacobians(T_camera_board, model):
+    """Derivatives of the corners' pixels by the poses' increments ``[w, v]``, shape (v, k, 2, 6)."""
+    turned = CORNERS @ np.swapaxes(T_camera_board[:, :3, :3], 1, 2)
+    points = turned + T_camera_board[:, None, :3, 3]
+    by_point = project_jacobians(points.reshape(-1, 3), model)[0].reshape(points.shape[:2] + (2, 3))
+    return np.concatenate([np.cross(turned[:, :, None, :], by_point), by_point], axis=-1)

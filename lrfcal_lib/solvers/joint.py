@@ -9,7 +9,16 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.geometry import DegenerateGeometry, TiltAxis, axis_of, head_from_axis
 from lrfcal_lib.solvers.edge_likelihood import disc_edge
-from lrfcal_lib.solvers.joint_blocks import SENSOR, JointData, JointState, Unknowns, gather, joint_blocks, move_state
+from lrfcal_lib.solvers.joint_blocks import (
+    SENSOR,
+    JointData,
+    JointState,
+    Unknowns,
+    gather,
+    joint_blocks,
+    move_state,
+    named_blocks,
+)
 from lrfcal_lib.solvers.joint_noise import (
     CONTRADICTION,
     LARGEST_SHARE,
@@ -35,7 +44,7 @@ LEVELS = (
     "prior",
 )  # fmt: skip
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
-GOOD_START = 5.0  # mean half squared residual; a start value this good is not searched further
+GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
@@ -266,7 +275,7 @@ def settle(state, data, unknowns, iterations):
 
 def drop_contradictions(obs, state, data, unknowns):
     """Leave out placements whose residuals are far larger than those of the others."""
-    found = misfits(state, data, unknowns)
+    found = misfits(named_blocks(state, data, unknowns), data)
     level = np.median(found)
     bad = np.flatnonzero(found > CONTRADICTION * max(level, 1.0))
     if len(bad) == 0:
@@ -362,8 +371,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     miss = np.median(rough_misses(state, gather(kept)))
     if miss > ROUGH_MISS:
         raise DegenerateGeometry(
-            f"images and scans contradict each other: in the middle of the placements the board lies {1000 * miss:.0f} mm "
-            "off where the images put it; check that images and scans carry the right numbers, and the board's size"
+            f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm or "
+            "more off where the images put it; check that images and scans carry the right numbers, and the board's size"
         )
     if len(bad) > LARGEST_SHARE * len(obs.placements):
         raise DegenerateGeometry(
@@ -477,7 +486,7 @@ _WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
 
 
 def _wrap(obs, data, unknowns, found, excluded):
-    state = found.state
+    state, blocks = found.state, named_blocks(found.state, data, unknowns)
     T_head_lrf = pose_transform(state.head)
     return JointSolution(
         T_head_lrf,
@@ -487,9 +496,9 @@ def _wrap(obs, data, unknowns, found, excluded):
         {int(p): s for p, s in zip(obs.placements, state.sweeps, strict=True)},
         dict(zip(obs.edges, state.size.tolist(), strict=True)),
         noise_levels(data, obs.cameras),
-        dict(zip(obs.placements.tolist(), misfits(state, data, unknowns).tolist(), strict=True)),
-        excluded, found.unobservable, joint_warnings(state, data, unknowns, found, obs.cameras), found, state, unknowns,
-        data,
+        dict(zip(obs.placements.tolist(), misfits(blocks, data).tolist(), strict=True)),
+        excluded, found.unobservable, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
+        unknowns, data,
     )  # fmt: skip
 
 

@@ -231,16 +231,23 @@ def ray_columns(by_o, by_d, ray):
 
 
 def assemble(unknowns, head, parts, board, *, cameras=None, sensor=None, size=None, sides=None):
-    """Columns side by side, only those that are unknown: shared ones first, then the placement's own."""
-    shape = head.shape[:-1]
-    empty = np.zeros(shape + (6 * unknowns.cameras,)) if cameras is None else cameras
-    sensor = np.zeros(shape + (3,)) if sensor is None else sensor
-    size = np.zeros(shape + (unknowns.edges,)) if size is None else size
-    shared = np.concatenate([head, empty, sensor, parts[..., :2], size], axis=-1)[..., unknowns.mask]
-    own = [board, parts[..., 2 : 2 + SWEEPS[unknowns.sweep]]]
-    if unknowns.sides:
-        own.append(np.zeros(shape + (unknowns.edges,)) if sides is None else sides)
-    return np.concatenate([shared, *own], axis=-1)
+    """Columns side by side, only those that are unknown: shared ones first, then the placement's own.
+
+    `sensor` are the columns of the first three of `SENSOR` (None for zeros), `parts` those of the pitch: scale and
+    offset by direction are shared, offset and stretch of the sweep its own.
+    """
+    sensors = [None if sensor is None else sensor[..., i] for i in range(3)] + [parts[..., 0], parts[..., 1]]
+    pieces = [(head, 4)] * unknowns.axis + [(cameras, 6 * unknowns.cameras)] * unknowns.poses
+    pieces += [(sensors[SENSOR.index(name)], 1) for name in SENSOR if name in unknowns.sensor]
+    pieces += [(size, unknowns.edges)] * unknowns.size + [(board, 6)]
+    count = SWEEPS[unknowns.sweep]
+    pieces += [(parts[..., 2 : 2 + count], count)] + [(sides, unknowns.edges)] * unknowns.sides
+    out, at = np.zeros(head.shape[:-1] + (unknowns.shared + unknowns.own,)), 0
+    for piece, width in pieces:
+        if piece is not None:
+            out[..., at : at + width] = piece if piece.ndim == out.ndim else piece[..., None]
+        at += width
+    return out
 
 
 def face_block(state, data, unknowns):
@@ -446,8 +453,7 @@ def joint_blocks(state, data, unknowns):
 
 
 def named_blocks(state, data, unknowns):
-    """Residuals by name: 'face' (metres), 'beam' (likelihoods), 'view' (radians and metres), 'sweep', 'side', 'softness',
-    'prior'."""
+    """Residuals by name: face (metres), beam (likelihoods), view (radians and metres), sweep, side, softness, prior."""
     makers = {"face": face_block, "beam": beam_block, "view": view_block}
     blocks = {n: make(state, data, unknowns) for n, make in makers.items() if getattr(data, n)["used"].any()}
     if SWEEPS[unknowns.sweep]:

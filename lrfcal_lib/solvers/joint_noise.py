@@ -76,7 +76,7 @@ def face_levels(state, data, block):
     z = np.where(used, block.residuals / np.where(used, data.face["sigma"], 1.0), 0.0)
     number = used.sum(axis=1)
     scale = np.sqrt(np.sum(z**2) / max(np.sum(np.maximum(number - PLANE, 1)), 1))
-    x = _on_board(state, data)
+    x = on_board(state, data)
     part = _part(x[..., 0], used) * PARTS + _part(x[..., 1], used)
     rows = np.arange(len(used))[:, None] * PARTS**2 + part
     size = len(used) * PARTS**2
@@ -87,7 +87,7 @@ def face_levels(state, data, block):
     return {"face_scale": float(scale), "face_share": float(1 / max(ratio, 1.0))}
 
 
-def _on_board(state, data):
+def on_board(state, data):
     """Measured face points in the boards' frames, shape (p, n, 3)."""
     o, d = rays(state, data, data.face)[:2]
     x = o + (data.face["range"] - state.sensor[0])[..., None] * d - state.boards[:, None, :, 3]
@@ -96,8 +96,8 @@ def _on_board(state, data):
 
 def _part(values, used):
     """Third of the spread of values that each one lies in, row by row."""
-    ordered = np.where(used, values, np.nan)
-    limits = np.nanquantile(np.where(used.any(axis=1, keepdims=True), ordered, 0.0), np.arange(1, PARTS) / PARTS, axis=1)
+    ordered = np.where(used | ~used.any(axis=1, keepdims=True), values, np.nan)
+    limits = np.nanquantile(ordered, np.arange(1, PARTS) / PARTS, axis=1)
     return np.sum(values[None] > limits[..., None], axis=0)
 
 
@@ -171,10 +171,9 @@ def side_level(sides, variance, sigma):
     return float(np.clip(sigma, 0.01, 2.0))
 
 
-def misfits(state, data, unknowns):
+def misfits(blocks, data):
     """Normalised mean squared residual of ranges and views of each placement; 1 is what the noise explains, (p,)."""
-    blocks = named_blocks(state, data, unknowns)
-    total, count = np.zeros(len(state.boards)), np.zeros(len(state.boards))
+    total, count = np.zeros(len(data.middle)), np.zeros(len(data.middle))
     for name, numbers in (("face", 1), ("view", 6)):
         if name in blocks:
             share = data.face_share if name == "face" else 1.0
@@ -186,6 +185,6 @@ def misfits(state, data, unknowns):
 def rough_misses(state, data):
     """Median distance of every board's face points from where the start value puts the board, metres, (p,)."""
     used = data.face["used"]
-    off = np.where(used, np.abs(_on_board(state, data)[..., 2]), np.nan)
+    off = np.where(used, np.abs(on_board(state, data)[..., 2]), np.nan)
     with np.errstate(all="ignore"):
         return np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in off])

@@ -18,12 +18,13 @@ TERMS = {
 }
 
 
-def joint_warnings(state, data, unknowns, found, names):
+def joint_warnings(blocks, data, unknowns, found, names):
     """Warnings about a joint estimate.
 
     Parameters
     ----------
-    state : JointState
+    blocks : dict of str to Block
+        Of :func:`lrfcal_lib.solvers.joint_blocks.named_blocks` at the solution.
     data : JointData
     unknowns : Unknowns
     found : Solution
@@ -34,12 +35,11 @@ def joint_warnings(state, data, unknowns, found, names):
     -------
     tuple of str
     """
-    blocks = named_blocks(state, data, unknowns)
     words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
     words += weak_words(found)
-    return tuple(words + asked_words(state, data, unknowns))
+    return tuple(words + asked_words(found.state, data, unknowns))
 
 
 def noise_words(blocks, data, names):
@@ -82,18 +82,21 @@ def weak_words(found):
 def asked_words(state, data, unknowns):
     """Errors of the pitch that were held at zero although the residuals ask for them (a score test)."""
     held = [name for name in TERMS if name not in unknowns.sensor]
-    words = []
-    for name in held:
-        wider = replace(unknowns, sensor=(*unknowns.sensor, name))
-        square, value = score_test(state, data, wider, name)
+    if not held:
+        return []
+    words, wider = [], replace(unknowns, sensor=(*unknowns.sensor, *held))
+    for name, (square, value) in score_tests(state, data, wider, held).items():
         least, what, factor, unit = TERMS[name]
         if square > ASKED and abs(value) > least:
             words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
     return words
 
 
-def score_test(state, data, unknowns, name):
-    """Squared score of one shared unknown in standard deviations, all others free, and the value it would take."""
+def score_tests(state, data, unknowns, held):
+    """Squared scores of shared unknowns held at zero, in standard deviations, and the values they would take.
+
+    Each one is tested by itself, with all that was estimated free.
+    """
     c, hessian, gradient = unknowns.shared, 0.0, 0.0
     for block in named_blocks(state, data, unknowns).values():
         r, J = whiten(block)
@@ -103,7 +106,11 @@ def score_test(state, data, unknowns, name):
     back = hessian[:, :c, c:] @ inverse
     whole = np.sum(hessian[:, :c, :c] - back @ hessian[:, c:, :c], axis=0)
     score = np.sum(gradient[:, :c] - (back @ gradient[:, c:, None])[..., 0], axis=0)
-    covariance = np.linalg.pinv(whole, rcond=1e-14, hermitian=True)
-    at = [i for i, n in enumerate(unknowns.names(range(unknowns.cameras), range(unknowns.edges))) if n == name][0]
-    step = -(covariance @ score)[at]
-    return float(step**2 / max(covariance[at, at], 1e-300)), float(step)
+    names = unknowns.names(range(unknowns.cameras), range(unknowns.edges))
+    others, out = [i for i, name in enumerate(names) if name not in held], {}
+    for name in held:
+        free = [*others, names.index(name)]
+        covariance = np.linalg.pinv(whole[np.ix_(free, free)], rcond=1e-14, hermitian=True)
+        step = -(covariance @ score[free])[-1]
+        out[name] = float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
+    return out

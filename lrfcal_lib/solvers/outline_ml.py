@@ -6,7 +6,8 @@ not, given by how much the sensor makes boards look larger.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -38,6 +39,9 @@ class EdgeModel:
     range_offset, range_offset_sigma : float
         Recorded minus true range, metres.
     T_head_lrf : RigidTransform
+    correct : callable, optional
+        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to points
+        is not used, `range_offset` is.
     """
 
     log_odds: float = 0.0
@@ -46,7 +50,12 @@ class EdgeModel:
     softness: float = 0.1
     range_offset: float = 0.0
     range_offset_sigma: float = 0.0
-    T_head_lrf: RigidTransform = RigidTransform.identity()
+    T_head_lrf: RigidTransform = field(default_factory=RigidTransform.identity)
+    correct: Callable | None = None
+
+    def pitch(self, placement, p_lrf, pitch):
+        """Recorded pitch without its known errors, radians."""
+        return pitch if self.correct is None else self.correct(placement, p_lrf, pitch)[1]
 
 
 @dataclass(frozen=True)

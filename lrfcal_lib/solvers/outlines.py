@@ -15,7 +15,7 @@ from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
 from lrfcal_lib.solvers.least_squares import Block, minimise
 from lrfcal_lib.solvers.observability import reduced_hessian
-from lrfcal_lib.solvers.outline_ml import LAPSE, face_surface, find_rays, start_lines
+from lrfcal_lib.solvers.outline_ml import FEWEST_CELLS, LAPSE, face_surface, find_rays, start_lines
 
 SPREAD = 0.2  # of the log odds from side to side, scale of a Cauchy distribution
 GAUGE = np.array([0.1, 0.3])  # metres, radians: how far an outline may be from its start
@@ -126,7 +126,9 @@ def _gather(sweeps, edges, model):
             edge = np.array([edges.index(name) for name in sides])
             starts.append((edge, start_lines(found, len(sides))[0]))
             rays.append((found, edge[found.side]))
-    width = max((len(edge) for _, edge in rays), default=0)
+    if not rays:
+        raise DegenerateGeometry(f"no side has {FEWEST_CELLS} beams about it in any of {len(sweeps)} sweeps")
+    width = max(len(edge) for _, edge in rays)
 
     def pad(values, fill=0.0):
         return np.stack([np.concatenate([v, np.full((width - len(v),) + v.shape[1:], fill, v.dtype)]) for v in values])
@@ -137,12 +139,24 @@ def _gather(sweeps, edges, model):
     return _Sweeps(edge=pad([edge for _, edge in rays], 0), used=used, **whole), starts
 
 
+def _turns(starts, lines):
+    """Complex turns from the sides of each sweep to those of the board: of length one where they agree."""
+    normals = [(lines[edge, 0] + 1j * lines[edge, 1], found[:, 0] + 1j * found[:, 1]) for edge, found in starts]
+    return np.array([np.mean(board * seen.conj()) for board, seen in normals])
+
+
+def _seen_from_behind(data, starts, lines):
+    """The sweeps turned over where the board's frame has its z axis away from the sensor."""
+    over = [(edge, found * [1, -1, 1]) for edge, found in starts]
+    if np.sum(np.abs(_turns(over, lines))) <= np.sum(np.abs(_turns(starts, lines))):
+        return data, starts
+    return replace(data, at=data.at * [1, -1], direction=data.direction * [1, -1, -1]), over
+
+
 def _start_poses(starts, lines):
     """In-plane poses (p, 3): turn and shift from each sweep's plane to the board, from the lines of its sides."""
     poses = []
-    for edge, found in starts:
-        angle = np.arctan2(lines[edge, 1], lines[edge, 0]) - np.arctan2(found[:, 1], found[:, 0])
-        turn = np.arctan2(np.sin(angle).sum(), np.cos(angle).sum())
+    for (edge, found), turn in zip(starts, np.angle(_turns(starts, lines)), strict=True):
         shift = np.linalg.lstsq(lines[edge, :2], found[:, 2] - lines[edge, 2], rcond=None)[0]
         poses.append(np.r_[turn, shift])
     return np.array(poses)
@@ -217,7 +231,7 @@ def _move(state, step, free):
 
 def _fit(sweeps, lines, edges, model, free):
     """Alternate between the softness and all else."""
-    data, starts = _gather(sweeps, tuple(edges), model)
+    data, starts = _seen_from_behind(*_gather(sweeps, tuple(edges), model), lines)
     pose = _start_poses(starts, lines)
     state = (model.log_odds, lines, pose, np.zeros((len(pose), len(edges))))
     softness = model.softness

@@ -1,0 +1,188 @@
+"""Tables about the joint estimate: every unknown with its uncertainty, noise levels, random halves, errors by truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from lrfcal_lib.evaluate.tables import rms, trusted_sigma, unit_of
+from lrfcal_lib.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
+from lrfcal_lib.solvers.camera import edge_residuals_px
+from lrfcal_lib.solvers.edge_likelihood import disc_edge, edge_shift
+from lrfcal_lib.solvers.joint import solve_again
+from lrfcal_lib.solvers.joint_noise import on_board
+
+ALL = 10**9  # crossings
+NOISE_WORDS = {
+    "face_scale": "scatter of ranges, in stated standard deviations",
+    "face_share": "independent errors per range",
+    "beam_share": "independent errors per beam at an edge",
+    "sigma_pitch": "error of the pitch of single images [deg]",
+    "side_sigma": "spread of the edge bias from side to side [log odds]",
+}
+
+
+def joint_table(joint):
+    """Every shared unknown of the joint estimate.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    DataFrame
+        parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the placements, model errors
+        included; NaN where unknown), sigma (the larger one).
+    """
+    solution = joint.solution.solution
+    spread = solution.sigma_placements
+    spread = np.full(len(solution.names), np.nan) if spread is None else spread
+    rows = []
+    for name, value, noise, scatter in zip(solution.names, solution.parameters, solution.sigma, spread, strict=True):
+        unit, factor = _unit(name)
+        rows.append((name, unit, factor * value, factor * noise, factor * scatter, factor * np.fmax(noise, scatter)))
+    columns = ["parameter", "unit", "value", "sigma_noise", "sigma_placements", "sigma"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _unit(name):
+    if name.startswith("axis_") or name == "pitch_by_direction":
+        return "deg", np.rad2deg(1.0)
+    if name.startswith(("offset_", "size_")) or name == "range_offset":
+        return "mm", 1000.0
+    if name == "pitch_scale":
+        return "%", 100.0
+    return unit_of(name.rsplit("_", 1)[-1]) if name[-2:] in ("rx", "ry", "rz", "tx", "ty", "tz") else ("1", 1.0)
+
+
+def noise_table(joint):
+    """Noise levels that the estimate took from the data, in words."""
+    found = joint.solution.noise
+    words = [NOISE_WORDS.get(name, "scatter of board poses, " + name.replace("_", " ")) for name in found]
+    values = [np.rad2deg(value) if name == "sigma_pitch" else value for name, value in found.items()]
+    return pd.DataFrame({"what": words, "value": values})
+
+
+def edge_bias_mm(joint):
+    """By how much boards look larger at each side: mean over the beams of every edge, millimetres.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    DataFrame
+        placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
+    """
+    solution = joint.solution
+    beams, rows = solution.data.beam, []
+    for i, placement in enumerate(solution.boards):
+        for e, edge in enumerate(joint.observations.edges):
+            mine = beams["used"][i] & (beams["edge"][i] == e)
+            if mine.any():
+                odds = beams["background"][i, mine] + solution.state.sides[i, e]
+                radius = beams["radius"][i, mine]
+                shift = edge_shift(solution.sensor["edge_log_odds"], radius, odds)[0]
+                x = disc_edge(solution.sensor["edge_log_odds"] + odds)[0]
+                distance = np.linalg.norm(solution.state.boards[i, :, 3])
+                rows.append((placement, edge, distance, 1000 * shift.mean(), x.mean()))
+    return pd.DataFrame(rows, columns=["placement", "edge", "distance_m", "bias_mm", "bias_radii"])
+
+
+def joint_fit(joint):
+    """How well ranges and edges fit the joint estimate.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    dict of str to float
+        ``plane_rms_mm`` (face points from their boards), ``edge_rms_px`` (all half-step crossings of scan lines
+        from the image edges, the estimated edge bias taken off, over all cameras).
+    """
+    solution = joint.solution
+    used = solution.data.face["used"]
+    plane = on_board(solution.state, solution.data)[..., 2][used]
+    edges = [edge_misses_px(joint, camera) for camera in joint.observations.cameras]
+    return {"plane_rms_mm": 1000 * rms(plane), "edge_rms_px": rms(np.concatenate(edges))}
+
+
+def edge_misses_px(joint, camera):
+    """Distances of crossings of scan lines from one camera's edges without the edge bias, undistorted pixels, (n,)."""
+    solution, obs = joint.solution, joint.seen_by(camera, crossings=ALL).along()
+    miss = edge_residuals_px(obs, solution.transforms[camera])
+    depth = solution.transforms[camera].apply(obs.crossing_points)[:, 2] if len(miss) else np.zeros(0)
+    row = {p: i for i, p in enumerate(solution.boards)}
+    column = {edge: i for i, edge in enumerate(joint.observations.edges)}
+    known = np.array([p in row for p in obs.crossing_placement], bool)
+    at = [row.get(p, 0) for p in obs.crossing_placement], [column[e] for e in obs.crossing_edge]
+    own = solution.state.sides[at] if len(miss) else np.zeros(0)
+    odds = obs.crossing_background + own
+    shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
+    return (miss - shift * obs.model.fx / depth)[known] if len(miss) else miss
+
+
+def random_halves(joint, pairs=8, seed=0):
+    """How far estimates from two random halves of the placements differ, beside what their sigmas predict.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+    pairs : int
+    seed : int
+
+    Returns
+    -------
+    DataFrame
+        pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg, predicted_translation_mm (root
+        mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma).
+        Splits of which a half leaves something open are missing.
+    """
+    rng, numbers = np.random.default_rng(seed), np.array(list(joint.solution.boards))
+    rows = []
+    for pair in range(pairs):
+        order = rng.permutation(numbers)
+        try:
+            halves = [
+                solve_again(joint.observations.select(np.sort(part)), joint.solution)
+                for part in np.array_split(order, 2)
+            ]
+        except DegenerateGeometry:
+            continue
+        for camera in joint.observations.cameras:
+            turn, shift = transform_difference(*(half.transforms[camera] for half in halves))
+            sigma = 2 * trusted_sigma(joint.solution.camera(camera))
+            expected = np.rad2deg(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:])
+            rows.append((pair, camera, np.rad2deg(turn), 1000 * shift, *expected))
+    columns = ["pair", "camera", "rotation_deg", "translation_mm", "predicted_rotation_deg", "predicted_translation_mm"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def joint_errors(joint, truth):
+    """Errors of axis and cameras against the truth, beside the predicted standard deviations.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+    truth : Truth
+
+    Returns
+    -------
+    DataFrame
+        what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm.
+    """
+    solution, sigma = joint.solution, np.sqrt(np.diag(joint.axis_parameters()[1]))
+    turn, shift = axis_difference(solution.axis, axis_of(truth.T_head_lrf))
+    rows = [("tilt axis", turn, np.linalg.norm(sigma[:2]), shift, np.linalg.norm(sigma[2:]))]
+    for camera, found in solution.transforms.items():
+        turn, shift = transform_difference(found, truth.cameras[camera])
+        spread = trusted_sigma(solution.camera(camera))
+        rows.append((f"camera {camera}", turn, np.linalg.norm(spread[:3]), shift, np.linalg.norm(spread[3:])))
+    factors = np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1000.0, 1000.0])
+    columns = ["rotation_error_deg", "rotation_sigma_deg", "translation_error_mm", "translation_sigma_mm"]
+    table = pd.DataFrame([factors * np.array(row[1:]) for row in rows], columns=columns)
+    return table.assign(what=[row[0] for row in rows])[["what", *columns]]

@@ -1,0 +1,344 @@
+"""Which boards look bent in the scan, which really are, and which materials read farther than others.
+
+A plane and a quadratic surface are fitted to the face of the board. Neighbouring points share their errors (waves of a
+printed sheet, the print itself, errors of the pitch), so parts of the board count as independent, not points.
+A pitch that is recorded too small by a share s makes a flat board look bent by s y^2 / r, with y half its height: 5 %
+over 0.86 m at 1.4 m are 6.6 mm. The corners of a printed pattern in the images tell such a scan from a bent board.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import f as f_distribution
+
+from lrfcal_lib.camera import project, project_jacobians
+from lrfcal_lib.geometry import lrf_to_platform
+from lrfcal_lib.preprocess.board_scan import face_points
+from lrfcal_lib.preprocess.segment import plane_axes
+
+MOST_POINTS = 12000  # a placement; more of them only cost time, since parts of the board count
+MARGIN = 0.02  # of a scan line and of a column, left out at either end: mixed pixels
+PARTS = 6  # along and across the board; a sixth is wider than a square of a usual pattern
+FEWEST_PARTS = 18  # for a surface of six numbers with a covariance from the scatter over parts
+OUTLIER = 4.0  # robust standard deviations
+LEVEL = 0.001  # false alarms a placement
+# Metres; as much as edge points are allowed to scatter about a straight edge (scan.EDGE_SCATTER): a board bent less is
+# not what limits a calibration. Chosen with the LMS400 recording in view: its bends are below 5.6 mm or above 6.2 mm.
+LEAST_BEND = 0.006
+RIM = 0.6  # squares about a pattern that may be its sheet's white rim or the board under it: they belong to neither
+LEAST_SHARE = 0.08  # of the points within the pattern and of those outside it, to compare two materials
+FEWEST_CORNERS = 12  # of a pattern, for a pose and a surface
+FEWEST_SHEETS = 4  # placements for a usual shape
+GRID = 33  # points along and across the outline on which a surface is evaluated
+
+
+@dataclass(frozen=True)
+class Bend:
+    """How bent one board looks in the scan, and its printed sheet in the images.
+
+    Attributes
+    ----------
+    placement : int
+    size, sigma : float
+        From the highest to the lowest point of the quadratic surface over what was scanned of the board, metres; nan
+        where the scan shows too little. Noise alone makes a size above zero: judge it by `p_value`.
+    p_value : float
+        Of such a surface on a flat board.
+    bends : bool
+        Significant at 0.001, and larger than 6 mm.
+    reason : str
+        Why there is no size; '' where there is one.
+    sheet, sheet_sigma : float
+        How far the printed sheet departs from its usual shape (the median over the placements) in the images: the same
+        range of heights, continued from the pattern to the area that was scanned; nan where that is not known. A bend
+        that all placements share cannot be told from the lens. Where `sheet` is much smaller than `size`, the scan is
+        at fault (its pitch), or the board beside the sheet, or the sheet has always been so.
+    surface : ndarray, shape (3,), or None
+        Coefficients of x^2, x y, y^2 in the coordinates of the `Face`, away from the LRF, 1/m.
+    """
+
+    placement: int
+    size: float
+    sigma: float
+    p_value: float
+    bends: bool
+    reason: str = ""
+    sheet: float = np.nan
+    sheet_sigma: float = np.nan
+    surface: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class BoardBends:
+    """The shape of the board in all sweeps.
+
+    Attributes
+    ----------
+    placements : dict of int to Bend
+    level, level_sigma : float
+        How much farther the board around its printed pattern reads than the pattern, metres; nan where the scans do
+        not show both. The standard deviation comes from the scatter over placements.
+    level_applied : bool
+        Whether the level is significant (three standard deviations) and was taken out before bends were measured.
+    """
+
+    placements: dict[int, Bend]
+    level: float = np.nan
+    level_sigma: float = np.nan
+    level_applied: bool = False
+
+
+@dataclass(frozen=True)
+class Face:
+    """Points on a board's face in coordinates of its plane.
+
+    Attributes
+    ----------
+    flat : ndarray, shape (n, 2)
+        Metres.
+    height : ndarray, shape (n,)
+        Over the plane, away from the LRF, metres.
+    by_range : ndarray, shape (n,)
+        Derivative of the height by the range.
+    around : ndarray, shape (n,)
+        0 within the pattern, 1 around it, nan in between; all 0 for one material, or an unknown place of the pattern.
+    outline : ndarray, shape (k, 2)
+        Corners of the area that was scanned, metres.
+    """
+
+    flat: np.ndarray
+    height: np.ndarray
+    by_range: np.ndarray
+    around: np.ndarray
+    outline: np.ndarray
+
+
+def board_bends(prepared, to_board=None):
+    """How the board bends at every placement.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        Its `scans` and its `board` are used, and its `views`, `models` and `relief` where it has any.
+    to_board : dict of int to callable, optional
+        By placement a function from LRF points (n, 3) and their pitch (n,) to the board frame, to about a centimetre.
+        It tells the pattern from the board around it. Without it two materials cannot be told apart from a bend (a
+        board whose rim reads farther than its sheet seems to bulge), and the images are not asked.
+
+    Returns
+    -------
+    BoardBends
+    """
+    to_board = to_board or {}
+    faces = {p: face_of(scan, prepared.board, to_board.get(p)) for p, scan in prepared.scans.items()}
+    level, sigma = common_level(list(faces.values()))
+    applied = bool(abs(level) > 3 * sigma)
+    found = {p: bend_of(face, p, level if applied else 0.0) for p, face in faces.items()}
+    sheets = {p: sheet_surface(prepared, p) for p in faces if p in to_board and not found[p].reason}
+    sheets = {p: sheet for p, sheet in sheets.items() if sheet is not None}
+    usual = np.median([surface for surface, _ in sheets.values()], axis=0) if len(sheets) >= FEWEST_SHEETS else None
+    for p, (surface, covariance) in sheets.items() if usual is not None else ():
+        size, spread = _height_range(faces[p], surface - usual, covariance)
+        found[p] = replace(found[p], sheet=size, sheet_sigma=spread)
+    return BoardBends(found, level, sigma, applied)
+
+
+def face_of(scan, board=None, to_board=None):
+    """The face of a scanned board in coordinates of its plane.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    board : Board, optional
+    to_board : callable, optional
+        See :func:`board_bends`.
+
+    Returns
+    -------
+    Face
+        In board coordinates with `to_board`, else in arbitrary ones of the plane.
+    """
+    p_lrf, pitch, _ = face_points(scan, MOST_POINTS, MARGIN)
+    points = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf)
+    origin = lrf_to_platform(np.zeros_like(p_lrf), pitch, scan.T_head_lrf)
+    by_range = (points - origin) @ scan.normal / np.linalg.norm(p_lrf, axis=1)
+    away = np.sign(np.median(by_range))
+    height, by_range = away * (points @ scan.normal - scan.distance), away * by_range
+    flat = points @ plane_axes(scan.normal).T if to_board is None else to_board(p_lrf, pitch)[:, :2]
+    around = np.zeros(len(flat)) if to_board is None else around_pattern(flat, board)
+    return Face(flat, height, by_range, around, hull(flat))
+
+
+def hull(flat):
+    """Corners of the area that holds points; all of them where they span none (a single scan line)."""
+    try:
+        return flat[ConvexHull(flat).vertices]
+    except (QhullError, ValueError):
+        return flat
+
+
+def around_pattern(flat, board):
+    """0 within the squares of the pattern, 1 around it, nan where the sheet may end, shape (n,)."""
+    if board is None or board.pattern is None:
+        return np.zeros(len(flat))
+    pattern = board.pattern
+    low = np.asarray(pattern.origin) - pattern.square
+    high = low + pattern.square * np.array([pattern.columns + 1, pattern.rows + 1])
+    outside = np.maximum(low - flat, flat - high).max(axis=1)
+    return np.where(outside <= 0, 0.0, np.where(outside > RIM * pattern.square, 1.0, np.nan))
+
+
+def common_level(faces):
+    """How much farther the board around the pattern reads than the pattern, over all placements.
+
+    Parameters
+    ----------
+    faces : sequence of Face
+
+    Returns
+    -------
+    level, sigma : float
+        Median over placements and its standard deviation, metres; nan with fewer than four that show both materials.
+    """
+    levels = []
+    for face in faces:
+        known = np.isfinite(face.around)
+        share = np.mean(face.around[known]) if known.any() else 0.0
+        if LEAST_SHARE < share < 1 - LEAST_SHARE:
+            columns = np.column_stack([_surface(face, face.flat), np.nan_to_num(face.around) * face.by_range])
+            levels.append(_robust_fit(columns[known], face.height[known])[0][-1])
+    if len(levels) < 4:
+        return np.nan, np.nan
+    spread = 1.4826 * np.median(np.abs(levels - np.median(levels)))
+    return float(np.median(levels)), float(1.2533 * spread / np.sqrt(len(levels)))
+
+
+def _surface(face, flat):
+    """Columns of a plane and a quadratic surface at points of the plane, shape (n, 6)."""
+    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
+    x, y = (flat - (low + high) / 2).T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def _robust_fit(columns, values, rounds=3):
+    """Least squares without outliers: coefficients, residuals, and which values were used."""
+    used = np.ones(len(values), bool)
+    for _ in range(rounds):
+        found = np.linalg.lstsq(columns[used], values[used], rcond=None)[0]
+        miss = values - columns @ found
+        middle = np.median(miss[used])
+        used = np.abs(miss - middle) <= OUTLIER * 1.4826 * np.median(np.abs(miss[used] - middle)) + 1e-12
+    return found, miss, used
+
+
+def bend_of(face, placement=0, level=0.0):
+    """The bend of one board.
+
+    Parameters
+    ----------
+    face : Face
+    placement : int
+    level : float
+        Taken off the ranges around the pattern, metres; points that may belong to either material are left out then.
+
+    Returns
+    -------
+    Bend
+    """
+    known = np.isfinite(face.around) if level else np.ones(len(face.flat), bool)
+    part = _part_of(face)[known]
+    if len(np.unique(part)) < FEWEST_PARTS:
+        reason = f"the scan shows {len(np.unique(part))} of {PARTS**2} parts of the board, {FEWEST_PARTS} are needed"
+        return Bend(placement, np.nan, np.nan, np.nan, False, f"placement {placement}: {reason}")
+    columns = _surface(face, face.flat[known])
+    height = face.height[known] - (level * np.nan_to_num(face.around) * face.by_range)[known]
+    found, miss, used = _robust_fit(columns, height)
+    covariance, free = _covariance(columns[used], miss[used], part[used])
+    q, of_q = found[3:], covariance[3:, 3:]
+    p_value = float(f_distribution.sf(q @ np.linalg.solve(of_q, q) / 3, 3, free))
+    size, sigma = _height_range(face, q, of_q)
+    return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
+
+
+def _part_of(face):
+    """Which part of the board each point belongs to."""
+    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
+    column = np.clip((PARTS * (face.flat - low) / np.maximum(high - low, 1e-9)).astype(int), 0, PARTS - 1)
+    return column @ [1, PARTS]
+
+
+def _covariance(columns, miss, part):
+    """Sandwich covariance with parts of the board as its independent pieces, and the degrees of freedom."""
+    score = np.zeros((PARTS**2, columns.shape[1]))
+    np.add.at(score, part, columns * miss[:, None])
+    bread = np.linalg.inv(columns.T @ columns)
+    pieces, unknowns = len(np.unique(part)), columns.shape[1]
+    return bread @ (score.T @ score) @ bread * pieces / (pieces - unknowns), pieces - unknowns
+
+
+def _height_range(face, q, covariance):
+    """Greatest difference in height of a quadratic surface (less its plane) over the outline, with its sigma."""
+    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
+    columns = _surface(face, grid[Delaunay(face.outline).find_simplex(grid) >= 0])
+    bent = columns[:, 3:] - columns[:, :3] @ np.linalg.lstsq(columns[:, :3], columns[:, 3:], rcond=None)[0]
+    height = bent @ q
+    between = bent[height.argmax()] - bent[height.argmin()]
+    return float(np.ptp(height)), float(np.sqrt(between @ covariance @ between))
+
+
+def sheet_surface(prepared, placement):
+    """The bend of the printed sheet at a placement over the waves that it has at all of them, from the images.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    placement : int
+
+    Returns
+    -------
+    (ndarray, shape (3,), ndarray, shape (3, 3)) or None
+        Coefficients of x^2, x y, y^2 of the board frame, away from the camera, 1/m, with their covariance, which grows
+        by what two cameras differ; None without a pattern in an image.
+    """
+    pattern, information, right, seen = prepared.board.pattern, np.zeros((3, 3)), np.zeros(3), []
+    for camera, views in prepared.views.items():
+        view = views.get(placement)
+        if pattern is None or view is None or view.pixels is None or view.T_camera_board is None:
+            continue
+        if np.isfinite(view.pixels).all(axis=1).sum() >= FEWEST_CORNERS:
+            q, weight = _bent_pattern(view, prepared.models[camera], pattern.points(), prepared.relief)
+            seen.append((q, weight))
+            information, right = information + weight, right + weight @ q
+    if not seen:
+        return None
+    q = np.linalg.solve(information, right)
+    differ = sum((own - q) @ weight @ (own - q) for own, weight in seen) / max(3 * (len(seen) - 1), 1)
+    return q, np.linalg.inv(information) * max(1.0, differ)
+
+
+def _bent_pattern(view, model, points, relief, rounds=6):
+    """Surface of the pattern in one image (coefficients with their information), pose and surface free."""
+    seen = np.isfinite(view.pixels).all(axis=1)
+    points[:, 2] += 0.0 if relief is None else relief
+    x, y = (points[seen, :2] - points[:, :2].mean(axis=0)).T
+    shape, pose, q = np.stack([x * x, x * y, y * y], axis=1), view.T_camera_board, np.zeros(3)
+    away = np.sign(pose.rotation.as_matrix()[:, 2] @ pose.translation)
+    for _ in range(rounds):
+        rotation = pose.rotation.as_matrix()
+        turned = (points[seen] + np.outer(shape @ q, [0.0, 0.0, 1.0])) @ rotation.T
+        miss = view.pixels[seen] - project(turned + pose.translation, model)
+        by_point = project_jacobians(turned + pose.translation, model)[0]
+        by_turn = np.cross(turned[:, None], by_point)  # a . (w x p) = w . (p x a)
+        by_shape = (by_point @ rotation[:, 2])[:, :, None] * shape[:, None]
+        jacobian = np.concatenate([by_turn, by_point, by_shape], axis=2).reshape(-1, 9)
+        step = np.linalg.lstsq(jacobian, miss.ravel(), rcond=None)[0]
+        turn = Rotation.from_rotvec(step[:3]) * pose.rotation
+        pose, q = RigidTransform.from_components(pose.translation + step[3:6], turn), q + step[6:]
+    variance = np.sum(miss**2) / (miss.size - 9)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)[6:, 6:] * variance
+    return away * q, np.linalg.inv(covariance)

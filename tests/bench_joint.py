@@ -1,0 +1,254 @@
+"""Speed and consistency of the joint estimate: against GTSAM (where installed), scipy, and its own bound.
+
+All of them solve the same residuals from the same start value: ranges, views, and for every beam near an edge the
+Gaussian that its likelihood is at the solution (mean and variance of its margin). Only the first row is the whole job
+of `solve_joint`: start values from nothing, then the likelihood itself. Run with ``make bench``.
+"""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from joint_draws import draw
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.evaluate.monte_carlo import consistency, monte_carlo
+from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
+from lrfcal_lib.solvers.joint import best_start, solve_joint
+from lrfcal_lib.solvers.joint_blocks import (
+    AXIS_COLUMNS,
+    Unknowns,
+    assemble,
+    edge_distance,
+    face_block,
+    gather,
+    move_state,
+    ray_columns,
+    rays,
+    view_block,
+)
+from lrfcal_lib.solvers.least_squares import Block, minimise, whiten
+from lrfcal_lib.solvers.pose import cross, pose_transform
+
+try:
+    import gtsam
+except ImportError:
+    gtsam = None
+
+COLUMNS = ["what", "value", "unit", "against", "times_faster"]
+REPEATS = 5
+FACE, BEAMS = 40, 30
+SENSOR = ("range_offset", "edge_log_odds")
+
+
+def seconds(function):
+    """Median time of a call, after one to warm up."""
+    function()
+    times = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times))
+
+
+def thinned(obs, **most):
+    """Observations with at most so many rows of each group a placement, evenly picked."""
+    masks = {}
+    for name, count in most.items():
+        place = getattr(obs, f"{name}_placement")
+        masks[name] = np.zeros(len(place), bool)
+        for p in range(len(obs.placements)):
+            rows = np.flatnonzero(place == p)
+            masks[name][rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)]] = True
+    return obs.keep(**masks)
+
+
+def problem(count):
+    """A drawn session, its solution, and the Gaussians of its beams there."""
+    obs, _, _ = draw(np.random.default_rng(0), count)
+    obs = thinned(obs, face=FACE, beam=BEAMS)
+    found = solve_joint(obs)
+    unknowns = Unknowns(len(obs.cameras), len(obs.edges), sensor=SENSOR)
+    data = gather(obs)
+    margin = margins(found.state, data, unknowns)[0]
+    sigma = np.where(data.beam["used"], data.beam["radius"], 1.0) * np.exp(found.state.sensor[2])
+    _, score, information, _ = beam_terms(margin, sigma, data.beam["hit"])
+    information = np.maximum(information, 1.0) * data.beam["used"]
+    target = margin - score / np.maximum(information, 1.0)
+    start = best_start(obs, found.unknowns, data.sweep_sigma)[1]
+    start = replace(start, sensor=np.where(np.arange(5) == 2, found.state.sensor, start.sensor))
+    return obs, replace(data, beam=data.beam | {"target": target, "root": np.sqrt(information)}), unknowns, start
+
+
+def margins(state, data, unknowns):
+    """How far inside the place where readings flip the beams lie (p, n), and the Jacobian."""
+    group = data.beam
+    ray = rays(state, data, group)
+    u, by_o, by_d, by_t, a, t, _ = edge_distance(state, data, group, ray)
+    shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"])
+    head, parts = ray_columns(-by_o, -by_d, ray)
+    board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
+    return shift - u, assemble(unknowns, head, parts, board, sensor=np.stack([0 * u, slope, 0 * u], axis=-1))
+
+
+def gaussian_blocks(state, data, unknowns):
+    """Ranges, beams as Gaussians, and views."""
+    margin, J = margins(state, data, unknowns)
+    beams = Block(margin - data.beam["target"], J, data.beam["root"])
+    return [face_block(state, data, unknowns), beams, view_block(state, data, unknowns)]
+
+
+def ours(data, unknowns, start):
+    """The joint estimate's own core on the Gaussian problem."""
+    return minimise(
+        lambda s: gaussian_blocks(s, data, unknowns), start, lambda s, d: move_state(s, d, unknowns),
+        shared=unknowns.shared, tolerance=1e-4,
+    )[0]  # fmt: skip
+
+
+def by_scipy(data, unknowns, start):
+    """scipy's dense trust region with a numeric Jacobian, increments about the start value."""
+    count, c = len(start.boards), unknowns.shared
+
+    def state_of(x):
+        return move_state(start, (x[:c], x[c:].reshape(count, -1)), unknowns)
+
+    def residuals(x):
+        return np.concatenate([whiten(b, False)[0].ravel() for b in gaussian_blocks(state_of(x), data, unknowns)])
+
+    return state_of(least_squares(residuals, np.zeros(c + count * unknowns.own), method="trf", x_scale="jac").x)
+
+
+def one_placement(data, p):
+    """The data of one placement without its padding."""
+    groups = {}
+    for name in ("face", "beam", "view"):
+        group = getattr(data, name)
+        groups[name] = {key: value[p : p + 1, group["used"][p]] for key, value in group.items()}
+    return replace(data, **groups, middle=data.middle[p : p + 1], direction=data.direction[p : p + 1])
+
+
+def by_gtsam(pieces, data, unknowns, start):
+    """GTSAM's Levenberg-Marquardt with one vectorised Python factor a placement."""
+    cameras, count = len(start.cameras), len(start.boards)
+    head, sensor, eyes, boards = 0, 1, [2 + i for i in range(cameras)], [100 + i for i in range(count)]
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    poses = [start.head, *start.cameras, *start.boards]
+    for key, pose in zip([head, *eyes, *boards], poses, strict=True):
+        values.insert(key, gtsam.Pose3(gtsam.Rot3(pose[:, :3]), pose[:, 3]))
+    values.insert(sensor, start.sensor[:2])
+
+    def read(v, p):
+        poses = [v.atPose3(key).matrix()[:3] for key in (head, *eyes, boards[p])]
+        now = replace(start, head=poses[0], cameras=np.stack(poses[1:-1]), boards=poses[-1][None])
+        return replace(now, sensor=np.r_[v.atVector(sensor), start.sensor[2:]], sweeps=start.sweeps[:1])
+
+    def factor(p):
+        def error(_, v, jacobians):
+            state = read(v, p)
+            parts = [whiten(b, jacobians is not None) for b in gaussian_blocks(state, pieces[p], unknowns)]
+            if jacobians is not None:
+                J = np.concatenate([part[1][0] for part in parts])
+                wide = np.zeros((len(J), 6))
+                wide[:, AXIS_COLUMNS] = J[:, :4]
+                jacobians[0], jacobians[1] = local(wide, state.head), J[:, 4 + 6 * cameras : 6 + 6 * cameras]
+                for i in range(cameras):
+                    jacobians[2 + i] = local(J[:, 4 + 6 * i : 10 + 6 * i], state.cameras[i])
+                jacobians[-1] = local(J[:, -6:], state.boards[0])
+            return np.concatenate([part[0][0] for part in parts])
+
+        rows = sum(pieces[p].__dict__[name]["used"].size * n for name, n in (("face", 1), ("beam", 1), ("view", 6)))
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [head, sensor, *eyes, boards[p]], error)
+
+    def gauge(_, v, jacobians):
+        pose = v.atPose3(head).matrix()
+        if jacobians is not None:
+            jacobians[0] = local(np.eye(6)[[0, 3]], pose)
+        turn = Rotation.from_matrix(pose[:3, :3] @ start.head[:, :3].T).as_rotvec()
+        return np.array([turn[0], pose[0, 3] - start.head[0, 3]])
+
+    for p in range(count):
+        graph.add(factor(p))
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(2, 1e-3), [head], gauge))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return replace(read(found, 0), boards=np.stack([found.atPose3(key).matrix()[:3] for key in boards]))
+
+
+def local(J, pose):
+    """Columns by increments in the destination frame to those by GTSAM's local ones."""
+    R = pose[:3, :3]
+    return np.asfortranarray(np.concatenate([J[:, :3] @ R, J[:, 3:] @ R], axis=1))
+
+
+def apart(a, b):
+    """Largest difference of the cameras' poses."""
+    return float(np.abs(a.cameras - b.cameras).max())
+
+
+def against_gtsam(count=100):
+    """The whole job, and its core against GTSAM."""
+    obs, data, unknowns, start = problem(count)
+    whole = seconds(lambda: solve_joint(obs))
+    core = seconds(lambda: ours(data, unknowns, start))
+    size = f"{count} placements x {FACE} ranges, {BEAMS} beams, 6 views"
+    if gtsam is None:
+        yield f"joint estimate, start values included, {size}", 1000 * whole, "ms", "GTSAM is not installed", np.nan
+        return
+    pieces = [one_placement(data, p) for p in range(count)]
+    theirs = seconds(lambda: by_gtsam(pieces, data, unknowns, start))
+    other = by_gtsam(pieces, data, unknowns, start)
+    assert apart(ours(data, unknowns, start), other) < 1e-5, "GTSAM and we end in different places"
+    against = "GTSAM, its iterations only"
+    yield f"joint estimate, start values included, {size}", 1000 * whole, "ms", against, theirs / whole
+    yield "its core on Gaussian residuals, same start", 1000 * core, "ms", against, theirs / core
+
+
+def against_scipy(count=10):
+    """The core against scipy with a dense numeric Jacobian, on a small problem."""
+    _, data, unknowns, start = problem(count)
+    core = seconds(lambda: ours(data, unknowns, start))
+    begin = time.perf_counter()
+    other = by_scipy(data, unknowns, start)
+    theirs = time.perf_counter() - begin
+    assert apart(ours(data, unknowns, start), other) < 1e-5, "scipy and we end in different places"
+    yield f"its core, {count} placements", 1000 * core, "ms", "scipy trf, numeric Jacobian", theirs / core
+
+
+def far_starts(count=100):
+    """Share of wrong start values (60 degrees, half a metre) that end at the same answer, on both mounts."""
+    for mount in ("head", "platform"):
+        obs, truth, _ = draw(np.random.default_rng(1), 12, mount=mount)
+        best, rng, same = solve_joint(obs), np.random.default_rng(2), 0
+        for _ in range(count):
+            turn, away = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+            wrong = RigidTransform.from_components(0.5 * away, Rotation.from_rotvec(np.radians(60) * turn))
+            found = solve_joint(obs, wrong * pose_transform(truth.head))
+            same += np.all(np.abs(found.solution.parameters - best.solution.parameters) < 0.01 * best.solution.sigma)
+        yield f"far starts that reach the same answer, {mount}", same, f"of {count}", "", np.nan
+
+
+def trials(count=100, placements=20, step_deg=0.5):
+    """Errors against bound, coverage and normalised squared error at the paper's set-up, both mounts."""
+    for mount in ("head", "platform"):
+        result = monte_carlo(
+            lambda rng, mount=mount: draw(rng, placements, mount=mount, pitch_step=np.radians(step_deg))[:2],
+            lambda obs: solve_joint(obs, required=False),
+            range(1000, 1000 + count),
+        )
+        print(f"\n{mount}, {placements} placements, {count} draws")
+        shown = ["group", "unit", "rmse", "crb", "rmse_over_crb", "coverage", "nees", "nees_low", "nees_high", "failed"]
+        print(consistency(result)[shown].round(3).to_string(index=False))
+
+
+def main(consistent=True):
+    rows = [row for part in (against_gtsam, against_scipy, far_starts) for row in part()]
+    print(pd.DataFrame(rows, columns=COLUMNS).round(2).to_string(index=False))
+    if consistent:
+        trials()
+
+
+if __name__ == "__main__":
+    main()

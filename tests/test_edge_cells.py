@@ -1,0 +1,138 @@
+"""Cells about the board's edges: one each, on the right side of the edge, clear of corners, holes and clutter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_scan import HEAD, SQUARE, scene
+
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess import scan
+from lrfcal_lib.preprocess.background import background_odds
+from lrfcal_lib.preprocess.edge_cells import edge_cells
+from lrfcal_lib.session import LrfInfo
+
+LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot=(0.01, 0.004))
+
+
+def cells_of(made, reach=2, lrf=LRF, change=None):
+    sweep = made.sweep if change is None else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
+    board = scan.find_board(sweep, made.board, HEAD)
+    along, swept = scan.edge_points(board), scan.sweep_edges(board)
+    return board, edge_cells(board, along, swept, lrf, reach)
+
+
+def outside(made, cells):
+    """Signed distance of cells from the nearest true edge, and which that is."""
+    p = lrf_to_platform(polar_to_points(cells.range_m, cells.bearing), cells.pitch, HEAD)
+    p = made.pose.inv().apply(p)
+    lines = made.board.lines()
+    distance = p[:, :2] @ lines[:, :2].T + lines[:, 2]
+    return distance, distance.argmax(axis=1)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return scene(sigma=0.004)
+
+
+@pytest.fixture(scope="module")
+def found(made):
+    return cells_of(made)
+
+
+def test_every_cell_once_with_its_reading(made, found):
+    board, cells = found
+    number = cells.line * made.sweep.ranges.shape[1] + cells.beam
+    assert len(np.unique(number)) == len(cells) > 500
+    np.testing.assert_array_equal(cells.hit, made.on[cells.line, cells.beam])
+    np.testing.assert_allclose(cells.bearing, made.sweep.bearings[cells.beam])
+    np.testing.assert_allclose(cells.pitch, made.sweep.pitch[cells.line])
+    hit = cells.hit
+    miss = made.sweep.ranges[cells.line, cells.beam][hit] - cells.range_m[hit]
+    assert np.abs(np.median(miss)) < 0.001 and np.abs(miss).max() < 0.03
+
+
+def test_hits_lie_inside_and_misses_outside_within_reach(made, found):
+    distance, nearest = outside(made, found[1])
+    signed = distance[np.arange(len(nearest)), nearest]
+    step = 2 * np.radians(0.25) * found[1].range_m * 1.6  # two steps at a slant
+    assert (signed[found[1].hit] < 0.002).all() and (signed[~found[1].hit] > -0.002).all()
+    assert (np.abs(signed) < step + 0.002).all()
+    assert 0.4 < found[1].hit.mean() < 0.6
+
+
+def test_all_sides_have_cells_and_each_side_is_one_edge(made, found):
+    _, nearest = outside(made, found[1])
+    sides = np.unique(found[1].side)
+    assert len(sides) == 4 and set(nearest) == {0, 1, 2, 3}
+    for side in sides:
+        mine = (found[1].side == side) & ~found[1].hit  # inside, beside a corner, the other edge may be nearer
+        assert len(set(nearest[mine])) == 1
+
+
+def test_no_spot_reaches_two_edges(made, found):
+    distance, _ = outside(made, found[1])
+    second = np.sort(distance, axis=1)[:, -2]
+    assert (second < -0.8 * found[1].radius).all()
+
+
+def test_background_follows_from_its_distance(made, found):
+    cells = found[1]
+    wall = 2 * np.log(cells.range_m / 3.5)  # the wall stands 3.5 m ahead; rays meet it at a slant
+    assert (cells.background < wall + 0.05).all() and (cells.background > wall - 0.6).all()
+
+
+def test_reach_and_spot_are_taken_as_given(made):
+    assert len(cells_of(made, reach=1)[1]) < 0.7 * len(cells_of(made, reach=2)[1])
+    np.testing.assert_allclose(cells_of(made, lrf=None)[1].radius, 0.005)
+    _, cells = cells_of(made)
+    np.testing.assert_allclose(cells.radius, (0.01 + 0.004 * cells.range_m) / 2)
+
+
+def test_holes_and_what_hides_the_board_are_left_out(made):
+    rows = slice(70, 80)
+
+    def hide(ranges):
+        board = np.flatnonzero(made.on[75])
+        ranges[rows, board[0] - 8 : board[0] + 12] = 0.8
+        return ranges
+
+    _, cells = cells_of(made, change=hide)
+    first = np.flatnonzero(made.on[75])[0]
+    there = (cells.line >= 70) & (cells.line < 80) & (np.abs(cells.beam - first) < 12)
+    assert not there.any()
+
+
+def test_a_post_close_behind_is_left_out_but_a_close_wall_is_not(made):
+    def post(ranges):
+        ranges[60:75] = np.where(made.on[60:75], ranges[60:75], 1.9)
+        return ranges
+
+    _, cells = cells_of(made, change=post)
+    beside = (cells.line >= 60) & (cells.line < 75) & ~cells.across
+    assert not beside.any()
+    _, near = cells_of(scene(wall=2.3, sigma=0.004))
+    assert len(near) > 500 and not near.background.any()
+
+
+def test_clouds_cut_to_the_board_have_no_background(made):
+    _, cells = cells_of(made, change=lambda r: np.where(made.on, r, np.nan))
+    assert len(cells) > 500 and not cells.background.any()
+    np.testing.assert_array_equal(cells.hit, made.on[cells.line, cells.beam])
+
+
+def test_a_reach_below_one_is_refused(made):
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        cells_of(made, reach=0)
+
+
+def test_odds_of_backgrounds():
+    np.testing.assert_allclose(background_odds(1.0, [2.0, 1.5, np.inf]), [-2 * np.log(2.0), 0.0, 0.0])
+
+
+def test_single_shot_gives_cells_at_both_ends():
+    made = scene(pitch=(0, 0.001), sigma=0.002)
+    board = scan.find_board(made.sweep, SQUARE, HEAD)
+    cells = edge_cells(board, scan.edge_points(board), None, LRF)
+    assert set(cells.side) == {0, 1} and not cells.across.any()

@@ -1,0 +1,150 @@
+"""Outlines by likelihood: exact widths of drawn boards, the edge model they give, statistics, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+from test_scan import facing
+
+from lrfcal_lib.board import Board
+from lrfcal_lib.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess.edge_cells import EdgeCells
+from lrfcal_lib.solvers.edge_likelihood import edge_shift
+from lrfcal_lib.solvers.outline_ml import EdgeModel, face_surface, measure_outline
+from lrfcal_lib.solvers.outlines import fit_edge_model, measure_outlines
+
+HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
+BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))
+MODEL = EdgeModel(log_odds=-0.8, softness=0.05, range_offset=0.004, T_head_lrf=HEAD)
+STEP = np.radians(0.25)
+
+
+def sweep(pose, rng, model=MODEL, sigma=0.003, deviation=0.0, board=BOARD, bend=0.0):
+    """(cells, face, names) of a board drawn from the model of the edges itself."""
+    bearing, pitch = np.meshgrid(np.radians(np.arange(60, 120.1, 0.25)), np.radians(np.arange(-18, 18.1, 0.25)))
+    origin = lrf_to_platform(np.zeros(bearing.shape + (3,)), pitch, HEAD)
+    rays = lrf_to_platform(polar_to_points(np.ones(bearing.shape), bearing), pitch, HEAD) - origin
+    o, d = pose.inv().apply(origin.reshape(-1, 3)), pose.rotation.inv().apply(rays.reshape(-1, 3))
+    r = -o[:, 2] / d[:, 2]
+    for _ in range(4):
+        at = o + r[:, None] * d
+        r = (bend * (at[:, 0] - 0.25) ** 2 - o[:, 2]) / d[:, 2]
+    lines = board.lines()
+    inside = at[:, :2] @ lines[:, :2].T + lines[:, 2]
+    across = d[:, :2] @ lines[:, :2].T
+    u = inside * np.abs(d[:, 2:]) / np.hypot(across, d[:, 2:])
+    radius = 0.008 + 0.006 * r
+    own = edge_shift(model.log_odds + deviation * np.ones(len(lines)), radius[:, None])[0]
+    jitter = model.softness * radius * rng.standard_normal(len(r))
+    hit = ((u - own).max(axis=1) < jitter).reshape(bearing.shape)
+    line, beam = np.nonzero(np.abs(u.max(axis=1)).reshape(bearing.shape) < 0.02)
+    flat = line * bearing.shape[1] + beam
+    second = np.sort(inside[flat], axis=1)[:, -2]
+    keep = second < -0.025
+    line, beam, flat = line[keep], beam[keep], flat[keep]
+    zero = np.zeros(len(flat))
+    cells = EdgeCells(
+        1, line, beam, bearing[line, beam], pitch[line, beam], hit[line, beam], u[flat].argmax(axis=1), r[flat],
+        radius[flat], zero, zero > 0, zero + STEP,
+    )  # fmt: skip
+    face = np.flatnonzero(inside.max(axis=1) < -0.03)
+    ranges = r[face] + model.range_offset + sigma * rng.standard_normal(len(face))
+    points = polar_to_points(ranges, bearing.ravel()[face])
+    return cells, (points, pitch.ravel()[face], sigma), dict(enumerate(board.edges))
+
+
+def poses(count, seed=0):
+    rng = np.random.default_rng(seed)
+    centre = (0.25, 0.2)
+    return [
+        facing(rng.uniform(1.2, 2.0), rng.uniform(10, 80), rng.uniform(-25, 25), centre=centre) for _ in range(count)
+    ]
+
+
+def errors(measured):
+    true = BOARD.lengths()
+    return np.array([measured.lengths[n] - true[n] for n in true]), np.array([measured.sigma[n] for n in true])
+
+
+def test_lengths_agree_with_their_standard_deviations():
+    rng, scaled, sizes = np.random.default_rng(1), [], []
+    for pose in poses(12):
+        error, sigma = errors(measure_outline(*sweep(pose, rng), BOARD.edges, MODEL))
+        scaled.append(error / sigma)
+        sizes.append(error)
+    assert np.mean(np.abs(sizes)) < 0.0015
+    assert 0.3 < np.mean(np.square(scaled)) < 2.0
+
+
+def test_the_wrong_odds_make_the_board_larger_by_twice_the_shift():
+    rng = np.random.default_rng(2)
+    cells, face, names = sweep(poses(1)[0], rng)
+    right = measure_outline(cells, face, names, BOARD.edges, MODEL)
+    wrong = measure_outline(cells, face, names, BOARD.edges, replace(MODEL, log_odds=0.4))
+    shift = np.subtract(*(edge_shift(v, np.median(cells.radius))[0] for v in (-0.8, 0.4)))
+    for name in BOARD.edges:
+        assert wrong.lengths[name] - right.lengths[name] == pytest.approx(2 * shift, rel=0.15)
+
+
+def test_uncertain_odds_show_in_the_lengths():
+    cells, face, names = sweep(poses(1)[0], np.random.default_rng(3))
+    sure, common, each = (
+        measure_outline(cells, face, names, BOARD.edges, replace(MODEL, **given)).sigma["top"]
+        for given in ({}, {"log_odds_sigma": 0.3}, {"spread": 0.3})
+    )
+    assert common > each > 2 * sure  # what is common to opposite sides adds up, what differs adds in squares
+
+
+def test_a_bent_board_is_seen_as_such():
+    rng, pose = np.random.default_rng(4), facing(1.5, 20.0, 25.0, centre=(0.25, 0.2))
+    made = sweep(pose, rng, bend=0.25)  # 16 mm from the middle to the ends
+    assert np.abs(face_surface(made[1], MODEL)[1]).max() > 0.1
+    assert np.abs(errors(measure_outline(*made, BOARD.edges, MODEL))[0]).max() < 0.004
+    assert not face_surface(sweep(pose, rng)[1], MODEL)[1].any()
+
+
+def test_sides_that_were_not_seen_have_no_length():
+    cells, face, names = sweep(poses(1)[0], np.random.default_rng(5))
+    measured = measure_outline(cells, face, {k: v for k, v in names.items() if v != "left"}, BOARD.edges, MODEL)
+    assert set(measured.lengths) == {"right"} and set(measured.corners) == {"right", "bottom"}
+
+
+def test_a_known_board_tells_how_large_edges_look():
+    rng = np.random.default_rng(6)
+    made = [sweep(pose, rng) for pose in poses(8, 1)]
+    found = fit_edge_model(made, BOARD, replace(MODEL, log_odds=0.0, softness=0.2))
+    assert found.log_odds == pytest.approx(-0.8, abs=4 * found.log_odds_sigma + 0.01)
+    assert found.log_odds_sigma < 0.15 and 0.02 < found.softness < 0.1
+
+
+def test_a_few_dark_backgrounds_do_not_spoil_the_odds():
+    rng = np.random.default_rng(7)
+    made = [sweep(pose, rng, deviation=np.array([0, 0, 0, -1.5]) * (i < 2)) for i, pose in enumerate(poses(9, 2))]
+    found = fit_edge_model(made, BOARD, replace(MODEL, log_odds=0.0))
+    assert found.log_odds == pytest.approx(-0.8, abs=0.2)
+
+
+def test_many_sweeps_measure_better_than_one():
+    rng = np.random.default_rng(8)
+    made = [sweep(pose, rng, deviation=rng.normal(0, 0.1, 4)) for pose in poses(8, 3)]
+    model = replace(MODEL, spread=0.1, log_odds_sigma=0.02)
+    start = np.array([[0, 0], [0.49, 0], [0.51, 0.41], [0, 0.395]])
+    lengths, sigma = measure_outlines(made, start, BOARD.edges, model)
+    alone = [np.abs(errors(measure_outline(*s, BOARD.edges, model))[0]).mean() for s in made]
+    together = np.array([lengths[n] - v for n, v in BOARD.lengths().items()])
+    assert np.abs(together).mean() < np.mean(alone)
+    assert (np.abs(together) < 4 * np.array(list(sigma.values())) + 2e-4).all()
+
+
+def test_what_nothing_was_seen_of_is_named():
+    cells, face, names = sweep(poses(1)[0], np.random.default_rng(9))
+    with pytest.raises(DegenerateGeometry, match="no side has 8 beams"):
+        measure_outline(cells.select(np.arange(6)), face, names, BOARD.edges, MODEL)
+    part = {k: v for k, v in names.items() if v in ("top", "right")}
+    with pytest.raises(DegenerateGeometry, match="no sweep crosses bottom, left"):
+        measure_outlines([(cells, face, part)], BOARD.corners, BOARD.edges, MODEL)
+    with pytest.raises(DegenerateGeometry, match="too few sides"):
+        fit_edge_model([(cells, face, part)], BOARD, MODEL)
+    with pytest.raises(DegenerateGeometry, match="no side has 8 beams about it in any"):
+        fit_edge_model([(cells.select(np.arange(6)), face, names)], BOARD, MODEL)

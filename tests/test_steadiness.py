@@ -1,0 +1,306 @@
+"""A camera on the base stood still or did not: synthetic backgrounds that are turned, scaled, dimmed and covered."""
+
+from types import SimpleNamespace
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lrfcal_lib import pipeline
+from lrfcal_lib.camera import CameraModel, distort, project
+from lrfcal_lib.evaluate.diagnosis import (
+    findings_in_words,
+    motion_words,
+    pitch_words,
+    problem_words,
+    steadiness_table,
+    steps_table,
+)
+from lrfcal_lib.plots.diagnosis import background_motion
+from lrfcal_lib.preprocess.image_motion import BackgroundLost, find_features, fit_motion, motion_misses
+from lrfcal_lib.preprocess.steadiness import (
+    Steadiness,
+    Step,
+    board_hull,
+    camera_steadiness,
+    find_steps,
+    pixel_metric,
+    steadiness_of,
+    turn_px,
+)
+from lrfcal_lib.session import open_session
+
+MODEL = CameraModel(480, 320, 300.0, 302.0, 241.0, 158.0, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
+PLACEMENTS = range(1, 9)
+
+
+@pytest.fixture(scope="module")
+def texture():
+    """A background of blobs of many sizes, larger than the image."""
+    rng = np.random.default_rng(4)
+    layers = [cv2.GaussianBlur(rng.standard_normal((520, 720)), (0, 0), s) * s for s in (1.5, 3, 8)]
+    return 118 + 45 * np.clip(sum(layers) / np.std(sum(layers)), -2, 2)
+
+
+def picture(texture, rng, turn=(0, 0, 0), scale=1.0, board=None, light=1.0, noise=1.5):
+    """The background seen by a camera that has turned; a board covers a part of it."""
+    u, v = np.meshgrid(np.arange(MODEL.width), np.arange(MODEL.height))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2).astype(float)
+    bare = cv2.undistortPoints(pixels[:, None], MODEL.matrix, MODEL.distortion)[:, 0] / scale
+    rays = Rotation.from_rotvec(turn).apply(np.column_stack([bare, np.ones(len(bare))]))
+    at = (300 * rays[:, :2] / rays[:, 2:] + [360, 260]).reshape(MODEL.height, MODEL.width, 2).astype(np.float32)
+    image = cv2.remap(texture.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+    if board is not None:
+        x, y = board
+        squares = (np.add.outer(np.arange(110) // 14, np.arange(130) // 14) % 2) * 200.0 + 20
+        image[y : y + 110, x : x + 130] = squares
+    image = light * image + noise * rng.standard_normal(image.shape)
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def series(texture, turns, seed=1, **more):
+    """One image a placement, the board somewhere else in each."""
+    rng = np.random.default_rng(seed)
+    return [
+        (p, picture(texture, rng, turn, board=(20 + 40 * p, 60 + 17 * p), **{k: v[i] for k, v in more.items()}))
+        for i, (p, turn) in enumerate(zip(PLACEMENTS, turns, strict=True))
+    ]
+
+
+def judge(images, reference=4):
+    return steadiness_of("left", images, dict(images)[reference], reference, MODEL)
+
+
+def motion(rotvec, sigma=1e-6, seed=0):
+    """Made-up motions with noise, for the search for steps."""
+    rng = np.random.default_rng(seed)
+    rotvec = np.asarray(rotvec, float) + sigma * rng.standard_normal((len(rotvec), 3))
+    covariance = np.tile(sigma**2 * np.eye(3), (len(rotvec), 1, 1))
+    return np.arange(1, len(rotvec) + 1), rotvec, covariance, pixel_metric(MODEL)
+
+
+def step_at(k, n=20, size=(0.001, -0.0008, 0.0003)):
+    return np.where(np.arange(n)[:, None] < k, 0.0, np.array(size))
+
+
+def a_step(rotvec, before=10, after=11):
+    return Step(before, after, np.array(rotvec), float(np.linalg.norm(rotvec)), 2e-5, 0.9, 0.01, 1e-9)
+
+
+def test_derivative_of_the_motion_is_that_of_differences():
+    rng = np.random.default_rng(0)
+    first, turn, step = rng.uniform(-0.6, 0.6, (30, 2)), Rotation.from_rotvec([0.02, -0.03, 0.01]), 1e-6
+    nothing = np.zeros_like(first)
+    base, by_state = motion_misses(first, nothing, turn, 1.01)
+    for k in range(3):
+        moved = motion_misses(first, nothing, Rotation.from_rotvec(step * np.eye(3)[k]) * turn, 1.01)[0]
+        np.testing.assert_allclose((base - moved) / step, by_state[:, :, k], atol=1e-5)
+    moved = motion_misses(first, nothing, turn, 1.01 + step)[0]
+    np.testing.assert_allclose((base - moved) / step, by_state[:, :, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.002])
+def test_a_turn_is_recovered_among_features_that_went_elsewhere(scale):
+    rng = np.random.default_rng(1)
+    bare = rng.uniform(-0.7, 0.7, (400, 2)) * [1.0, 0.66]
+    focal, centre = np.array([MODEL.fx, MODEL.fy]), np.array([MODEL.cx, MODEL.cy])
+    turn = np.array([0.003, -0.002, 0.004])
+    rays = Rotation.from_rotvec(turn).apply(np.column_stack([bare, np.ones(400)]))
+    start = distort(bare, MODEL.distortion) * focal + centre
+    end = distort(scale * rays[:, :2] / rays[:, 2:], MODEL.distortion) * focal + centre
+    start, end = start + 0.05 * rng.standard_normal(start.shape), end + 0.05 * rng.standard_normal(end.shape)
+    end[:100] += rng.uniform(-6, 6, (100, 2))
+    found = fit_motion(start, end, MODEL)
+    error = np.r_[found.rotvec - turn, found.scale - scale]
+    assert (np.abs(error) < 4 * np.sqrt(np.diag(found.covariance))).all()
+    assert np.abs(error).max() * MODEL.fx < 0.03
+    assert 220 < found.n_features < 340
+
+
+def test_the_covariance_is_that_of_many_draws():
+    rng = np.random.default_rng(2)
+    bare = rng.uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.66]
+    pixels = distort(bare, MODEL.distortion) * [MODEL.fx, MODEL.fy] + [MODEL.cx, MODEL.cy]
+    draws = [fit_motion(pixels, pixels + 0.1 * rng.standard_normal(pixels.shape), MODEL) for _ in range(60)]
+    spread = np.std([np.r_[d.rotvec, d.scale] for d in draws], axis=0)
+    stated = np.sqrt(np.mean([np.diag(d.covariance) for d in draws], axis=0))
+    np.testing.assert_allclose(stated / spread, 1.0, atol=0.35)
+
+
+def test_a_steady_camera_gives_no_finding_under_another_light(texture):
+    found = judge(series(texture, np.zeros((8, 3)), light=[1.0, 0.6, 1.2, 0.9, 0.8, 1.1, 0.7, 1.0]))
+    assert not found.steps and not found.problems and not found.scale_drifts
+    assert (found.size_px < 0.06).all()
+    assert motion_words({"left": found}) == []
+
+
+def test_a_nudge_is_found_where_it_happened(texture):
+    turn = np.array([0.0016, -0.0012, 0.0005])
+    found = judge(series(texture, step_at(5, 8, turn)))
+    (step,) = found.steps
+    assert (step.before, step.after) == (5, 6)
+    np.testing.assert_allclose(step.rotvec, turn, atol=1.5e-4)
+    assert step.angle == pytest.approx(np.linalg.norm(turn), rel=0.05) and step.angle_sigma < 0.1 * step.angle
+    assert step.size_px == pytest.approx(turn_px(turn, pixel_metric(MODEL)), rel=0.05)
+    assert "camera left moved by 0.1" in motion_words({"left": found})[0]
+
+
+def test_a_lens_that_warms_up_is_no_nudge(texture):
+    found = judge(series(texture, np.zeros((8, 3)), scale=1 + 0.003 * np.exp(-np.arange(8) / 2.0)))
+    assert found.scale_drifts and not found.steps
+    assert np.ptp(found.scale) == pytest.approx(0.003 * (1 - np.exp(-3.5)), rel=0.1)
+    (words,) = motion_words({"left": found})
+    assert "image scale" in words and "between placements 1 and 8" in words.replace("8 and 1", "1 and 8")
+
+
+def test_an_image_of_something_else_is_named(texture):
+    images = series(texture, np.zeros((8, 3)))
+    images[6] = (7, picture(np.flip(texture), np.random.default_rng(9)))
+    found = judge(images)
+    assert 7 not in found.placements and "mounted anew" in found.problems[7]
+    assert any("placement 7" in words for words in motion_words({"left": found}))
+
+
+def test_a_plain_wall_is_refused():
+    with pytest.raises(BackgroundLost, match="40 in 10 are needed"):
+        fit_motion(np.full((5, 2), 100.0), np.full((5, 2), 100.0), MODEL)
+    assert find_features(np.full((50, 60), 90, np.uint8)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("n", [6, 10, 20])
+def test_noise_alone_is_no_step(n):
+    sigma = 0.4 / MODEL.fx
+    alarms = sum(bool(find_steps(*motion(np.zeros((n, 3)), sigma, seed))) for seed in range(300))
+    assert alarms <= 2, "a level of 0.001"
+
+
+@pytest.mark.parametrize("k", [2, 7, 18])
+def test_one_step_is_found_wherever_it_is(k):
+    (step,) = find_steps(*motion(step_at(k), 3e-5))
+    assert (step.before, step.after) == (k, k + 1)
+    assert abs(step.angle - np.linalg.norm([0.001, -0.0008, 0.0003])) < 4 * step.angle_sigma + 1e-5
+
+
+def test_all_steps_are_found():
+    steps = find_steps(*motion(step_at(6) + step_at(13, size=(-0.002, 0.001, 0.0)), 3e-5))
+    assert [(s.before, s.after) for s in steps] == [(6, 7), (13, 14)]
+    np.testing.assert_allclose(steps[1].rotvec, [-0.002, 0.001, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize("k", [1, 10, 19])
+def test_one_placement_apart_is_no_step(k):
+    turns = np.zeros((20, 3))
+    turns[k] = 0.003
+    assert find_steps(*motion(turns, 3e-5)) == ()
+
+
+def test_a_step_too_small_to_matter_is_not_reported():
+    small = 0.1 / MODEL.fx
+    assert find_steps(*motion(step_at(10, size=(small, 0, 0)), small / 50)) == ()
+    assert find_steps(*motion(step_at(10, size=(6 * small, 0, 0)), small / 50))
+
+
+def test_five_placements_are_too_few():
+    assert find_steps(*motion(step_at(3, 5), 1e-6)) == ()
+
+
+def test_a_camera_on_the_head_is_not_judged(texture):
+    session = SimpleNamespace(cameras={"left": SimpleNamespace(mount="head", model=None)})
+    found = camera_steadiness(session, "left")
+    assert "rides on the head" in found.reason and len(found.placements) == 0 and not found.steps
+    assert steadiness_table({"left": found}).empty and motion_words({"left": found}) == []
+    with pytest.raises(ValueError, match="rides on the head"):
+        background_motion(None, {"left": found})
+
+
+def test_unknown_camera_and_missing_intrinsics_are_named():
+    session = SimpleNamespace(cameras={"left": SimpleNamespace(mount="platform", model=None)})
+    with pytest.raises(ValueError, match="no camera 'top'; the session has left"):
+        camera_steadiness(session, "top")
+    with pytest.raises(ValueError, match="no intrinsics in the session: give model"):
+        camera_steadiness(session, "left")
+    session.images = lambda camera, purpose: ()
+    session.placements = ()
+    assert "0 images" in camera_steadiness(session, "left", model=MODEL).reason
+
+
+def test_the_hull_of_a_board_holds_its_pattern_and_edges():
+    corners = np.array([[-0.3, -0.2, 2.0], [0.3, -0.2, 2.0], [0.3, 0.2, 2.0], [-0.3, 0.2, 2.0]])
+    bare = CameraModel(480, 320, 300.0, 302.0, 241.0, 158.0)
+    ends = project(corners, bare)
+    view = SimpleNamespace(pixels=None, edges=[SimpleNamespace(ends=ends[[0, 1]]), SimpleNamespace(ends=ends[[2, 3]])])
+    hull = board_hull(view, MODEL).astype(np.float32)
+    assert all(cv2.pointPolygonTest(hull, p.astype(np.float32), False) > 0 for p in project(corners, MODEL))
+    assert board_hull(SimpleNamespace(pixels=None, edges=[]), MODEL) is None
+
+
+def test_cameras_that_turn_alike_are_one_rig():
+    turn = np.array([0.001, 0.0006, 0.0])
+    judged = {c: Steadiness(c, np.arange(1, 21), 1, steps=(a_step(turn),)) for c in ("left", "right")}
+    assert motion_words(judged) == [
+        "the rig moved by 0.067 +- 0.001 deg between placements 10 and 11: the background moves by 0.9 px"
+    ]
+    judged["right"] = Steadiness("right", np.arange(1, 21), 1, steps=(a_step(-turn),))
+    assert [w.split(" moved")[0] for w in motion_words(judged)] == ["camera left", "camera right"]
+    assert list(steps_table(judged).turn_deg.round(3)) == [0.067, 0.067]
+
+
+def test_pitch_is_put_in_words():
+    each = SimpleNamespace(offset=np.radians([0.3, -0.3]), stretch=np.array([0.05, -0.02]))
+    errors = SimpleNamespace(wanted="sweep_stretch", direction_offset=np.radians(0.25),
+                             direction_sigma=np.radians(0.05), models={"sweep_stretch": each})  # fmt: skip
+    words = pitch_words(errors)
+    assert "upward and downward sweeps differ by 0.50 +- 0.10 deg" in words[0]
+    assert "0.30 deg (sd)" in words[1] and "-2.0 to +5.0 %" in words[2]
+    errors.direction_sigma = np.radians(0.1)
+    assert len(pitch_words(errors)) == 2, "two and a half sigma are none"
+    assert pitch_words(None) == [] and pitch_words(SimpleNamespace(wanted="none")) == []
+
+
+def test_problems_name_their_placement():
+    words = problem_words({6: "camera left: its plane is 90 mm rms off the scan; left out", "6 2": "placement 6: crooked"})
+    assert words == ["placement 6: camera left: its plane is 90 mm rms off the scan; left out", "placement 6: crooked"]
+
+
+def test_the_figure_marks_the_step():
+    n, fig = 20, plt.figure()
+    ax = fig.subplots()
+    size = np.where(np.arange(n) < 10, 0.0, 0.9)
+    more = {"covariance": np.zeros((n, 4, 4)), "size_px": size, "corner_px": 0 * size, "rotvec": np.outer(size, [1e-3, 0, 0])}
+    background_motion(ax, {"left": Steadiness("left", np.arange(1, n + 1), 1, steps=(a_step([1e-3, 0, 0]),), **more)})
+    marks = [line.get_xdata()[0] for line in ax.lines if len(set(line.get_xdata())) == 1 and len(line.get_xdata()) == 2]
+    assert marks == [9.5], "between the tenth and the eleventh tick"
+    assert "10 and 11" in ax.get_title() and ax.get_ylabel().endswith("[px]")
+    plt.close(fig)
+
+
+@pytest.fixture(scope="module")
+def lms400(lms400_session):
+    session = open_session(lms400_session)
+    models = pipeline.prepare_images(pipeline.Prepared(session, session.board, {}, {}, {})).models
+    return {camera: camera_steadiness(session, camera, model=model) for camera, model in models.items()}
+
+
+def test_the_nudge_of_a_real_rig_is_found(lms400):
+    """Without being told where the board is: half of the features lie on it or behind it."""
+    for found in lms400.values():
+        (step,) = found.steps
+        assert (step.before, step.after) == (10, 11)
+        assert 0.05 < np.rad2deg(step.angle) < 0.09 and 0.6 < step.size_px < 1.0
+        assert not found.problems and len(found.placements) == 20
+    assert "the rig moved by 0.06" in motion_words(lms400)[0]
+
+
+def test_the_scale_of_both_real_cameras_drifts_together(lms400):
+    left, right = (lms400[c].corner_px for c in ("left", "right"))
+    assert np.corrcoef(left, right)[0, 1] > 0.95
+    assert all(found.scale_drifts for found in lms400.values())
+
+
+def test_findings_of_a_faultless_recording_are_none():
+    from lrfcal_lib.evaluate.diagnosis import Diagnosis
+    from lrfcal_lib.preprocess.bend import BoardBends
+
+    assert findings_in_words(Diagnosis({}, BoardBends({}))) == []
