@@ -18,7 +18,7 @@ from lrfcal_lib.session import CameraInfo, LrfInfo, SessionError, SessionWriter,
 # the LRF looks along +y. Ours is the same platform with the origin on the axis and pitch = p - 90 deg.
 LASERSETERO_HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])
 LASERSETERO_CLOUD = RigidTransform.from_translation([0.0, 0.0, 0.2])  # T_cloud_platform
-# The authors state their dimensions to half a millimetre, and axis and scan plane parallel: bolted plates are good to this.
+# The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of bolted plates.
 LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
 LASERSETERO_STEP_DEG = 0.1
 LASERSETERO_VIEW_DEG = (55.0, 125.0)  # the LMS400 sees 70 deg

@@ -87,6 +87,7 @@ class JointCalibration:
             range_offset=sensor["range_offset"],
             range_offset_sigma=float(sigma.get("range_offset", 0.0)),
             T_head_lrf=solution.T_head_lrf,
+            correct=solution.correct,
         )
 
 
@@ -116,8 +117,9 @@ def joint_settings(prepared, observations):
     sensor = ["range_offset", "edge_log_odds", "edge_log_softness"]
     if image_span(observations) > LEAST_SPAN:
         sensor.append("pitch_scale")
-    settings = {"sensor": tuple(sensor), "noise": "estimate", "lapse": LAPSE, "axis": sweep_span(observations) > LEAST_SWEEP}
-    settings["sides"] = len(np.unique(observations.beam_placement * 100 + observations.beam_edge)) >= LEAST_SIDES
+    sides = len(np.unique(observations.beam_placement * 100 + observations.beam_edge))
+    settings = {"sensor": tuple(sensor), "noise": "estimate", "lapse": LAPSE, "sides": sides >= LEAST_SIDES}
+    settings["axis"] = bool(sweep_span(observations) > LEAST_SWEEP)
     if noise.offset:
         settings["sweep"] = "offset_stretch" if noise.stretch else "offset"
         settings["sweep_sigma"] = (noise.offset, noise.stretch or 0.01)

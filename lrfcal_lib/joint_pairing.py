@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lrfcal_lib.pairing import thin
+from lrfcal_lib.pairing import cells_of, thin
 from lrfcal_lib.preprocess import image
 from lrfcal_lib.preprocess.board_scan import face_points
-from lrfcal_lib.preprocess.edge_cells import edge_cells
 from lrfcal_lib.solvers.joint_observations import JointObservations
 
 FACE_POINTS = 150  # a placement: neighbouring ranges of a real device share their errors
@@ -92,24 +91,13 @@ def _beams(prepared, index, count):
         named = {side: edges.index(name) for side, name in prepared.names.get(placement, {}).items()}
         cells = cells_of(prepared, placement)
         for side, edge in named.items():
-            rows = thin_pairs(np.flatnonzero(cells.side == side), count)
+            rows = thin(np.flatnonzero(cells.side == side), count)
             for key in ("bearing", "pitch", "hit", "radius", "background"):
                 out[key].append(getattr(cells, key)[rows])
             out["edge"].append(np.full(len(rows), edge))
             out["placement"].append(np.full(len(rows), i))
     kinds = {"hit": bool, "edge": int, "placement": int}
     return {key: np.concatenate(value) if value else np.zeros(0, kinds.get(key, float)) for key, value in out.items()}
-
-
-def cells_of(prepared, placement):
-    """Beams about the edges in one placement."""
-    along = prepared.edges["half_step"][placement]
-    return edge_cells(prepared.scans[placement], along, prepared.swept["half_step"].get(placement), prepared.session.lrf)
-
-
-def thin_pairs(rows, count):
-    """At most `count` of some rows, evenly spread."""
-    return thin(rows, count)
 
 
 def _views(views, index):

@@ -302,7 +302,7 @@ def _model_error(solution):
 def _noise(solution):
     """Noise estimated much larger than stated."""
     found = {"ranges": solution.noise.get("face_scale", 1.0)}
-    found |= {f"images of '{c}'": solution.noise.get(f"view_scale_{c}", 1.0) for c in solution.transforms}
+    found |= {"images": solution.noise.get("view_scale", 1.0)}
     large = [f"{name} {scale:.1f} times" for name, scale in found.items() if scale > STATED]
     if large:
         yield Reason(CARE, "noise", "residuals are larger than the stated noise (" + ", ".join(large) + ")")

@@ -20,6 +20,7 @@ RANKS = [
     {"pairing"},
     {"joint_pairing"},
     {"joint_calibration"},
+    {"fused_outline"},
     {"pipeline"},
     {"evaluate"},
     {"notebook", "plots", "export", "report", "acquisition", "drivers"},  # drivers: seen from above, see APART

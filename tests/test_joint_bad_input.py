@@ -112,7 +112,7 @@ def test_a_camera_that_sees_nothing_is_named(mount):
 def test_contradictory_noise_is_repaired_from_the_data(mount, factor, kind):
     obs, truth, _ = draw(rng(), mount=mount)
     found = solve_joint(mis_stated(obs, kind, factor), noise="estimate")
-    level = found.noise["face_scale" if kind == "face" else "view_scale_left"]
+    level = found.noise["face_scale" if kind == "face" else "view_scale"]
     assert 0.7 < level * factor < 1.4
     assert worst(found, truth) < 4.5
     sigma = solve_joint(obs, noise="estimate").solution.sigma[:4]

@@ -7,7 +7,7 @@ import pytest
 from joint_draws import draw
 from test_joint import moved, random_problem
 
-from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, groups_of, monte_carlo, state_errors
+from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, groups_of, monte_carlo, spread, state_errors
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_blocks import Unknowns, gather, move_state, named_blocks
@@ -63,6 +63,12 @@ def test_units_and_rows():
     turn = np.degrees(np.sqrt(np.mean(np.sum(trials.errors[:, :2] ** 2, axis=1))))
     assert wide.rmse[0] == pytest.approx(turn)
     assert groups_of(("size_ab", "edge_log_odds"))["board size"][2] == "mm"
+
+
+def test_spread_is_the_root_of_the_trace_in_its_unit():
+    found = spread(np.diag(np.square([0.003, 0.004, 0.02, 0.005, 0.001])), NAMES)
+    expected = {"axis direction": np.degrees(0.005), "left rotation": np.degrees(0.02)}
+    assert found == pytest.approx(expected | {"left translation": 5.0, "range offset": 1.0})
 
 
 def test_bad_trials_are_refused():
@@ -197,7 +203,7 @@ def test_errors_reach_the_bound_and_are_as_stated(trials, mount):
     judged = table.drop(index=["edge softness", "all"])
     assert (judged.rmse_over_crb < 1.1 * 1.25).all() and (judged.rmse_over_crb > 0.7).all()
     assert 0.9 < table.rmse_over_crb["all"] < 1.18
-    assert 0.83 < table.coverage["all"] < 0.96
+    assert 0.80 < table.coverage["all"] < 0.97
     assert 0.8 < table.nees["all"] < 1.35
     assert np.allclose(judged.stated_over_crb, 1.0, atol=0.08)
 
@@ -206,4 +212,4 @@ def test_a_wrong_noise_level_is_caught():
     """Noise 1.5 times as large as stated: the same limits fail."""
     found = monte_carlo(lambda rng: draw(rng, 8, see_noise=1.5)[:2], solve_joint, range(20), bounds=False)
     row = consistency(found).iloc[-1]
-    assert row.nees > 1.6 and row.coverage < 0.87
+    assert row.nees > 1.6 and row.nees > 1.2 * row.nees_high

@@ -115,7 +115,7 @@ def test_a_known_board_tells_how_large_edges_look():
     made = [sweep(pose, rng) for pose in poses(8, 1)]
     found = fit_edge_model(made, BOARD, replace(MODEL, log_odds=0.0, softness=0.2))
     assert found.log_odds == pytest.approx(-0.8, abs=4 * found.log_odds_sigma + 0.01)
-    assert found.log_odds_sigma < 0.15 and 0.02 < found.softness < 0.1
+    assert found.log_odds_sigma < 0.15 and found.softness < 0.1  # below the steps of the beams there is no telling
 
 
 def test_a_few_dark_backgrounds_do_not_spoil_the_odds():

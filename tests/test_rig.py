@@ -51,6 +51,8 @@ WRONG = {
     r"devices\.lrf is missing": ("devices.lrf", None),
     r"devices is missing": ("devices", None),
     r"devices\.head\.port is missing": ("devices.head.port", None),
+    r"devices\.head\.port are both /dev/fake_lrf": ("devices.head.port", "/dev/fake_lrf"),
+    r"devices\.head is 7: an object": ("devices.head", 7),
     r"devices\.head\.adress is not known; known are port, address": ("devices.head.adress", 1),
     r"devices\.head: tilt_speed of the head is 99": ("devices.head.tilt_speed", 99),
     r"devices\.head: address of the head is 'one'": ("devices.head.address", "one"),

@@ -6,14 +6,17 @@ import contextlib
 import logging
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from lrfcal_lib.drivers.control import ask
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
+from lrfcal_lib.drivers.rig_events import Moved, Photographed, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import RigFileError
+
+__all__ = ["Moved", "Photographed", "Rig", "Scanned", "Tracked"]
 
 LOG = logging.getLogger(__name__)
 SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
@@ -21,92 +24,6 @@ IMAGE_S = 15.0  # wait for one fresh image, a camera that comes back included
 BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
 GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
-
-
-@dataclass(frozen=True)
-class Moved:
-    """The head rests at a stop.
-
-    Attributes
-    ----------
-    placement : int
-    time_s : float
-        Host clock; what is recorded at this stop is later.
-    commanded, pitch : float
-        Radians.
-    measured : bool
-        False where the head does not tell its pitch: dead reckoning.
-    number, of : int
-        This stop and how many there are.
-    """
-
-    placement: int
-    time_s: float
-    commanded: float
-    pitch: float
-    measured: bool
-    number: int
-    of: int
-
-
-@dataclass(frozen=True, eq=False)
-class Scanned:
-    """Scans, each with its pitch.
-
-    Attributes
-    ----------
-    placement : int
-    readings : tuple of Reading
-    pitch : ndarray, shape (len(readings),)
-        Radians.
-    share : float
-        Of a continuous sweep that is done, 0 to 1; NaN at a stop.
-    """
-
-    placement: int
-    readings: tuple
-    pitch: np.ndarray
-    share: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Photographed:
-    """An image.
-
-    Attributes
-    ----------
-    placement : int
-        -1 for the board held close.
-    camera : str
-    frame : Frame
-    pitch : float
-        Radians.
-    purpose : {'board', 'scene', 'intrinsics'}
-    """
-
-    placement: int
-    camera: str
-    frame: object
-    pitch: float
-    purpose: str
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """The pitch over a continuous sweep.
-
-    Attributes
-    ----------
-    placement : int
-    commanded : float
-        Where the sweep was sent, radians.
-    track : tuple of (float, float, bool)
-        Host time, pitch in radians, measured.
-    """
-
-    placement: int
-    commanded: float
-    track: tuple
 
 
 class Rig:
@@ -414,8 +331,9 @@ def _open_camera(stated, name, log, clock):
     from lrfcal_lib.drivers.video import Camera
 
     asked, info = stated.camera_devices[name], stated.cameras[name]
-    options = {"exposure": asked.get("exposure"), "fps": asked.get("fps"), "log": log, "clock": clock}
-    camera = Camera.open(asked["source"], name=name, size=(info.width, info.height), **options)
+    options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
+    size = (info.width, info.height)
+    camera = Camera.open(asked["source"], name=name, size=size, **options, log=log, clock=clock)
     got = camera.settings["size"]["got"]
     if got is not None and tuple(got) != (info.width, info.height):
         camera.close()

@@ -19,7 +19,7 @@ MODES = ("stop-and-go", "continuous")
 PURPOSES = ("board", "scene")
 LRF_KEYS = ("port", "baudrate", "address", "password", "variant", "unit", "measuring_mode", "realtime_indices",
             "interlaced")  # fmt: skip
-CAMERA_KEYS = ("source", "size", "exposure", "fps")
+CAMERA_KEYS = ("source", "size", "exposure", "fps", "silence_s")
 DEVICE_KEYS = ("lrf", "head", "cameras", "control")
 MOST_STOPS = 5000
 
@@ -221,7 +221,9 @@ def rig_of(data, path=Path("rig.json")):
     stated = parse_session({**about, **data})
     devices = _known(_member(data, "devices", "the file"), DEVICE_KEYS, "devices")
     lrf = _known(_member(devices, "lrf", "devices"), LRF_KEYS, "devices.lrf")
-    head = dict(_member(devices, "head", "devices"))
+    head = dict(_object(_member(devices, "head", "devices"), "devices.head"))
+    if lrf.get("port") is not None and lrf["port"] == head.get("port"):
+        raise ValueError(f"devices.lrf.port and devices.head.port are both {lrf['port']}: each device has its own")
     cameras = _object(devices.get("cameras", {}), "devices.cameras")
     for name, one in cameras.items():
         _member(_known(one, CAMERA_KEYS, f"devices.cameras.{name}"), "source", f"devices.cameras.{name}")

@@ -15,6 +15,7 @@ from lrfcal_lib.solvers.joint_noise import on_board
 ALL = 10**9  # crossings
 NOISE_WORDS = {
     "face_scale": "scatter of ranges, in stated standard deviations",
+    "view_scale": "scatter of board poses in images, in stated standard deviations",
     "face_share": "independent errors per range",
     "beam_share": "independent errors per beam at an edge",
     "sigma_pitch": "error of the pitch of single images [deg]",
@@ -59,7 +60,7 @@ def _unit(name):
 def noise_table(joint):
     """Noise levels that the estimate took from the data, in words."""
     found = joint.solution.noise
-    words = [NOISE_WORDS.get(name, "scatter of board poses, " + name.replace("_", " ")) for name in found]
+    words = [NOISE_WORDS[name] for name in found]
     values = [np.rad2deg(value) if name == "sigma_pitch" else value for name, value in found.items()]
     return pd.DataFrame({"what": words, "value": values})
 

@@ -246,6 +246,23 @@ def _group(name):
     return (f"{camera} rotation", np.degrees(1.0), "deg") if part[0] == "r" else (f"{camera} translation", 1000.0, "mm")
 
 
+def spread(covariance, names):
+    """Standard deviation of each group of unknowns: root of the trace, in the group's unit.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (k, k)
+    names : tuple of str
+
+    Returns
+    -------
+    dict of str to float
+        E.g. ``{"axis direction": 0.05, "axis offset": 1.3}``, degrees and millimetres.
+    """
+    variance = np.diagonal(covariance)
+    return {words: float(factor * np.sqrt(variance[i].sum())) for words, (i, factor, _) in groups_of(names).items()}
+
+
 def consistency(trials, names=None):
     """How errors compare with the bound and with what the solver states, by group of unknowns and pooled.
 

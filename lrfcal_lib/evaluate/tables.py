@@ -8,6 +8,7 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.fused_outline import fused_outline_of
 from lrfcal_lib.geometry import DegenerateGeometry, paper_parameters, transform_difference
 from lrfcal_lib.joint_calibration import left_out_residuals as jointly_left_out
 from lrfcal_lib.pairing import likely_outline_of, outline_of
@@ -496,7 +497,7 @@ def stereo_check(solutions, cameras, T_second_first):
     return pd.DataFrame(rows)
 
 
-def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None):
+def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
     """Edges of the board measured in the cloud of every placement, beside the paper's own row.
 
     Parameters
@@ -507,15 +508,22 @@ def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None):
     edge_model_of : callable, optional
         ``edge_model_of(placement) -> EdgeModel``, from a calibration that has not seen the placement. Adds the variant
         'likelihood', which does not know the board's size.
+    joint : JointCalibration, optional
+        With its estimates without each placement. Adds 'likelihood' from its edge model, and 'fused': image edges on
+        the plane of the cloud. Neither knows the board's size, and neither calibration has seen the placement.
 
     Returns
     -------
     DataFrame
         source, placement, edge, ends, variant, true_mm, measured_mm, error_mm. One row for every edge that some camera
         sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams decide both
-        ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines).
+        ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines), 'image'
+        where images show them ('fused').
     """
     ways = {v: lambda placement, v=v: _by_least_squares(prepared, placement, v, T_head_lrf) for v in VARIANTS}
+    if joint is not None:
+        edge_model_of = joint.edge_model
+        ways["fused"] = lambda placement: fused_outline_of(joint, placement)
     if edge_model_of is not None:
         ways["likelihood"] = lambda placement: likely_outline_of(prepared, placement, edge_model_of(placement))
     rows = []
@@ -544,10 +552,17 @@ def _placement_lengths(prepared, placement, variant, measure):
         length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):
-            ends = "pitch" if _neighbours(prepared.board.edges, name) & across else "scan"
+            ends = _ends(prepared.board.edges, name, across)
         if _seen_in_image(prepared, placement, name):
             rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
     return rows
+
+
+def _ends(edges, name, across):
+    """What decides the ends of an edge: its neighbours in the image, beams, or the recorded pitch."""
+    if across is None:
+        return "image"
+    return "pitch" if _neighbours(edges, name) & across else "scan"
 
 
 def _neighbours(edges, name):

@@ -26,6 +26,8 @@ from lrfcal_lib.solvers.joint_noise import (
     estimate_noise,
     misfits,
     rough_misses,
+    same_levels,
+    view_misses,
 )
 from lrfcal_lib.solvers.joint_start import start_states
 from lrfcal_lib.solvers.joint_warnings import joint_warnings
@@ -37,7 +39,7 @@ from lrfcal_lib.solvers.solution import Solution
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 START_STEPS = 8
-NOISE_ROUNDS, ROUND_STEPS = 3, 10
+NOISE_ROUNDS, ROUND_STEPS = 10, 10
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 LEVELS = (
     "face_scale", "view_scale", "sigma_pitch", "face_share", "beam_share", "lapse", "sweep_sigma", "side_sigma",
@@ -252,7 +254,8 @@ def solve_joint(
         excluded = excluded | bad
         if bad:
             state, data = settle(state, data, unknowns, max_iterations)
-    found = _solve(obs, data, in_stated_gauge(state, obs), unknowns, required, max_iterations)
+    state = in_stated_gauge(_converge(state, data, unknowns, max_iterations, LAST_STEP), obs)
+    found = _solve(obs, data, state, unknowns, required, max_iterations)
     return _wrap(obs, data, unknowns, found, excluded)
 
 
@@ -268,8 +271,10 @@ def without_blind_cameras(obs, required):
 def settle(state, data, unknowns, iterations):
     """Estimate unknowns and noise levels in turn until they agree."""
     for _ in range(NOISE_ROUNDS):
-        data = estimate_noise(state, data, unknowns)
+        before, data = data, estimate_noise(state, data, unknowns)
         state = _converge(state, data, unknowns, min(iterations, ROUND_STEPS))
+        if same_levels(before, data):
+            break
     return state, data
 
 
@@ -319,7 +324,7 @@ def solve_again(obs, like, max_iterations=60):
     obs = obs.select([known[row] for row in rows])
     state = replace(like.state, **{key: getattr(like.state, key)[rows] for key in OWN})
     data = with_levels(gather(obs), like.data)
-    state = _converge(state, data, like.unknowns, max_iterations)
+    state = _converge(state, data, like.unknowns, max_iterations, LAST_STEP)
     found = _solve(obs, data, in_stated_gauge(state, obs), like.unknowns, True, max_iterations)
     return _wrap(obs, data, like.unknowns, found, like.excluded)
 
@@ -354,25 +359,26 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     DegenerateGeometry
         When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
     """
-    data, best, least = gather(obs), None, np.inf
-    for state in start_states(obs, T0):
+    data, best, least, rough = gather(obs), None, np.inf, np.inf
+    for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
             state = replace(state, head=pose_array(known))
+        rough = min(rough, np.median(rough_misses(state, data)))
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = replace(gather(kept) if bad else data, sweep_sigma=tuple(sweep_sigma))
         state, cost = a_few_steps(fitting, cut, unknowns)
         badness = cost / count_rows(cut) + LEFT_OUT * len(bad) / len(obs.placements)
         if best is None or badness < least:
             best, least = (kept, state, bad), badness
-        if least < GOOD_START:
+        if least < GOOD_START and (T0 is None or number):
             break
     kept, state, bad = best
-    miss = np.median(rough_misses(state, gather(kept)))
-    if miss > ROUGH_MISS:
+    miss = np.median(view_misses(state, gather(kept)))
+    if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
-            f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm or "
-            "more off where the images put it; check that images and scans carry the right numbers, and the board's size"
+            f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm "
+            "or more off where the images put it; check that images and scans carry the right numbers"
         )
     if len(bad) > LARGEST_SHARE * len(obs.placements):
         raise DegenerateGeometry(
@@ -436,9 +442,10 @@ def total_cost(state, data, unknowns):
     return float(total) if np.isfinite(total) else np.inf
 
 
-def _converge(state, data, unknowns, iterations):
+def _converge(state, data, unknowns, iterations, tolerance=None):
     evaluate, move = _problem(data, unknowns)
-    return minimise(evaluate, state, move, shared=unknowns.shared, max_iterations=iterations, tolerance=ROUGH_STEP)[0]
+    options = {"shared": unknowns.shared, "max_iterations": iterations, "tolerance": tolerance or ROUGH_STEP}
+    return minimise(evaluate, state, move, **options)[0]
 
 
 def _problem(data, unknowns):
@@ -495,15 +502,15 @@ def _wrap(obs, data, unknowns, found, excluded):
         dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
         {int(p): s for p, s in zip(obs.placements, state.sweeps, strict=True)},
         dict(zip(obs.edges, state.size.tolist(), strict=True)),
-        noise_levels(data, obs.cameras),
+        noise_levels(data),
         dict(zip(obs.placements.tolist(), misfits(blocks, data).tolist(), strict=True)),
         excluded, found.unobservable, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
         unknowns, data,
     )  # fmt: skip
 
 
-def noise_levels(data, cameras):
+def noise_levels(data):
     """Noise levels in use by name."""
-    views = {f"view_scale_{name}": float(scale) for name, scale in zip(cameras, data.view_scale, strict=True)}
+    views = {"view_scale": float(data.view_scale[0])} if len(data.view_scale) else {}
     names = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return {name: float(getattr(data, name)) for name in names} | views

@@ -25,8 +25,11 @@ from lrfcal_lib.solvers.least_squares import whiten
 PARTS = 3  # of a board in x and y, and of an edge
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
+LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
+SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
+SETTLED = 0.02  # change of the logarithm of a noise level
 ROUGH_MISS = 0.08  # metres, of a board's face from where the first image of it puts it
 
 
@@ -126,30 +129,26 @@ def beam_share(state, data, block, unknowns):
 
 
 def view_levels(data, block, state):
-    """Scale of each camera's pose errors and the error of the pitch of single images: the most likely pair."""
+    """Scale of the pose errors in images and the error of the pitch of single images: the most likely pair.
+
+    One scale serves all cameras: with one view each, a camera could buy itself perfection at the other's cost.
+    """
     p, v = data.view["used"].shape
-    r = block.residuals.reshape(p, v, 6)
-    by_pitch = pitch_columns(state, data)
-    used = data.view["used"]
-    taken = 6 * np.maximum(used.any(axis=1).sum(), 1) / max(6 * used.sum(), 1)  # share that the boards' poses take up
+    r, used, by_pitch = block.residuals.reshape(p, v, 6), data.view["used"], pitch_columns(state, data)
+    free = 1 - 6 * used.any(axis=1).sum() / max(6 * used.sum(), 1)  # the boards' own poses take up the rest
+    free = max(free, LEAST_FREEDOM)
 
     def level(sigma):
         trial = replace(data, sigma_pitch=float(sigma))
-        scales = np.array(trial.view_scale)
-        for _ in range(4):
-            trial = replace(trial, view_scale=scales)
-            z = (view_whitener(trial, by_pitch) @ r[..., None])[..., 0]
-            for c in range(len(scales)):
-                mine = used & (data.view["camera"] == c)
-                if mine.any():
-                    scales[c] *= np.sqrt(max(np.mean(z[mine] ** 2) / max(1 - taken, 0.2), 1e-4)) ** 0.7
+        for _ in range(SCALE_ROUNDS):
+            z = (view_whitener(trial, by_pitch) @ r[..., None])[..., 0][used]
+            factor = np.sqrt(np.mean(z**2) / free)
+            trial = replace(trial, view_scale=np.clip(trial.view_scale * factor**0.7, *SCALE_LIMITS))
         whitener = view_whitener(trial, by_pitch)
-        z = (whitener @ r[..., None])[..., 0]
-        logs = np.log(np.abs(np.diagonal(whitener[used], axis1=-2, axis2=-1))).sum()
-        return 0.5 * np.sum(z[used] ** 2) / max(1 - taken, 0.2) - logs, trial
+        z = (whitener @ r[..., None])[..., 0][used]
+        return 0.5 * np.sum(z**2) / free - np.log(np.diagonal(whitener[used], axis1=-2, axis2=-1)).sum(), trial
 
-    levels = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
-    found = [level(sigma) for sigma in levels]
+    found = [level(sigma) for sigma in (PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1])]
     return min(found, key=lambda pair: pair[0])[1]
 
 
@@ -188,3 +187,21 @@ def rough_misses(state, data):
     off = np.where(used, np.abs(on_board(state, data)[..., 2]), np.nan)
     with np.errstate(all="ignore"):
         return np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in off])
+
+
+def view_misses(state, data):
+    """Median distance of every board from where its images put it, metres, (p,); 0 without images."""
+    used = data.view["used"]
+    if not used.any():
+        return np.zeros(len(used))
+    lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=())
+    shift = view_block(state, data, lone).residuals.reshape(used.shape + (6,))[..., 3:]
+    off = np.where(used, np.linalg.norm(shift, axis=-1), np.nan)
+    return np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in off])
+
+
+def same_levels(before, after):
+    """Whether noise levels have settled within a few per cent."""
+    ratios = [getattr(after, name) / getattr(before, name) for name in ("face_scale", "face_share", "beam_share")]
+    ratios += (after.view_scale / before.view_scale).tolist()
+    return bool(np.all(np.abs(np.log(ratios)) < SETTLED))

@@ -11,7 +11,7 @@ from lrfcal_lib.solvers.least_squares import whiten
 
 NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
 ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
-WEAK_DIRECTION, WEAK_OFFSET = np.radians(0.5), 0.010  # standard deviations of an axis nobody should rely on
+WEAK_DIRECTION, WEAK_OFFSET = np.radians(1.0), 0.020  # standard deviations of an axis nobody should rely on
 TERMS = {
     "pitch_scale": (0.001, "the scale of the pitch", 100.0, "%"),
     "pitch_by_direction": (np.radians(0.01), "a pitch offset by sweep direction", np.degrees(1.0), "deg"),

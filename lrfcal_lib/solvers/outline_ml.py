@@ -40,8 +40,8 @@ class EdgeModel:
         Recorded minus true range, metres.
     T_head_lrf : RigidTransform
     correct : callable, optional
-        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to points
-        is not used, `range_offset` is.
+        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to
+        points is not used, `range_offset` is.
     """
 
     log_odds: float = 0.0
