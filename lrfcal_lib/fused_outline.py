@@ -19,7 +19,7 @@ def fused_outline_of(joint, placement):
     ----------
     joint : JointCalibration
         Its estimate without the placement is used where there is one (see
-        :func:`lrfcal_lib.joint_calibration.leave_one_out`).
+        :func:`lrfcal_lib.joint_calibration.leave_out`).
     placement : int
 
     Returns

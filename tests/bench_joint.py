@@ -131,50 +131,67 @@ def one_placement(data, p):
     return replace(data, **groups, middle=data.middle[p : p + 1], direction=data.direction[p : p + 1])
 
 
+HEAD, SENSOR_KEY, FIRST_CAMERA, FIRST_BOARD = 0, 1, 2, 100
+
+
 def by_gtsam(pieces, data, unknowns, start):
     """GTSAM's Levenberg-Marquardt with one vectorised Python factor a placement."""
-    cameras, count = len(start.cameras), len(start.boards)
-    head, sensor, eyes, boards = 0, 1, [2 + i for i in range(cameras)], [100 + i for i in range(count)]
+    eyes = [FIRST_CAMERA + i for i in range(len(start.cameras))]
+    boards = [FIRST_BOARD + i for i in range(len(start.boards))]
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     poses = [start.head, *start.cameras, *start.boards]
-    for key, pose in zip([head, *eyes, *boards], poses, strict=True):
+    for key, pose in zip([HEAD, *eyes, *boards], poses, strict=True):
         values.insert(key, gtsam.Pose3(gtsam.Rot3(pose[:, :3]), pose[:, 3]))
-    values.insert(sensor, start.sensor[:2])
+    values.insert(SENSOR_KEY, start.sensor[:2])
+    for board, piece in zip(boards, pieces, strict=True):
+        graph.add(placement_factor([HEAD, SENSOR_KEY, *eyes, board], piece, unknowns, start))
+    graph.add(gauge_factor(start))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    state = state_at(found, [HEAD, SENSOR_KEY, *eyes, boards[0]], start)
+    return replace(state, boards=np.stack([found.atPose3(key).matrix()[:3] for key in boards]))
 
-    def read(v, p):
-        poses = [v.atPose3(key).matrix()[:3] for key in (head, *eyes, boards[p])]
-        now = replace(start, head=poses[0], cameras=np.stack(poses[1:-1]), boards=poses[-1][None])
-        return replace(now, sensor=np.r_[v.atVector(sensor), start.sensor[2:]], sweeps=start.sweeps[:1])
 
-    def factor(p):
-        def error(_, v, jacobians):
-            state = read(v, p)
-            parts = [whiten(b, jacobians is not None) for b in gaussian_blocks(state, pieces[p], unknowns)]
-            if jacobians is not None:
-                J = np.concatenate([part[1][0] for part in parts])
-                wide = np.zeros((len(J), 6))
-                wide[:, AXIS_COLUMNS] = J[:, :4]
-                jacobians[0], jacobians[1] = local(wide, state.head), J[:, 4 + 6 * cameras : 6 + 6 * cameras]
-                for i in range(cameras):
-                    jacobians[2 + i] = local(J[:, 4 + 6 * i : 10 + 6 * i], state.cameras[i])
-                jacobians[-1] = local(J[:, -6:], state.boards[0])
-            return np.concatenate([part[0][0] for part in parts])
+def state_at(values, keys, start):
+    """The state of one placement from GTSAM's values."""
+    head, sensor, *eyes, board = keys
+    poses = [values.atPose3(key).matrix()[:3] for key in (head, *eyes, board)]
+    sensors = np.r_[values.atVector(sensor), start.sensor[2:]]
+    state = replace(start, head=poses[0], cameras=np.stack(poses[1:-1]), boards=poses[-1][None])
+    return replace(state, sensor=sensors, sweeps=start.sweeps[:1])
 
-        rows = sum(pieces[p].__dict__[name]["used"].size * n for name, n in (("face", 1), ("beam", 1), ("view", 6)))
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [head, sensor, *eyes, boards[p]], error)
 
-    def gauge(_, v, jacobians):
-        pose = v.atPose3(head).matrix()
+def placement_factor(keys, piece, unknowns, start):
+    """All residuals of one placement as one factor."""
+    c = len(start.cameras)
+
+    def error(_, values, jacobians):
+        state = state_at(values, keys, start)
+        parts = [whiten(b, jacobians is not None) for b in gaussian_blocks(state, piece, unknowns)]
+        if jacobians is not None:
+            J = np.concatenate([part[1][0] for part in parts])
+            wide = np.zeros((len(J), 6))
+            wide[:, AXIS_COLUMNS] = J[:, :4]
+            jacobians[0], jacobians[1] = local(wide, state.head), J[:, 4 + 6 * c : 6 + 6 * c]
+            for i in range(c):
+                jacobians[2 + i] = local(J[:, 4 + 6 * i : 10 + 6 * i], state.cameras[i])
+            jacobians[-1] = local(J[:, -6:], state.boards[0])
+        return np.concatenate([part[0][0] for part in parts])
+
+    rows = sum(getattr(piece, name)["used"].size * n for name, n in (("face", 1), ("beam", 1), ("view", 6)))
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), keys, error)
+
+
+def gauge_factor(start):
+    """Holds the turn about the axis and the shift along it, which no data show."""
+
+    def error(_, values, jacobians):
+        pose = values.atPose3(HEAD).matrix()
         if jacobians is not None:
             jacobians[0] = local(np.eye(6)[[0, 3]], pose)
         turn = Rotation.from_matrix(pose[:3, :3] @ start.head[:, :3].T).as_rotvec()
         return np.array([turn[0], pose[0, 3] - start.head[0, 3]])
 
-    for p in range(count):
-        graph.add(factor(p))
-    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(2, 1e-3), [head], gauge))
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return replace(read(found, 0), boards=np.stack([found.atPose3(key).matrix()[:3] for key in boards]))
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(2, 1e-3), [HEAD], error)
 
 
 def local(J, pose):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib import evaluate, pipeline
+from lrfcal_lib import evaluate, joint_calibration, pipeline
 from lrfcal_lib.export import calibration_record, write_calibration
 from lrfcal_lib.geometry import axis_difference, axis_of, lrf_to_platform, transform_difference
 from lrfcal_lib.importers import import_lasersetero
@@ -123,12 +123,48 @@ def test_methods_are_close_to_the_authors_calibration(found):
     assert np.rad2deg(angle) < 2.0 and shift < 0.05
 
 
-def test_left_out_errors_are_reported_for_every_method(found):
-    table = evaluate.method_comparison(found.observations, found.solutions)
-    assert len(table) == 12 and np.isfinite(table.drop(columns=["camera", "method"]).to_numpy()).all()
+def test_left_out_errors_are_reported_for_every_method(found, joint):
+    table = evaluate.method_comparison(found.observations, found.solutions, joint=joint)
+    assert len(table) == 16 and np.isfinite(table.drop(columns=["camera", "method"]).to_numpy()).all()
     assert (table.left_out_plane_rms_mm < 25).all() and (table.left_out_edge_rms_px < 12).all()
     table = table.groupby("method").left_out_edge_rms_px.mean()
     assert table["line"] < table["line_last_beam"]
+
+
+@pytest.fixture(scope="module")
+def joint(found):
+    return joint_calibration.leave_out(found.joint)
+
+
+def test_the_joint_estimate_asks_for_errors_of_every_sweep(joint):
+    assert joint.settings["sweep"] == "offset_stretch"
+    assert joint.solution.converged and not joint.solution.unobservable
+
+
+def test_the_joint_estimate_fits(joint):
+    fit = evaluate.joint_fit(joint)
+    assert fit["plane_rms_mm"] < 6.5 and fit["edge_rms_px"] < 2.0
+
+
+def test_the_joint_cameras_agree_with_the_chessboard(found):
+    cameras, T_second_first, _ = pipeline.stereo_reference(found.prepared)
+    row = evaluate.stereo_check(found.solutions, cameras, T_second_first).set_index("method").loc["joint"]
+    assert abs(row.baseline_error_mm) < 1.5 and row.translation_error_mm < 2.0 and row.rotation_error_deg < 0.15
+
+
+def test_random_halves_agree_as_their_sigma_says(joint):
+    """The prior of the platform is common to both halves, so they differ a little less than predicted."""
+    middle = evaluate.random_halves(joint).median(numeric_only=True)
+    assert middle.rotation_deg < 0.4 and middle.translation_mm < 12
+    usual = 0.89  # median of the length of a normal 3-vector, relative to its root mean square
+    for unit in ("rotation_deg", "translation_mm"):
+        assert 1 / 1.6 < middle[unit] / (usual * middle[f"predicted_{unit}"]) < 1.6
+
+
+def test_edge_lengths_of_left_out_placements(joint):
+    table = evaluate.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint=joint)
+    summary = evaluate.edge_summary(table).set_index(["variant", "ends"]).mean_abs_error_mm
+    assert summary["likelihood", "scan"] < 4.7 and summary["half_step", "scan"] < 4.7
 
 
 def test_the_cloud_is_coloured(found):
@@ -138,7 +174,7 @@ def test_the_cloud_is_coloured(found):
 
 
 def test_calibration_file_holds_what_a_user_needs(found, tmp_path):
-    record = calibration_record(found.prepared, found.platform, found.observations, found.solutions, "line")
+    record = calibration_record(found, "line")
     write_calibration(tmp_path / "calibration.json", record)
     back = json.loads((tmp_path / "calibration.json").read_text())
     assert back["cameras"]["left"]["maps"] == "platform to left"

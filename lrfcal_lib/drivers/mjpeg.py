@@ -69,7 +69,7 @@ class MjpegStream:
                 head = self._upto(b"\r\n\r\n")
             stated = LENGTH.search(fields)
             self._image = self._count(int(stated[1])) if stated else self._upto(END)
-        except (OSError, EOFError, http.client.HTTPException):
+        except (OSError, EOFError, ValueError, http.client.HTTPException):  # ValueError: the answer was closed
             return False
         return True
 

@@ -189,7 +189,8 @@ class Camera:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
-        self._quit.wait(AGAIN_S)
+        if self._quit.wait(AGAIN_S):
+            return
         with contextlib.suppress(PortError):
             self._capture = self._source.open()
             self._apply()

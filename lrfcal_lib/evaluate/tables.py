@@ -164,7 +164,7 @@ def method_comparison(observations, solutions, left_out=True, truth=None, joint=
     truth : Truth, optional
         Of a simulated session.
     joint : JointCalibration, optional
-        With its estimates without each placement (:func:`lrfcal_lib.joint_calibration.leave_one_out`): the left-out
+        With its estimates without each placement (:func:`lrfcal_lib.joint_calibration.leave_out`): the left-out
         columns of the method 'joint'. It is judged on the same beams, with its own platform and range offset.
 
     Returns

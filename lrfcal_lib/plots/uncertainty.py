@@ -136,7 +136,8 @@ def misfit_bars(ax, misfit, limit=4.0):
     ax.bar(np.arange(len(names)), values, color=np.where(bad, COLORS["outlier"], COLORS["lrf"]), width=0.75)
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     ax.set(xlabel="placement", ylabel="chi-square per degree of freedom", ylim=(0, 1.1 * max(values.max(), 1.2)))
-    ax.set(xticks=np.arange(len(names)), xticklabels=names)
+    shown = np.arange(0, len(names), 1 if len(names) < 16 else 2)
+    ax.set(xticks=shown, xticklabels=[names[i] for i in shown])
     ax.set_title(f"{bad.sum()} of {len(names)} placements fit much worse than the others" if bad.any() else
                  f"all placements fit alike, the worst {values.max():.1f}")  # fmt: skip
     ax.grid(False, axis="x")

@@ -231,7 +231,9 @@ def _handler(cameras):
             self.end_headers()
             while not cameras._quit.is_set():
                 _, data = cameras.image(name)
-                if data is not None:
+                if data is None:
+                    self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
+                else:
                     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     self.wfile.write(head.encode() + data + b"\r\n")
                     cameras._quit.wait(1 / cameras.fps)

@@ -1,0 +1,147 @@
+"""The joint calibration of a session: which unknowns it takes, what it hands over, and boards in the coloured cloud."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib import evaluate, joint_calibration, pipeline
+from lrfcal_lib.export import calibration_record
+from lrfcal_lib.fused_outline import edge_on_plane, fused_outline_of
+from lrfcal_lib.geometry import transform_difference
+from lrfcal_lib.session import open_session
+from lrfcal_lib.solvers.joint import solve_again
+
+QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
+
+
+@pytest.fixture(scope="module")
+def found():
+    return pipeline.calibrate(open_session(QUICK), methods=("line", "zhang_pless"))
+
+
+@pytest.fixture(scope="module")
+def joint(found):
+    return joint_calibration.leave_out(found.joint, groups=4)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return evaluate.read_truth(open_session(QUICK))
+
+
+def test_the_session_asks_for_its_unknowns(joint):
+    """Cameras on the head that see the board at several pitch angles show the scale of the pitch; nothing else is off."""
+    assert "pitch_scale" in joint.settings["sensor"]
+    assert "sweep" not in joint.settings
+    assert joint.settings["prior"].sigma_offset == joint.prepared.session.platform_sigma[1]
+
+
+def test_images_at_one_pitch_do_not_ask_for_its_scale(joint):
+    views = {name: found[:1] for name, found in joint_calibration.all_views(joint.prepared).items()}
+    seen = joint_calibration.observe_joint(joint.prepared, views)
+    assert "pitch_scale" not in joint_calibration.joint_settings(joint.prepared, seen)["sensor"]
+
+
+def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
+    for noise, sweep in (((0.005, 0.0), "offset"), ((0.005, 0.04), "offset_stretch")):
+        loose = replace(joint.prepared, pitch_noise=pipeline.PitchNoise(*noise))
+        assert joint_calibration.joint_settings(loose, joint.observations)["sweep"] == sweep
+
+
+def test_errors_agree_with_their_sigma(joint, truth):
+    table = evaluate.joint_errors(joint, truth)
+    assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
+    assert (table.translation_error_mm < 3.5 * table.translation_sigma_mm).all()
+    assert table.translation_error_mm.max() < 25
+
+
+def test_it_is_far_better_than_lines(found, joint, truth):
+    for camera in joint.observations.cameras:
+        errors = [
+            transform_difference(found.solutions[camera, name].transform, truth.cameras[camera])
+            for name in ("joint", "line")
+        ]
+        assert errors[0][1] < 0.5 * errors[1][1]
+
+
+def test_every_placement_is_left_out_once(joint):
+    assert set(joint.without) == set(joint.solution.boards)
+    assert all(placement not in solution.boards for placement, solution in joint.without.items())
+
+
+def test_all_placements_again_change_nothing(joint):
+    again = solve_again(joint.observations, joint.solution)
+    step = (again.solution.parameters - joint.solution.solution.parameters) / joint.solution.solution.sigma
+    assert np.abs(step).max() < 0.05
+
+
+def test_corrections_undo_what_the_estimate_found(joint):
+    """A point measured too far by the range offset comes back; a placement that took no part gets the scale only."""
+    solution = joint.solution
+    p = np.array([[0.3, 1.8, 0.0], [-0.2, 1.1, 0.0]])
+    away = p * (1 + solution.sensor["range_offset"] / np.linalg.norm(p, axis=1, keepdims=True))
+    back, pitch = solution.correct(99, away, np.array([0.1, -0.2]))
+    np.testing.assert_allclose(back, p, atol=2e-5)
+    np.testing.assert_allclose(pitch, np.array([0.1, -0.2]) * (1 + solution.sensor["pitch_scale"]))
+
+
+def test_it_is_handed_over_with_its_platform_and_sensor(found):
+    assert evaluate.handed_over(found) == "joint"
+    record = calibration_record(found, "joint")
+    np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
+    assert set(record["cameras"]) == set(found.joint.observations.cameras)
+    assert record["sensor"]["range_offset"]["sigma"] > 0
+    assert "sensor" not in calibration_record(found, "line")
+
+
+def test_what_did_not_converge_is_not_handed_over(found):
+    bad = replace(found.joint.solution, solution=replace(found.joint.solution.solution, converged=False))
+    assert evaluate.handed_over(replace(found, joint=replace(found.joint, solution=bad))) in ("line", "zhang_pless")
+
+
+def test_tables_hold_the_joint_estimate(found, joint):
+    comparison = evaluate.method_comparison(found.observations, found.solutions, joint=joint)
+    row = comparison[comparison.method == "joint"].iloc[0]
+    assert np.isfinite([row.left_out_edge_rms_px, row.left_out_plane_rms_mm]).all()
+    assert "joint" in set(evaluate.platform_calibration_table(found.platform).method)
+    assert "joint" in set(evaluate.camera_calibration_table(found.solutions).method)
+    assert set(evaluate.joint_table(joint).unit) <= {"deg", "mm", "%", "1"}
+    assert (evaluate.joint_table(joint).sigma > 0).all()
+    assert len(evaluate.noise_table(joint)) == len(joint.solution.noise)
+    assert evaluate.joint_fit(joint)["plane_rms_mm"] < 12
+    assert set(evaluate.edge_bias_mm(joint).edge) <= set(joint.observations.edges)
+
+
+def test_boards_of_unknown_size_in_the_coloured_cloud(joint):
+    """Edge lengths from the plane of the cloud and the edges in the images, calibrated without the placement."""
+    true = joint.prepared.board.lengths()
+    misses = [
+        1000 * (length - true[edge])
+        for placement in joint.without
+        for edge, length in fused_outline_of(joint, placement)[0].lengths.items()
+    ]
+    assert len(misses) >= 6 and np.mean(np.abs(misses)) < 3.0
+
+
+def test_an_image_edge_on_a_plane_projects_onto_itself(found):
+    camera, views = next(iter(found.prepared.views.items()))
+    edge = next(iter(views.values())).edges[0]
+    model = found.prepared.models[camera]
+    T = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.3]))
+    centre, normal = T.inv().apply([0.1, 0.0, 1.7]), T.inv().rotation.apply([0.2, 0.1, -0.97])
+    points = edge_on_plane(edge, model, T.inv(), centre, normal)
+    np.testing.assert_allclose((points - centre) @ normal, 0, atol=1e-12)
+    q = T.apply(points)
+    uv = q[:, :2] / q[:, 2:] * [model.fx, model.fy] + [model.cx, model.cy]
+    np.testing.assert_allclose(uv @ edge.line[:2] + edge.line[2], 0, atol=1e-9)
+
+
+def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(found):
+    """Without a usable placement the joint estimate has a problem in words; what was there stays."""
+    problems = {placement: "a dog ran through" for placement in found.prepared.scans}
+    again = pipeline.with_joint(replace(found, prepared=replace(found.prepared, problems=problems), joint=None))
+    assert again.joint is None and "no placement" in again.problems["rig", "joint"]
+    assert again.solutions is found.solutions

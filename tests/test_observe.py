@@ -1,0 +1,86 @@
+"""Observations drawn from noise models: exact where noise is off, as noisy as they say where it is on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joint_draws import draw
+
+from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.solvers.joint_blocks import Unknowns, gather, named_blocks
+from lrfcal_lib.solvers.least_squares import whiten
+from lrfcal_lib.solvers.pose import pose_transform
+
+MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+@MOUNTS
+def test_exact_observations_leave_no_residual(mount):
+    obs, truth, _ = draw(rng(), 6, mount=mount, see_noise=0.0, stretch=0.02)
+    blocks = named_blocks(truth, gather(obs), Unknowns(2, 3))
+    assert np.abs(whiten(blocks["face"], False)[0]).max() < 1e-9
+    assert np.abs(whiten(blocks["view"], False)[0]).max() < 1e-6
+
+
+@MOUNTS
+def test_noise_is_what_is_stated(mount):
+    """Whitened residuals at the truth have unit variance: ranges within 3 %, views within 10 %."""
+    obs, truth, _ = draw(rng(), 40, mount=mount)
+    data = gather(obs)
+    blocks = named_blocks(truth, data, Unknowns(2, 3))
+    face = whiten(blocks["face"], False)[0][data.face["used"]]
+    view = whiten(blocks["view"], False)[0]
+    assert np.mean(face**2) == pytest.approx(1, abs=0.1) and abs(np.mean(face)) < 0.1
+    assert np.mean(view**2) == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("bias", [-0.5, 0.0, 0.5])
+def test_beams_flip_where_the_bias_says(bias):
+    """Read beams lie inside the shifted edge, missed ones outside, but for the softness."""
+    obs, truth, rig = draw(rng(), 10, bias=bias, softness=0.05)
+    data = gather(obs)
+    chance = {
+        hit: np.exp(-named_blocks(truth, replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)}),
+                                  Unknowns(2, 3))["beam"].cost)
+        for hit in (True, False)
+    }  # fmt: skip
+    used, hit = data.beam["used"], data.beam["hit"]
+    assert np.allclose((chance[True] + chance[False])[used], 1.0)
+    expected, spread = chance[True][used].sum(), np.sqrt((chance[True] * chance[False])[used].sum())
+    assert abs(hit[used].sum() - expected) < 4 * spread + 1
+    certain = np.where(hit, chance[True], chance[False])[used]
+    assert np.mean(certain > 0.5) > 0.95
+
+
+def test_faces_lie_on_the_board():
+    obs, truth, rig = draw(rng(), 5, see_noise=0.0)
+    p_lrf = polar_to_points(obs.face_range - rig.range_offset, obs.face_bearing)
+    p = lrf_to_platform(p_lrf, obs.face_pitch, rig.T_head_lrf)
+    assert len(np.unique(obs.face_placement)) == 5
+    pose = truth.boards[obs.face_placement]
+    turned = (pose_transform(truth.head) * rig.T_head_lrf.inv()).apply(p)  # the truth is in the estimate's gauge
+    on_board = np.einsum("nji,nj->ni", pose[:, :, :3], turned - pose[:, :, 3])
+    assert np.abs(on_board[:, 2]).max() < 1e-9
+    inside = on_board[:, :2] @ rig.board.lines()[:, :2].T + rig.board.lines()[:, 2]
+    assert inside.max() < 0.5 * np.max(obs.beam_radius) + 1e-6
+
+
+def test_single_shots_and_images():
+    obs, *_ = draw(rng(), 4, see_span=0.0, see_images=1)
+    assert set(obs.direction) == {0} and len(obs.view_pitch) == 8
+    for p in range(4):
+        mine = obs.face_placement == p
+        assert len(np.unique(obs.face_pitch[mine])) == 1
+        assert np.allclose(obs.view_pitch[obs.view_placement == p], obs.face_pitch[mine][0])
+    assert draw(rng(), 3, see_images=0)[0].view_pose.shape == (0, 4, 4)
+    assert set(draw(rng(), 3)[0].direction) == {-1, 1}
+
+
+def test_one_seed_gives_one_draw():
+    one, two, other = (draw(rng(seed), 3)[0] for seed in (1, 1, 2))
+    assert np.array_equal(one.face_range, two.face_range) and np.array_equal(one.beam_hit, two.beam_hit)
+    assert len(one.face_range) != len(other.face_range) or not np.array_equal(one.face_range, other.face_range)
