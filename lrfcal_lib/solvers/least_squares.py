@@ -14,6 +14,7 @@ hands over as `corrected`. Robust weights are frozen while a step is judged and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -118,6 +119,12 @@ def _group_sizes(block, r):
     return np.sqrt(squares / count), count
 
 
+@lru_cache(maxsize=4096)
+def usual_size(count):
+    """Median root mean square of `count` normal numbers."""
+    return float(np.sqrt(chi2_distribution.ppf(0.5, count) / count))
+
+
 def _scale(block, z, count, scale, axes):
     """Scale of a block's group sizes: given, or ('auto') from their median, per trial."""
     if scale != "auto":
@@ -125,7 +132,8 @@ def _scale(block, z, count, scale, axes):
     inside = np.broadcast_to(
         block.whitener != 0 if block.size == 1 else np.any(block.whitener != 0, axis=(-1, -2)), z.shape
     )
-    expected = np.sqrt(chi2_distribution.ppf(0.5, count) / count)
+    sizes, index = np.unique(count, return_inverse=True)
+    expected = np.array([usual_size(float(size)) for size in sizes])[index].reshape(np.shape(count))
     return np.maximum(np.nanmedian(np.where(inside, z / expected, np.nan), axis=axes, keepdims=True), 1e-9)
 
 
