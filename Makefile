@@ -26,7 +26,7 @@ report: setup
 
 test: setup
 	$(RUN) -m ruff check .
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n 4 --dist loadfile
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")
@@ -36,6 +36,7 @@ lab: setup
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py
+	@PYTHONPATH=tests $(RUN) tests/bench_joint.py
 
 data: setup
 	rm -rf data/.new

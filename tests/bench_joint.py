@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+from bench import seconds
 from joint_draws import draw
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -38,20 +39,8 @@ except ImportError:
     gtsam = None
 
 COLUMNS = ["what", "value", "unit", "against", "times_faster"]
-REPEATS = 5
 FACE, BEAMS = 40, 30
 SENSOR = ("range_offset", "edge_log_odds")
-
-
-def seconds(function):
-    """Median time of a call, after one to warm up."""
-    function()
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times))
 
 
 def thinned(obs, **most):

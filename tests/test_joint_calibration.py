@@ -33,7 +33,7 @@ def truth():
 
 
 def test_the_session_asks_for_its_unknowns(joint):
-    """Cameras on the head that see the board at several pitch angles show the scale of the pitch; nothing else is off."""
+    """Cameras on the head that see the board at several pitch angles show the scale of the pitch; no sweep is off."""
     assert "pitch_scale" in joint.settings["sensor"]
     assert "sweep" not in joint.settings
     assert joint.settings["prior"].sigma_offset == joint.prepared.session.platform_sigma[1]

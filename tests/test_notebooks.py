@@ -1,40 +1,23 @@
 """Notebooks are stored as run from top to bottom, kept readable, and still run."""
 
 import ast
-import os
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import nbformat
 import pytest
+from notebook_runs import (
+    NOTEBOOKS,
+    ROOT,
+    WITH_SESSION,
+    WITHOUT_SESSION,
+    check,
+    code_cells,
+    has_outputs,
+    read,
+    run_nbval,
+)
 
-ROOT = Path(__file__).resolve().parents[1]
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 SHIPPED = ROOT / "data" / "sim_lms221" / "session.json"
 LONGEST_CELL, LONGEST_FUNCTION = 15, 10
-CELL_SECONDS = 600
-
-
-def read(path):
-    return nbformat.read(path, as_version=4)
-
-
-def code_cells(notebook):
-    return [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
-
-
-def asks_for_session(path):
-    return any("notebook.start(" in cell.source for cell in code_cells(read(path)))
-
-
-def has_outputs(path):
-    return any(cell.outputs for cell in code_cells(read(path)))
-
-
-WITH_SESSION = [path for path in NOTEBOOKS if asks_for_session(path)]
-WITHOUT_SESSION = [path for path in NOTEBOOKS if path not in WITH_SESSION]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
@@ -91,39 +74,9 @@ def test_no_output_of_a_recording_is_stored(path):
     assert not has_outputs(path)
 
 
-def run_nbval(path, session=None):
-    """Run a notebook under nbval, comparing outputs where there are any and no other session is asked for."""
-    strict = has_outputs(path) and session is None
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:dash", "-p", "no:cacheprovider", "--tb=short"]
-    command += ["--nbval" if strict else "--nbval-lax", "--nbval-current-env", f"--nbval-cell-timeout={CELL_SECONDS}"]
-    command += ["--nbval-sanitize-with", "tests/nbval_sanitize.cfg", str(path)]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
-    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    environment |= {} if session is None else {"LRFCAL_SESSION": str(session)}
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-
-
-def check(done):
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert " passed" in done.stdout
-
-
 @pytest.mark.parametrize("path", WITHOUT_SESSION, ids=lambda p: p.stem)
 def test_runs_alone(path):
     check(run_nbval(path))
-
-
-@pytest.fixture(scope="module")
-def runs_on_the_recording(lms400_session):
-    """All notebooks on the imported recording, two at a time; results as futures by path."""
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        # later notebooks take longer, so they start first
-        yield {path: pool.submit(run_nbval, path, lms400_session) for path in reversed(WITH_SESSION)}
-
-
-@pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
-def test_runs_on_the_recording(path, runs_on_the_recording):
-    check(runs_on_the_recording[path].result())
 
 
 @pytest.mark.skipif(not SHIPPED.is_file(), reason="no simulated session ships yet")

@@ -120,7 +120,7 @@ def test_the_axis_cancels_at_the_pitch_of_the_image(solved):
     axis = found.parts["axis"][0]
     assert (axis[0] > 0).all()
     if rig.mount == "head":
-        assert axis[2].max() < 0.6 * axis[[0, 4]].min()  # the middle row is measured near the pitch of the image
+        assert axis[2].max() < 0.75 * axis[[0, 4]].min()  # the middle row is measured near the pitch of the image
     else:
         assert (found.parts["camera"] > found.sigma).any()  # errors of axis and camera compensate
 

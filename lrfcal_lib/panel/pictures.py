@@ -110,14 +110,13 @@ class TopView:
         return self._canvases[reach]
 
     def _axes(self, ax, reach):
-        width = reach * self.size[0] / self.size[1]
-        low, high = min(0.0, reach * np.sin(min(self.field_of_view))), reach
-        middle, half = (low + high) / 2, 1.08 * max((high - low) / 2, width / 2 * self.size[1] / self.size[0])
-        ax.set(xlim=(-half * self.size[0] / self.size[1], half * self.size[0] / self.size[1]),
-               ylim=(middle - half, middle + half), aspect="equal")  # fmt: skip
-        ax.set_axis_off()
-        angle = np.linspace(*self.field_of_view, 90)
+        angle = np.linspace(*self.field_of_view, 91)
         edge = reach * np.column_stack([np.cos(angle), np.sin(angle)])
+        shape = self.size[0] / self.size[1]
+        low, high, side = min(0.0, edge[:, 1].min()), edge[:, 1].max(), np.abs(edge[:, 0]).max()
+        middle, half = (low + high) / 2, 1.1 * max((high - low) / 2, side / shape)
+        ax.set(xlim=(-half * shape, half * shape), ylim=(middle - half, middle + half), aspect="equal")
+        ax.set_axis_off()
         ax.fill(*np.vstack([[0, 0], edge]).T, color="#f4f6f8", zorder=0)
         step = 1.0 if reach <= 6 else 2.0 if reach <= 12 else 5.0 if reach <= 30 else 20.0
         for radius in np.arange(step, reach + 1e-6, step):
@@ -182,7 +181,7 @@ class SweepPicture:
         edges = np.degrees([bearings[-1], bearings[0]])
         for pitch, row in zip(np.degrees(list(rows)), shades, strict=True):
             ends = [(edges[0], pitch + self.step / 2), (edges[1], pitch - self.step / 2)]
-            (left, top), (right, bottom) = np.rint(self._canvas.pixels(ends)).astype(int)
+            (left, top), (right, bottom) = np.rint(self._canvas.pixels(ends)).astype(int) + [[0, 0], [0, 1]]
             if right > left and bottom > top:
                 line = cv2.resize(row[None, ::-1], (right - left, 1), interpolation=cv2.INTER_NEAREST)
                 image[top:bottom, left:right] = line

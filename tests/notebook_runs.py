@@ -1,0 +1,49 @@
+"""The notebooks, and how tests run them under nbval."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+CELL_SECONDS = 600
+
+
+def read(path):
+    return nbformat.read(path, as_version=4)
+
+
+def code_cells(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+
+
+def asks_for_session(path):
+    return any("notebook.start(" in cell.source for cell in code_cells(read(path)))
+
+
+def has_outputs(path):
+    return any(cell.outputs for cell in code_cells(read(path)))
+
+
+WITH_SESSION = [path for path in NOTEBOOKS if asks_for_session(path)]
+WITHOUT_SESSION = [path for path in NOTEBOOKS if path not in WITH_SESSION]
+
+
+def run_nbval(path, session=None):
+    """Run a notebook under nbval, comparing outputs where there are any and no other session is asked for."""
+    strict = has_outputs(path) and session is None
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:dash", "-p", "no:cacheprovider", "--tb=short"]
+    command += ["--nbval" if strict else "--nbval-lax", "--nbval-current-env", f"--nbval-cell-timeout={CELL_SECONDS}"]
+    command += ["--nbval-sanitize-with", "tests/nbval_sanitize.cfg", str(path)]
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
+    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment |= {} if session is None else {"LRFCAL_SESSION": str(session)}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+
+
+def check(done):
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert " passed" in done.stdout
