@@ -245,7 +245,8 @@ def verdict(title, sentences):
     sentences : sequence of str
         The most important one first.
     """
-    _record("verdicts", {"title": title, "sentences": list(sentences)})
+    sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
+    _record("verdicts", {"title": title, "sentences": sentences})
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 

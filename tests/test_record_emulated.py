@@ -62,15 +62,12 @@ def simulated_session(setup, tmp_path_factory):
 def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
     folder, begun = tmp_path_factory.mktemp("recorded"), time.time()
-    with pytest.MonkeyPatch().context() as patch, EmulatedRig(
-        setup[0], placements=setup[1], time_scale=QUICKLY, platform={"settle": 0.2},
+    with EmulatedRig(
+        setup[0], placements=setup[1], time_scale=QUICKLY, platform={"settle": 0.2}, rest_s=2.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
-        patch.setattr(emulated_camera, "REST_S", 2.0)  # images are drawn where they are taken, not at every stop
         data = state_intrinsics(emulated.rig_file(), setup[0])
         data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
-        for camera in data["devices"]["cameras"].values():
-            camera["silence_s"] = 60.0  # no image is sent while the head moves
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
         with Rig.open(stated, clock=lambda: begun + QUICKLY * (time.time() - begun)) as rig:

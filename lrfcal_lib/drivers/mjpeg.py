@@ -93,6 +93,8 @@ class MjpegStream:
         self._connection.close()
 
     def _fill(self):
+        if self._socket.fileno() < 0:  # the answer closed it, at its end or after a silence
+            raise EOFError
         self.waited |= not select.select([self._socket], [], [], 0)[0]
         if not (some := self._answer.read1(CHUNK)) or len(self._buffer) > LONGEST:
             raise EOFError

@@ -59,7 +59,7 @@ class Parts:
     def __init__(self, rig, session):
         wide = {"description_width": "62px"}
         self.rig = w.Combobox(value=rig, options=PRACTICE_RIGS, description="rig", style=wide,
-                              placeholder="rig.json, or an emulated rig", layout=w.Layout(flex="1 1 260px"))  # fmt: skip
+                              placeholder="rig file or emulated rig", layout=w.Layout(flex="1 1 260px"))  # fmt: skip
         self.session = w.Text(value=session, description="session", style=wide, layout=w.Layout(flex="2 1 320px"))
         self.connect = button("Connect", "connect", "open all devices and the session", "primary", "plug")
         self.close = button("Close", "close", "finish the session and close all devices", icon="power-off")

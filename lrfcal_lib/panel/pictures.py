@@ -35,7 +35,7 @@ class Canvas:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI)
+        figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, layout="none")
         canvas = FigureCanvasAgg(figure)
         ax = figure.add_axes(place)
         draw(ax)
@@ -121,8 +121,8 @@ class TopView:
         step = 1.0 if reach <= 6 else 2.0 if reach <= 12 else 5.0 if reach <= 30 else 20.0
         for radius in np.arange(step, reach + 1e-6, step):
             ax.plot(radius * np.cos(angle), radius * np.sin(angle), color="#d5d9dd", linewidth=0.8, zorder=1)
-            ax.text(*radius * np.array([np.cos(angle[0]), np.sin(angle[0])]), f" {radius:g} m", color=GREY, fontsize=8,
-                    va="top", ha="left")  # fmt: skip
+            if radius < reach:
+                ax.text(*edge[0] * radius / reach, f" {radius:g} m", color=GREY, fontsize=8, va="top", ha="left")
         ax.plot(0, 0, marker="^", color="#333333", markersize=9)
 
 

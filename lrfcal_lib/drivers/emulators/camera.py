@@ -27,7 +27,6 @@ from lrfcal_lib.simulate.record import world_of
 from lrfcal_lib.simulate.render import Imager
 
 BOUNDARY = "frame"
-REST_S = 0.15  # that the head must rest before an image is begun: most stops of a sweep need none
 LOOK_S = 0.05
 CACHED = 64  # images
 
@@ -107,14 +106,17 @@ class CameraServer:
     fps : float
         Most images a second of a camera.
     seed : int
+    rest_s : float
+        Seconds of the devices that the head must rest before an image is drawn. Nobody tells a camera whether its
+        image is wanted; most stops of a sweep need none and are shorter.
 
     Attributes
     ----------
     urls : dict of str to str
     """
 
-    def __init__(self, world, setup=None, *, quality=97, fps=8.0, seed=0):
-        self.world, self.quality, self.fps, self.seed = world, quality, fps, seed
+    def __init__(self, world, setup=None, *, quality=97, fps=8.0, seed=0, rest_s=0.5):
+        self.world, self.quality, self.fps, self.seed, self.rest_s = world, quality, fps, seed, rest_s
         setup = setup or world.setup
         self.names = [c.name for c in setup.rig.cameras]
         self._done, self._begun, self._lock = OrderedDict(), {}, threading.Lock()
@@ -170,7 +172,7 @@ class CameraServer:
         if first is None:
             return None
         place, pitch = first
-        if self.world.head.tilt.resting(self.world.clock.now())[0] < REST_S + self.world.head.platform.settle:
+        if self.world.head.tilt.resting(self.world.clock.now())[0] < self.rest_s + self.world.head.platform.settle:
             return None
         return name, place.key, round(pitch, 7)
 

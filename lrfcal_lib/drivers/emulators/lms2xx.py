@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from contextlib import suppress
@@ -22,6 +23,7 @@ from lrfcal_lib.drivers.emulators.lms2xx_scans import (
 )
 from lrfcal_lib.drivers.lms2xx import TelegramError, crc16, encode_telegram, parse_telegram
 
+LOG = logging.getLogger(__name__)
 ACK, NAK, STX = 0x06, 0x15, 0x02
 ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allows 60 ms
 REPLY_S = 0.065  # to the first byte of a reply, as measured on a real device
@@ -33,6 +35,7 @@ GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 BURST = 508  # bytes that leave in one turn of the mirror at 500000 Bd
 LONGEST_REQUEST = 1024
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
+LATE_S = 1.0, 0.1  # a stream that lags so far leaves scans out: no host can know how late they are; once it did
 BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
 INSTALLATION, DIAGNOSIS, REQUEST, TEST_PASSWORD = 0x00, 0x10, 0x25, 0x30
 DONE, WRONG, FAULT = 0, 1, 2  # results of command 0x20
@@ -68,6 +71,9 @@ class EmulatedLms:
         The newest 20000.
     requests : deque of (float, bytes)
         Host time and sound telegrams from the host.
+    left_out : int
+        Times that a stream left scans out, as this machine is too slow to cast them in time: a moving head needs
+        some 20 ms of its processor for a scan, and `time_scale` shortens the time between two.
     """
 
     def __init__(self, source=None, *, path, seed=0, time_scale=1.0, clock=None, boot_s=2.0, powered_s=60.0,
@@ -78,7 +84,7 @@ class EmulatedLms:
         now = self.clock.now()
         self.scanner = Scanner(source or SyntheticSource(), self.memory, self.clock, now - powered_s)
         self.scans = self.scanner.records
-        self._buffer, self._stream, self._booting = b"", None, powered_s < boot_s
+        self._buffer, self._stream, self._booting, self.left_out = b"", None, powered_s < boot_s, 0
         if self._booting:
             self.line.at(now + boot_s - powered_s, self._ready, "boot")
 
@@ -352,6 +358,9 @@ class EmulatedLms:
             self._plan()
 
     def _plan(self):
+        late = self.clock.now() - self._stream.complete_at
+        if late > LATE_S[self.left_out > 0]:
+            self._leave_out(late)
         self._when_complete(self._stream.complete_at, self._stream.measure, self._next, "stream")
 
     def _next(self, scan, at):
@@ -362,6 +371,15 @@ class EmulatedLms:
             self._emit(scan, at)
         self._stream.advance()
         self._plan()
+
+    def _leave_out(self, late):
+        """Go on with the scan of the present; the host sees the gap in the indices."""
+        if not self.left_out:
+            LOG.warning("%s: this machine casts scans too slowly for time_scale %g: %.1f s of them are left out; "
+                        "choose a smaller one, or stop-and-go", self.path, self.clock.scale, late)  # fmt: skip
+        self.left_out += 1
+        self.scanner.telegrams += 1
+        self._stream.begin(self.clock.now())
 
     _COMMANDS = {
         0x10: _reset, 0x20: _mode, 0x30: _measure, 0x31: _status, 0x32: _errors, 0x36: _measure_mean,

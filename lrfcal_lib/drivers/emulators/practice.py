@@ -16,7 +16,7 @@ from lrfcal_lib.simulate.setups import SETUPS, sim_quick
 
 PRACTICE = "practice"
 NAMES = (PRACTICE, *SETUPS)
-SMALL = 480  # pixels of an image's width: its chessboard is still found at 2 m
+SMALL = 400  # pixels of an image's width: its chessboard is still found at 2 m
 FAST = 2.0  # times as fast as real devices
 MARGIN = np.radians(1.0)  # of a sweep beyond the board
 

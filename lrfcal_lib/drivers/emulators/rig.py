@@ -21,6 +21,7 @@ from lrfcal_lib.session.stated import SCHEMA, camera_to_json, lrf_to_json
 from lrfcal_lib.simulate.beam import LARGEST_WORD
 from lrfcal_lib.simulate.setups import SETUPS
 
+SILENCE_S = 600.0  # that says nothing about an emulated camera: it sends no image while the head moves
 FIRMWARE = {"LMS200": "V02.19 ", "LMS211": "X01.27 ", "LMS221": "X01.27 "}
 
 
@@ -37,7 +38,8 @@ class EmulatedRig:
     placements : sequence of Placement, optional
         Where the board can be put, see :class:`EmulatedWorld`.
     time_scale : float
-        Seconds of the devices in a second of the host.
+        Seconds of the devices in a second of the host. A stream of scans leaves some out, with a warning, where this
+        machine is too slow for it; 1 is safe, and with a head that rests 8.
     lrf_options : dict, optional
         Of :class:`EmulatedLms`.
     head_options : dict, optional
@@ -48,7 +50,7 @@ class EmulatedRig:
         Whether there are cameras.
     image_width : int, optional
         Pixels; the field of view stays.
-    quality, fps
+    quality, fps, rest_s
         Of :class:`CameraServer`.
 
     Attributes
@@ -70,7 +72,7 @@ class EmulatedRig:
     """
 
     def __init__(self, setup="sim_quick", *, folder=None, seed=0, placements=None, time_scale=1.0, lrf_options=None,
-                 head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0):  # fmt: skip
+                 head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0, rest_s=0.5):  # fmt: skip
         setup = _setup(setup)
         rig = replace(setup.rig, platform=replace(setup.rig.platform, **(platform or {})))
         setup, self.clock = replace(setup, rig=rig), Clock(time_scale)
@@ -86,7 +88,8 @@ class EmulatedRig:
         self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
         self.faults, self.scans = {"lrf": self.lrf.faults, "head": self.pan_tilt.faults}, self.lrf.scans
         self.lrf_port, self.head_port = self.lrf.path, self.pan_tilt.path
-        self._cameras = CameraServer(self.world, self.setup, quality=quality, fps=fps, seed=seed) if cameras else None
+        shown = {"quality": quality, "fps": fps, "seed": seed, "rest_s": rest_s}
+        self._cameras = CameraServer(self.world, self.setup, **shown) if cameras else None
         self.camera_urls = self._cameras.urls if cameras else {}
         self.control = str(self.folder / "control")
         self._socket = ControlSocket(self.control, self)
@@ -188,7 +191,8 @@ class EmulatedRig:
                     "unit": "mm" if beam.unit < 0.005 else "cm", "interlaced": False},
             "head": {"port": self.head_port, "address": self.pan_tilt.address, "baudrate": self.pan_tilt.baudrate,
                      "pitch_limits_deg": low_high.round(6).tolist()},
-            "cameras": {name: {"source": url, "size": size[name]} for name, url in self.camera_urls.items()},
+            "cameras": {name: {"source": url, "size": size[name], "silence_s": SILENCE_S}
+                        for name, url in self.camera_urls.items()},
             "control": self.control,
         }  # fmt: skip
 

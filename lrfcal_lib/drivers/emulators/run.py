@@ -31,6 +31,7 @@ def parser():
     top.add_argument("--head-baudrate", type=int, default=2400)
     top.add_argument("--model", help="type string of the laser range finder, 21 characters")
     top.add_argument("--image-width", type=int, help="pixels")
+    top.add_argument("--image-rest", type=float, default=0.5, help="s the head rests before an image is drawn (0.5)")
     top.add_argument("--no-cameras", action="store_true")
     top.add_argument("--time-scale", type=float, default=1.0, help="2 runs all devices twice as fast")
     return top
@@ -79,7 +80,8 @@ def _rig(args):
     head = {"feedback": args.feedback, "reply": args.reply, "echo": args.echo, "baudrate": args.head_baudrate}
     return EmulatedRig(
         args.setup, folder=args.folder, seed=args.seed, time_scale=args.time_scale, cameras=not args.no_cameras,
-        image_width=args.image_width, head_options=head, lrf_options={"model": args.model} if args.model else None,
+        image_width=args.image_width, rest_s=args.image_rest, head_options=head,
+        lrf_options={"model": args.model} if args.model else None,
     )  # fmt: skip
 
 

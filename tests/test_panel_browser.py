@@ -1,0 +1,169 @@
+"""The panel in JupyterLab in a browser: press the buttons, see the scan, the images and the result."""
+
+import json
+import os
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import nbformat
+import pytest
+
+NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"]  # CI runs as root, in a container
+START_S, ACTION_S, CALIBRATION_S = 60, 60, 120  # guards against hanging
+PLACEMENTS = 3
+
+
+def require_browser():
+    """Skip where no browser can be had; CI must have one."""
+    reasons = []
+    if CHROMIUM is None:
+        reasons.append("there is no Chromium: run 'sudo apt-get install -y chromium'")
+    try:
+        import playwright  # noqa: F401
+    except ImportError:
+        reasons.append("there is no playwright: run 'pip install -r environment.txt'")
+    if reasons and os.environ.get("CI") == "true":
+        pytest.fail("; ".join(reasons))
+    if reasons:
+        pytest.skip("; ".join(reasons))
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def panel_only(folder):
+    """The notebook up to the cell that shows the panel."""
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    last = next(i for i, cell in enumerate(notebook.cells) if "panel.show()" in cell.source)
+    notebook.cells = notebook.cells[: last + 1]
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs, cell.execution_count = [], None
+    nbformat.write(notebook, folder / "panel.ipynb")
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """Address of a JupyterLab with the panel's notebook, its token included."""
+    require_browser()
+    work = tmp_path / "work"
+    work.mkdir()
+    panel_only(work)
+    port, token = free_port(), secrets.token_hex(16)
+    environment = os.environ | {f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower()) for kind in ("CONFIG", "RUNTIME")}
+    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
+    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
+    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", "--core-mode"]  # else dash suggests a build
+    with (tmp_path / "log").open("w") as log:
+        server = subprocess.Popen(command, env=environment, cwd=work, stdout=log, stderr=log)
+        try:
+            wait_for(f"http://127.0.0.1:{port}/api?token={token}", server, tmp_path / "log")
+            yield f"http://127.0.0.1:{port}/doc/tree/panel.ipynb?token={token}"
+        finally:
+            end_kernels(f"http://127.0.0.1:{port}/api/kernels", token)
+            server.terminate()
+            server.wait(20)
+
+
+def wait_for(address, server, log):
+    end = time.monotonic() + START_S
+    while True:
+        try:
+            return urllib.request.urlopen(address, timeout=5).read()
+        except OSError:
+            if server.poll() is not None or time.monotonic() > end:
+                pytest.fail(f"JupyterLab does not start:\n{log.read_text()[-3000:]}")
+            time.sleep(0.2)
+
+
+def end_kernels(address, token):
+    """Let the kernels end by themselves: the panel's rig is closed, its head stopped."""
+    header = {"Authorization": f"token {token}"}
+    with urllib.request.urlopen(urllib.request.Request(address, headers=header), timeout=10) as answer:
+        kernels = json.load(answer)
+    for kernel in kernels:
+        request = urllib.request.Request(f"{address}/{kernel['id']}", headers=header, method="DELETE")
+        urllib.request.urlopen(request, timeout=20).close()
+
+
+@pytest.fixture
+def page(lab):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        page = browser.new_page(viewport={"width": 1400, "height": 1150})
+        page.set_default_timeout(1000 * ACTION_S)
+        page.goto(lab)
+        yield page
+        browser.close()
+
+
+def pixels(page, name):
+    """Size of a picture as the browser decoded it; (0, 0) for none."""
+    return page.eval_on_selector(f"img.lrfcal-picture-{name}", "i => [i.naturalWidth, i.naturalHeight]")
+
+
+def changed(page, name, before):
+    """Wait until a picture is another one; returns its address."""
+    page.wait_for_function("([n, b]) => document.querySelector(`img.lrfcal-picture-${n}`).src !== b", arg=[name, before])
+    return address(page, name)
+
+
+def address(page, name):
+    return page.get_attribute(f"img.lrfcal-picture-{name}", "src")
+
+
+def press(page, name):
+    page.click(f"button.lrfcal-{name}:enabled")
+
+
+def wait_ready(page, seconds=ACTION_S):
+    page.wait_for_selector(".lrfcal-state:has-text('ready')", timeout=1000 * seconds)
+    assert page.locator(".lrfcal-error").count() == 0, page.inner_text(".lrfcal-error")
+
+
+def test_buttons_record_and_calibrate(page):
+    page.wait_for_selector(".jp-Notebook .jp-CodeCell")
+    page.click(".lm-MenuBar-itemLabel:text-is('Run')")
+    page.click(".lm-Menu-itemLabel:text-is('Run All Cells')")
+    page.wait_for_selector(".lrfcal-panel")
+    press(page, "connect")
+    page.wait_for_selector("img.lrfcal-picture-scan")
+    wait_ready(page)
+    empty = address(page, "sweep")
+    changed(page, "scan", "")
+    for name in ("left", "right"):
+        page.wait_for_function(
+            "n => document.querySelector(`img.lrfcal-picture-${n}`).naturalWidth > 100", arg=name
+        )
+    assert pixels(page, "scan")[0] > 100
+    for number in range(1, PLACEMENTS + 1):
+        page.wait_for_selector(f".lrfcal-panel :text('Placement {number} of')")
+        press(page, "capture")
+        page.wait_for_selector(f".lrfcal-panel :text('Quality of placement {number}')")
+        wait_ready(page)
+        assert page.locator(".light:has-text('camera left')").count() == 1
+        assert "board on" in page.inner_text(".light:has-text('scan')")
+    assert changed(page, "sweep", empty) != empty
+    press(page, "calibrate")
+    page.wait_for_selector(".lrfcal-result", timeout=1000 * CALIBRATION_S)
+    said = page.inner_text(".lrfcal-result")
+    assert "rotation vector" in said and "right" in said and "calibration.json" in said, said
+    assert "Expected error at 2 m" in said
+    if os.environ.get("LRFCAL_SCREENSHOT"):
+        page.locator(".lrfcal-panel").screenshot(path=os.environ["LRFCAL_SCREENSHOT"])
+    press(page, "close")
+    page.wait_for_selector(".lrfcal-state:has-text('not connected')")
+
