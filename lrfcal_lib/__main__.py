@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
+INTERRUPTED = 130  # exit code after Ctrl-C
+
 
 def _import_lasersetero(args):
     from lrfcal_lib.importers import import_lasersetero
@@ -115,8 +117,8 @@ def main(argv=None):
     Returns
     -------
     int
-        0, or 1 after a message on stderr (a ``ValueError`` is bad input, not a bug). ``record`` has its own: 2, and
-        130 after Ctrl-C.
+        0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after Ctrl-C. ``record`` has
+        its own: 2 after a message that says what to do.
     """
     args, args.rest = parser().parse_known_args(argv)
     if args.rest and args.run not in (_report, _emulate):
@@ -126,6 +128,9 @@ def main(argv=None):
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # before a verb that has more to say got so far
+        print("\nstopped by Ctrl-C", file=sys.stderr)
+        return INTERRUPTED
     return result if isinstance(result, int) else 0
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from lrfcal_lib.pairing import cells_of, thin
 from lrfcal_lib.preprocess import image
 from lrfcal_lib.preprocess.board_scan import face_points
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_observations import JointObservations
 
 FACE_POINTS = 150  # a placement: neighbouring ranges of a real device share their errors
@@ -55,7 +56,7 @@ def observe_joint(prepared, views=None, *, face_points=FACE_POINTS, cells=CELLS_
     placements = [p for p in prepared.scans if p not in prepared.problems]
     index = {p: i for i, p in enumerate(placements)}
     parts = {"face": _faces(prepared, index, face_points), "beam": _beams(prepared, index, cells)}
-    parts["view"] = _views(views, index)
+    parts["view"] = _views(views, index, prepared)
     found = {f"{group}_{key}": value for group, part in parts.items() for key, value in part.items()}
     session = prepared.session
     return JointObservations(
@@ -67,6 +68,7 @@ def observe_joint(prepared, views=None, *, face_points=FACE_POINTS, cells=CELLS_
         cameras=tuple(views),
         mounts=tuple(session.cameras[c].mount for c in views),
         T_head_lrf=session.T_head_lrf,
+        lens_covariance=np.stack([_lens(prepared.models[c]) for c in views]) if views else None,
         **found,
     )
 
@@ -100,16 +102,25 @@ def _beams(prepared, index, count):
     return {key: np.concatenate(value) if value else np.zeros(0, kinds.get(key, float)) for key, value in out.items()}
 
 
-def _views(views, index):
-    out = {"camera": [], "pitch": [], "pose": [], "covariance": [], "placement": []}
+def _lens(model):
+    """Covariance of the intrinsics; zeros where they are stated without one."""
+    return np.zeros((9, 9)) if model.covariance is None else np.asarray(model.covariance)
+
+
+def _views(views, index, prepared):
+    out = {"camera": [], "pitch": [], "pose": [], "covariance": [], "placement": [], "lens": []}
+    pattern = prepared.board.pattern
     for number, found in enumerate(views.values()):
         for view in found:
             if view.T_camera_board is None or view.placement not in index:
                 continue
-            row = (number, view.pitch, view.T_camera_board.as_matrix(), view.covariance, index[view.placement])
+            corners = np.zeros((0, 3)) if pattern is None or view.pixels is None else pattern.points()
+            seen = corners if view.pixels is None else corners[np.isfinite(view.pixels).all(axis=1)]
+            lens = pose_by_intrinsics(view.T_camera_board, seen, prepared.models[view.camera])
+            row = (number, view.pitch, view.T_camera_board.as_matrix(), view.covariance, index[view.placement], lens)
             for key, value in zip(out, row, strict=True):
                 out[key].append(value)
-    shapes = {"pose": (0, 4, 4), "covariance": (0, 6, 6)}
+    shapes = {"pose": (0, 4, 4), "covariance": (0, 6, 6), "lens": (0, 6, 9)}
     whole = {"camera": int, "placement": int}
     arrays = {k: np.array(v) if v else np.zeros(shapes.get(k, (0,)), whole.get(k, float)) for k, v in out.items()}
     return arrays | {"pitch": np.nan_to_num(arrays["pitch"])}

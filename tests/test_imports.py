@@ -23,7 +23,7 @@ RANKS = [
     {"fused_outline"},
     {"pipeline"},
     {"evaluate"},
-    {"notebook", "plots", "export", "report", "acquisition", "drivers"},  # drivers: seen from above, see APART
+    {"notebook", "plots", "export", "report", "acquisition", "panel", "drivers", "emulators"},  # see APART
     {"__main__"},
 ]
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}

@@ -17,6 +17,8 @@ import pytest
 NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"]  # CI runs as root, in a container
+# dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
+QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
 START_S, ACTION_S, CALIBRATION_S = 60, 60, 120  # guards against hanging
 PLACEMENTS = 3
 
@@ -64,7 +66,7 @@ def lab(tmp_path):
     environment = os.environ | {f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower()) for kind in ("CONFIG", "RUNTIME")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
-    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", "--core-mode"]  # else dash suggests a build
+    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", QUIET, "--LabApp.news_url="]
     with (tmp_path / "log").open("w") as log:
         server = subprocess.Popen(command, env=environment, cwd=work, stdout=log, stderr=log)
         try:

@@ -20,7 +20,7 @@ __all__ = ["Moved", "Photographed", "Rig", "Scanned", "Tracked"]
 
 LOG = logging.getLogger(__name__)
 SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
-IMAGE_S = 15.0  # wait for one fresh image, a camera that comes back included
+IMAGE_S = 30.0  # wait for one fresh image, a camera that comes back included
 BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
 GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop

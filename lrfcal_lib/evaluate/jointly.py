@@ -140,7 +140,8 @@ def random_halves(joint, pairs=8, seed=0):
     -------
     DataFrame
         pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg, predicted_translation_mm (root
-        mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma).
+        mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma,
+        without the part of the intrinsics, which the halves share).
         Splits of which a half leaves something open are missing.
     """
     rng, numbers = np.random.default_rng(seed), np.array(list(joint.solution.boards))
@@ -156,11 +157,18 @@ def random_halves(joint, pairs=8, seed=0):
             continue
         for camera in joint.observations.cameras:
             turn, shift = transform_difference(*(half.transforms[camera] for half in halves))
-            sigma = 2 * trusted_sigma(joint.solution.camera(camera))
+            sigma = 2 * own_sigma(joint.solution, camera)
             expected = np.rad2deg(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:])
             rows.append((pair, camera, np.rad2deg(turn), 1000 * shift, *expected))
     columns = ["pair", "camera", "rotation_deg", "translation_mm", "predicted_rotation_deg", "predicted_translation_mm"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def own_sigma(solution, camera):
+    """Standard deviations of a camera's pose without the part of the intrinsics, which all placements share."""
+    index = solution.columns(f"{camera}_")
+    lens = np.diag(solution.lens)[index]
+    return np.sqrt(np.maximum(trusted_sigma(solution.camera(camera)) ** 2 - lens, 0.0))
 
 
 def joint_errors(joint, truth):

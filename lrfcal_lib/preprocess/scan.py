@@ -279,7 +279,7 @@ def _straight_sides(flat, order, end, mixed, tolerance):
     the board's outline lies before something close (a wall), which moves all of it alike.
     """
     shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0)) if len(flat) else 0.0
-    usable, found = ~mixed if np.mean(mixed) < 0.5 else np.ones(len(flat), bool), []
+    usable, found = ~mixed if 2 * mixed.sum() < len(flat) else np.ones(len(flat), bool), []
     for e in (-1, 1):
         mine = np.flatnonzero((end == e) & usable)
         left_out = np.unique(order[(end == e) & ~usable])  # makes no gap

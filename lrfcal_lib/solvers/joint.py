@@ -19,6 +19,7 @@ from lrfcal_lib.solvers.joint_blocks import (
     move_state,
     named_blocks,
 )
+from lrfcal_lib.solvers.joint_lens import lens_covariance
 from lrfcal_lib.solvers.joint_noise import (
     CONTRADICTION,
     LARGEST_SHARE,
@@ -78,6 +79,8 @@ class JointSolution:
         Placements (and cameras) left out, with the reason.
     unobservable : tuple of str
         Motions that the data do not determine, in words.
+    lens : ndarray, shape (c, c)
+        The part of the covariances that comes from the intrinsics, which all placements share.
     warnings : tuple of str
         What is suspicious: no convergence, noise that contradicts what is stated, a weak axis, errors of the pitch that
         the data ask for.
@@ -98,6 +101,7 @@ class JointSolution:
     misfit: dict
     excluded: dict
     unobservable: tuple
+    lens: np.ndarray
     warnings: tuple
     solution: Solution
     state: JointState
@@ -494,6 +498,9 @@ _WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
 
 def _wrap(obs, data, unknowns, found, excluded):
     state, blocks = found.state, named_blocks(found.state, data, unknowns)
+    lens = lens_covariance(obs, found, data, unknowns)
+    spread = None if found.covariance_placements is None else found.covariance_placements + lens
+    found = replace(found, covariance=found.covariance + lens, covariance_placements=spread)
     T_head_lrf = pose_transform(state.head)
     return JointSolution(
         T_head_lrf,
@@ -504,7 +511,7 @@ def _wrap(obs, data, unknowns, found, excluded):
         dict(zip(obs.edges, state.size.tolist(), strict=True)),
         noise_levels(data),
         dict(zip(obs.placements.tolist(), misfits(blocks, data).tolist(), strict=True)),
-        excluded, found.unobservable, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
+        excluded, found.unobservable, lens, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
         unknowns, data,
     )  # fmt: skip
 

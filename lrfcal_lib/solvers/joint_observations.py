@@ -57,6 +57,10 @@ class JointObservations:
         Names, and 'head' or 'platform'.
     T_head_lrf : RigidTransform or None
         Stated platform: one of the start values, and the rotation about the axis and shift along it that no data show.
+    view_lens : ndarray, shape (v, 6, 9), optional
+        Derivative of the view's pose by the intrinsics; see :mod:`lrfcal_lib.solvers.joint_lens`. Zeros by default.
+    lens_covariance : ndarray, shape (c, 9, 9), optional
+        Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
 
     placements: np.ndarray
@@ -84,8 +88,14 @@ class JointObservations:
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
+    view_lens: np.ndarray | None = None
+    lens_covariance: np.ndarray | None = None
 
     def __post_init__(self):
+        if self.view_lens is None:
+            object.__setattr__(self, "view_lens", np.zeros((len(self.view_camera), 6, 9)))
+        if self.lens_covariance is None:
+            object.__setattr__(self, "lens_covariance", np.zeros((len(self.cameras), 9, 9)))
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
@@ -140,4 +150,5 @@ class JointObservations:
         out = self.keep(view=np.isin(self.view_camera, kept))
         camera = np.searchsorted(kept, out.view_camera) if kept else out.view_camera
         chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
+        chosen["lens_covariance"] = self.lens_covariance[kept]
         return replace(out, view_camera=camera, **chosen)

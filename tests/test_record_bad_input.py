@@ -1,0 +1,161 @@
+"""`python -m lrfcal_lib record` in a process of its own, against emulated devices: what goes wrong ends with one line
+that says what to do, an exit code, a head that stands still and a session that can be gone on with.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lrfcal_lib.drivers.emulators import EmulatedRig
+from lrfcal_lib.drivers.emulators.practice import practice_setup
+from lrfcal_lib.session import model_to_json, open_session, validate
+
+DEADLINE = 120.0  # s, against hanging
+FORBIDDEN = """
+import errno, sys, serial
+class Forbidden(serial.Serial):
+    def open(self):
+        raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
+serial.Serial = Forbidden
+from lrfcal_lib.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A quick rig with one placement of five stops and one image of 64 x 48 pixels."""
+    setup, placements = practice_setup()
+    low = float(np.mean(placements[0].sweep))
+    first = replace(placements[0], sweep=(low, low + np.radians(4.0)), image_pitch=(low,))
+    setup = replace(setup, rig=replace(setup.rig, cameras=setup.rig.cameras[:1]))
+    head = {"baudrate": 38400, "go_speed": 60.0}
+    with EmulatedRig(setup, placements=[first], image_width=64, platform={"settle": 0.0}, head_options=head,
+                     rest_s=0.1) as rig:  # fmt: skip
+        yield rig
+
+
+@pytest.fixture
+def stated(rig):
+    """Its rig file, to be spoilt."""
+    data = rig.rig_file()
+    data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.02, "gap_s": 0.005}
+    data["rig"]["cameras"]["left"]["intrinsics"] = model_to_json(rig.setup.rig.cameras[0].model)
+    return data
+
+
+class Program:
+    """`record`, running."""
+
+    def __init__(self, folder, data, *options, code=None):
+        (folder / "rig.json").write_text(json.dumps(data))
+        start = ["-m", "lrfcal_lib"] if code is None else ["-c", code]
+        call = [sys.executable, *start, "record", str(folder / "rig.json"), str(folder / "s"), *options]
+        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        env = os.environ | {"PYTHONUNBUFFERED": "1"}
+        self.run = subprocess.Popen(call, text=True, env=env, **pipes)
+
+    def end(self):
+        """Exit code, what it said, and what it complained about."""
+        try:
+            out, err = self.run.communicate(timeout=DEADLINE)
+        finally:
+            self.run.kill()
+        return self.run.returncode, out, err.strip()
+
+
+def stands_still(rig):
+    """Whether the head rests: it may still react to a last stop."""
+    time.sleep(0.2)
+    return not rig.world.head.tilt.moving(rig.clock.now())
+
+
+def swapped(data, rig):
+    data["devices"]["lrf"]["port"], data["devices"]["head"]["port"] = rig.head_port, rig.lrf_port
+
+
+def shared(data, rig):
+    data["devices"]["lrf"]["port"] = rig.head_port
+
+
+def missing(data, rig):
+    data["devices"]["lrf"]["port"] = "/dev/no_such_port"
+
+
+def too_far(data, rig):
+    data["devices"]["head"]["pitch_limits_deg"] = [-1.0, 1.0]
+
+
+def no_camera(data, rig):
+    data["devices"]["cameras"]["left"]["source"] = "http://127.0.0.1:9/left.mjpg"
+
+
+def no_socket(data, rig):
+    data["devices"]["control"] = "/tmp/no_such_socket"
+
+
+SPOILT = {
+    missing: "error: lrf: there is no port /dev/no_such_port: check cable and power",
+    swapped: "check power",
+    shared: "devices.lrf.port and devices.head.port are both",
+    too_far: "pitch_limits_deg are -1 to 1: ask for less",
+    no_camera: "error: camera 'left': http://127.0.0.1:9/left.mjpg gives no video: open http",
+    no_socket: "is 'python -m lrfcal_lib emulate' still running?",
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT, ids=lambda spoil: spoil.__name__)
+def test_what_is_wrong_with_a_rig_file_is_one_line(tmp_path, rig, stated, spoil):
+    spoil(stated, rig)
+    code, _, err = Program(tmp_path, stated).end()
+    assert code == 2 and SPOILT[spoil] in err.splitlines()[-1] and "Traceback" not in err
+    assert stands_still(rig)
+
+
+def test_no_permission(tmp_path, stated):
+    code, _, err = Program(tmp_path, stated, code=FORBIDDEN).end()
+    assert code == 2 and "no permission" in err and "sudo usermod -aG dialout $USER" in err and "\n" not in err
+
+
+def test_a_camera_without_exposure_control_is_used_as_it_is(tmp_path, rig, stated):
+    stated["devices"]["cameras"]["left"] |= {"exposure": 0.005, "fps": 10}
+    code, out, err = Program(tmp_path, stated).end()
+    assert code == 0 and err.splitlines() == [
+        "camera left: exposure cannot be set, asked 0.005",
+        "camera left: fps cannot be set, asked 10",
+    ]
+    assert "placements 1 are safe" in out
+    session = open_session(tmp_path / "s")
+    assert len(session.sweep(1).pitch) == 5 and len(list(session.images(placement=1))) == 1
+
+
+def test_a_head_at_its_end_stop_ends_the_recording(tmp_path, rig, stated, monkeypatch):
+    first, last, _ = stated["plan"]["placements"][0]["pitch_deg"]
+    monkeypatch.setattr(rig.world.head.tilt, "limits", (-1.0, np.radians((first + last) / 2)))
+    code, _, err = Program(tmp_path, stated).end()
+    assert code == 2 and "no placement was finished; --resume goes on from there" in err and "Traceback" not in err
+    assert "end stop" in err or "limit" in err
+    assert stands_still(rig)
+
+
+@pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0, 3.0])
+def test_ctrl_c_at_any_time(tmp_path, rig, stated, after_s):
+    """From the first moment on: while modules are imported, devices are opened, the head moves."""
+    program = Program(tmp_path, stated)
+    time.sleep(after_s)
+    program.run.send_signal(signal.SIGINT)
+    code, out, err = program.end()
+    done = "are safe; 'python" in out
+    assert code in ((0, 130) if done else (130,)) or after_s < 0.5 and code == -signal.SIGINT
+    assert stands_still(rig)
+    if (tmp_path / "s" / "session.json").exists():
+        code, out, err = Program(tmp_path, stated, "--resume").end()
+        assert code == 0, err
+        assert validate(tmp_path / "s") == [] and open_session(tmp_path / "s").placements == (1,)
