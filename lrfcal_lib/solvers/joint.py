@@ -250,7 +250,7 @@ def solve_joint(
         excluded = excluded | bad
     data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), side_sigma=side_sigma, prior=prior)
     state = _converge(start, data, coarse(unknowns), max_iterations)
-    state = _converge(state, data, unknowns, max_iterations)
+    state = _converge(state, data, unknowns, max_iterations, LAST_STEP)
     data = replace(data, lapse=lapse)
     if noise == "estimate":
         state, data = settle(state, data, unknowns, max_iterations)
@@ -258,8 +258,9 @@ def solve_joint(
         excluded = excluded | bad
         if bad:
             state, data = settle(state, data, unknowns, max_iterations)
-    state = in_stated_gauge(_converge(state, data, unknowns, max_iterations, LAST_STEP), obs)
-    found = _solve(obs, data, state, unknowns, required, max_iterations)
+    if noise == "estimate" or lapse:
+        state = _converge(state, data, unknowns, max_iterations, LAST_STEP)
+    found = _solve(obs, data, in_stated_gauge(state, obs), unknowns, required, max_iterations)
     return _wrap(obs, data, unknowns, found, excluded)
 
 

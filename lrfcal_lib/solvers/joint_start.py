@@ -16,7 +16,7 @@ START_SOFTNESS = 0.2  # spot radii
 LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
 SAME_PITCH = np.radians(0.6)  # scan lines so near the pitch of an image are used with it
 POINTS = 30  # a plane
-VIEWS = 20  # a camera; closed forms do not get much better with more
+VIEWS = 24  # a camera; closed forms do not get much better with more
 FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
