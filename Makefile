@@ -24,6 +24,7 @@ setup:
 report: setup
 	@$(RUN) -m lrfcal_lib.report $(if $(SESSION),"$(SESSION)")
 
+test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m pytest -n 4 --dist loadfile

@@ -19,7 +19,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"]  # CI runs as root, in a container
 # dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
 QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
-START_S, ACTION_S, CALIBRATION_S = 60, 60, 120  # guards against hanging
+START_S, ACTION_S = 90, 120  # guards against hanging
 PLACEMENTS = 3
 
 
@@ -66,7 +66,7 @@ def lab(tmp_path):
     environment = os.environ | {f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower()) for kind in ("CONFIG", "RUNTIME")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
-    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", QUIET, "--LabApp.news_url="]
+    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", QUIET]
     with (tmp_path / "log").open("w") as log:
         server = subprocess.Popen(command, env=environment, cwd=work, stdout=log, stderr=log)
         try:
@@ -112,6 +112,18 @@ def page(lab):
         browser.close()
 
 
+def run_all(page):
+    """Run all cells; the page takes the order before its kernel is there, and forgets it, so it is given again."""
+    page.wait_for_selector(".jp-StatusBar-Widget :text('| Idle')")
+    end = time.monotonic() + START_S
+    while not page.locator(".jp-InputPrompt:text-matches('[*]|1')").count():
+        assert time.monotonic() < end, "the kernel does not take the cells"
+        page.click(".lm-MenuBar-itemLabel:text-is('Run')")
+        page.click(".lm-Menu-itemLabel:text-is('Run All Cells')")
+        page.wait_for_timeout(1000)
+    page.wait_for_selector(".lrfcal-panel")
+
+
 def pixels(page, name):
     """Size of a picture as the browser decoded it; (0, 0) for none."""
     return page.eval_on_selector(f"img.lrfcal-picture-{name}", "i => [i.naturalWidth, i.naturalHeight]")
@@ -119,7 +131,8 @@ def pixels(page, name):
 
 def changed(page, name, before):
     """Wait until a picture is another one; returns its address."""
-    page.wait_for_function("([n, b]) => document.querySelector(`img.lrfcal-picture-${n}`).src !== b", arg=[name, before])
+    differs = "([name, before]) => document.querySelector(`img.lrfcal-picture-${name}`).src !== before"
+    page.wait_for_function(differs, arg=[name, before])
     return address(page, name)
 
 
@@ -131,41 +144,46 @@ def press(page, name):
     page.click(f"button.lrfcal-{name}:enabled")
 
 
-def wait_ready(page, seconds=ACTION_S):
-    page.wait_for_selector(".lrfcal-state:has-text('ready')", timeout=1000 * seconds)
-    assert page.locator(".lrfcal-error").count() == 0, page.inner_text(".lrfcal-error")
+def wait_for_text(page, text):
+    """Wait until the panel says something, or that something failed."""
+    page.wait_for_selector(f".lrfcal-panel :text('{text}'), .lrfcal-error:has-text('failed')")
+    failed = page.locator(".lrfcal-error:has-text('failed')")
+    assert failed.count() == 0, failed.first.inner_text()
 
 
 def test_buttons_record_and_calibrate(page):
-    page.wait_for_selector(".jp-Notebook .jp-CodeCell")
-    page.click(".lm-MenuBar-itemLabel:text-is('Run')")
-    page.click(".lm-Menu-itemLabel:text-is('Run All Cells')")
-    page.wait_for_selector(".lrfcal-panel")
+    run_all(page)
+    page.fill(".lrfcal-session input", "recordings/monday")
     press(page, "connect")
-    page.wait_for_selector("img.lrfcal-picture-scan")
-    wait_ready(page)
+    wait_for_text(page, "Placement 1 of")
     empty = address(page, "sweep")
     changed(page, "scan", "")
     for name in ("left", "right"):
-        page.wait_for_function(
-            "n => document.querySelector(`img.lrfcal-picture-${n}`).naturalWidth > 100", arg=name
-        )
+        page.wait_for_function("n => document.querySelector(`img.lrfcal-picture-${n}`).naturalWidth > 100", arg=name)
     assert pixels(page, "scan")[0] > 100
     for number in range(1, PLACEMENTS + 1):
-        page.wait_for_selector(f".lrfcal-panel :text('Placement {number} of')")
         press(page, "capture")
-        page.wait_for_selector(f".lrfcal-panel :text('Quality of placement {number}')")
-        wait_ready(page)
+        wait_for_text(page, f"Quality of placement {number}")
+        wait_for_text(page, f"Placement {number + 1} of")
         assert page.locator(".light:has-text('camera left')").count() == 1
         assert "board on" in page.inner_text(".light:has-text('scan')")
     assert changed(page, "sweep", empty) != empty
     press(page, "calibrate")
-    page.wait_for_selector(".lrfcal-result", timeout=1000 * CALIBRATION_S)
+    wait_for_text(page, "rotation vector")
     said = page.inner_text(".lrfcal-result")
-    assert "rotation vector" in said and "right" in said and "calibration.json" in said, said
-    assert "Expected error at 2 m" in said
+    assert "rotation vector" in said and "right" in said and "recordings/monday_calibration" in said, said
     if os.environ.get("LRFCAL_SCREENSHOT"):
+        page.add_style_tag(content=".Toastify {display: none}")
         page.locator(".lrfcal-panel").screenshot(path=os.environ["LRFCAL_SCREENSHOT"])
     press(page, "close")
     page.wait_for_selector(".lrfcal-state:has-text('not connected')")
 
+
+def test_without_a_browser_only_ci_fails(monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "CHROMIUM", None)
+    monkeypatch.delenv("CI", raising=False)
+    with pytest.raises(pytest.skip.Exception, match="sudo apt-get install -y chromium"):
+        require_browser()
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match="there is no Chromium"):
+        require_browser()

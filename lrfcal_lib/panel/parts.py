@@ -76,7 +76,8 @@ class Parts:
         self.calibrate = button("Save & calibrate", "calibrate", "calibrate what is recorded so far", "info", "check")
         self.result = w.HTML(words.soft("three placements and more; the recording can go on afterwards"))
         self.pictures, self.views = {}, row()
-        for name, made in (("state", self.state), ("doing", self.doing), ("message", self.error)):
+        named = {"state": self.state, "rig": self.rig, "session": self.session}
+        for name, made in named.items():
             made.add_class(f"lrfcal-{name}")
         self.root = self._laid_out()
 

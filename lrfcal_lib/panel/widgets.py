@@ -229,7 +229,7 @@ class Panel:
         if self._sweep is not None:
             rows = dict(view.rows)
             picture = png(self._sweep.draw(rows, view.bearings))
-            pictures["sweep"].show(picture, f"{len(rows)} scan lines; near is bright")
+            pictures["sweep"].show(picture, f"{len(rows)} scan lines; near is bright, white is no range")
         for name, frame in dict(view.frames).items():
             size = "{1} x {0} pixels".format(*frame.image.shape)
             pictures[name].show(jpeg(frame.image, PICTURE[0]), size)

@@ -67,10 +67,15 @@ def notes(lines):
 def lights(heading, found):
     """Lights of a placement, or a remark where there are none yet."""
     rows = "".join(
-        f'<div class="light">{mark(*LIGHTS[one.state])}<span><b>{escape(one.name)}</b> {escape(one.text)}</span></div>'
+        f'<div class="light">{_light(one)}<span><b>{escape(one.name)}</b> {escape(one.text)}</span></div>'
         for one in found
     )
     return title(heading) + (rows or soft("they are checked as soon as a placement is recorded"))
+
+
+def _light(one):
+    """What should be added next is no fault of what was recorded."""
+    return mark(IDLE, "→", "next") if (one.name, one.state) == ("information", "warn") else mark(*LIGHTS[one.state])
 
 
 def task(found, emulated, finished):
@@ -78,9 +83,10 @@ def task(found, emulated, finished):
     done = f"recorded: {', '.join(map(str, finished))}" if finished else "nothing is recorded yet"
     if found is None:
         return title("The plan is done") + f"<p>Calibrate, or close.</p>{soft(done)}"
-    who = "The emulated board moves by itself: " if emulated and found.placement else ""
-    guidance = who + (found.guidance if who else found.guidance[:1].upper() + found.guidance[1:])
-    return f"{title(found.title)}<p>{escape(guidance)}.</p>{soft(done)}"
+    what = escape(found.guidance[:1].upper() + found.guidance[1:])
+    if emulated:
+        what = f"The emulated board moves by itself. {soft('A real one:')} {what}"
+    return f"{title(found.title)}<p>{what}.</p>{soft(done)}"
 
 
 def pitch(view):

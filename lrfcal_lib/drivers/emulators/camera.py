@@ -7,6 +7,7 @@ while it does none is sent, and one that was begun before a move is not sent aft
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import threading
@@ -26,6 +27,7 @@ import numpy as np
 from lrfcal_lib.simulate.record import world_of
 from lrfcal_lib.simulate.render import Imager
 
+LOG = logging.getLogger(__name__)
 BOUNDARY = "frame"
 LOOK_S = 0.05
 CACHED = 64  # images
@@ -113,6 +115,8 @@ class CameraServer:
     Attributes
     ----------
     urls : dict of str to str
+    error : Exception or None
+        What ended the drawing process; there are no more images.
     """
 
     def __init__(self, world, setup=None, *, quality=97, fps=8.0, seed=0, rest_s=0.5):
@@ -120,7 +124,7 @@ class CameraServer:
         setup = setup or world.setup
         self.names = [c.name for c in setup.rig.cameras]
         self._done, self._begun, self._lock = OrderedDict(), {}, threading.Lock()
-        self._quit = threading.Event()
+        self._quit, self._serving, self.error = threading.Event(), None, None
         spawn = get_context("spawn")
         self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=(setup,))
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
@@ -130,14 +134,16 @@ class CameraServer:
 
     def start(self):
         """Serve, and draw the first images ahead."""
-        threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True).start()
+        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        self._serving.start()
         for name in self.names:
             self._ask(name, self._key(name))
 
     def close(self):
         """End the server and the drawing process."""
         self._quit.set()
-        self._server.shutdown()
+        if self._serving is not None:
+            self._server.shutdown()
         self._server.server_close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
@@ -156,7 +162,7 @@ class CameraServer:
             What it shows, and a JPEG file; (None, None) where there is none in time.
         """
         end = time.monotonic() + timeout
-        while not self._quit.is_set():
+        while not self._quit.is_set() and self.error is None:
             key = self._key(name)
             data = self._drawn(key) if key else None
             if data is not None and self._key(name) == key:
@@ -182,7 +188,7 @@ class CameraServer:
             future = self._begun.get(key)
             if future is not None and future.done():
                 del self._begun[key]
-                with contextlib.suppress(CancelledError, BrokenProcessPool):
+                with contextlib.suppress(CancelledError), self._mourning():
                     self._done[key] = future.result()
             while len(self._done) > CACHED:
                 self._done.popitem(last=False)
@@ -200,9 +206,23 @@ class CameraServer:
             for old in [k for k in self._begun if k[0] == name]:
                 self._begun.pop(old).cancel()
             seed = [self.seed, self.names.index(name), len(self._done), abs(hash(key[2])) % 2**31]
-            with contextlib.suppress(RuntimeError):  # shut down meanwhile
+            with self._mourning():
                 index = self.names.index(name)
                 self._begun[key] = self._pool.submit(_draw, index, place, key[2], seed, self.quality)
+
+    @contextlib.contextmanager
+    def _mourning(self):
+        """Say once that the drawing process died; a pool that was shut down is no news."""
+        try:
+            yield
+        except BrokenProcessPool as error:
+            if self.error is None and not self._quit.is_set():
+                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
+                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
+            self.error = error
+        except RuntimeError:
+            if not self._quit.is_set():
+                raise
 
 
 def _handler(cameras):
@@ -231,7 +251,7 @@ def _handler(cameras):
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
             self.send_header("Cache-Control", "no-cache")
             self.end_headers()
-            while not cameras._quit.is_set():
+            while not cameras._quit.is_set() and cameras.error is None:
                 _, data = cameras.image(name)
                 if data is None:
                     self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves

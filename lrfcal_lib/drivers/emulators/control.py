@@ -106,14 +106,16 @@ class ControlSocket:
         class Server(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
             daemon_threads, block_on_close = True, False
 
-        self._server = Server(str(self.path), Handler)
+        self._server, self._serving = Server(str(self.path), Handler), None
 
     def start(self):
         """Serve in a thread."""
-        threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True).start()
+        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        self._serving.start()
 
     def close(self):
         """Remove the socket."""
-        self._server.shutdown()
+        if self._serving is not None:
+            self._server.shutdown()
         self._server.server_close()
         self.path.unlink(missing_ok=True)

@@ -29,8 +29,10 @@ def practice_setup():
     setup : Setup
     placements : list of Placement
     """
-    setup = replace(sim_quick(), name=PRACTICE, rig=scaled(sim_quick().rig, SMALL), pairs=3, distances=(1.3, 1.7),
-                    step=np.radians(1.0), intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
+    rig = scaled(sim_quick().rig, SMALL)
+    rig = replace(rig, cameras=tuple(replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras))
+    setup = replace(sim_quick(), name=PRACTICE, rig=rig, pairs=3, distances=(1.3, 1.7), step=np.radians(1.0),
+                    intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN)
     return setup, [replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1])) for p in found]
 

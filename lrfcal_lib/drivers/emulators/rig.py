@@ -136,7 +136,7 @@ class EmulatedRig:
 
     def error(self):
         """What ended a device by itself, None while all live."""
-        return self.lrf.line.error or self.pan_tilt.line.error
+        return self.lrf.line.error or self.pan_tilt.line.error or (self._cameras and self._cameras.error)
 
     def status(self):
         """The devices now, as JSON."""

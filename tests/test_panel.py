@@ -1,0 +1,462 @@
+"""The data collection panel without a browser: its logic on a fake rig, its pictures, its words, its buttons."""
+
+import json
+import threading
+
+import cv2
+import numpy as np
+import pytest
+from fake_rig import SIZE, make_rig, opened, rig_data
+
+from lrfcal_lib.acquisition import Light, RecordingError
+from lrfcal_lib.drivers.emulators import practice
+from lrfcal_lib.drivers.errors import DeviceError, LineLost, OutOfRange, PortError
+from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.panel import Busy, Collector, Interrupted, Panel, collector, result, widgets, words
+from lrfcal_lib.panel.pictures import SweepPicture, TopView, jpeg, png, reach_of
+from lrfcal_lib.session import SessionError, open_session, validate
+
+WAIT_S = 20  # guards against hanging
+VIEW = np.radians([40.0, 140.0])
+
+
+def fake(monkeypatch, folder, **plan):
+    """A rig file in a folder and the fake rig that opens for it."""
+    data = rig_data(**plan)
+    path = folder / "rig.json"
+    path.write_text(json.dumps(data))
+    rig = make_rig(data)
+    rig.head.emergency_stop = rig.head.stop
+    rig.head.pitch = lambda: (rig.head.at, True)
+    monkeypatch.setattr(collector, "Rig", opened(rig))
+    return path, rig
+
+
+@pytest.fixture
+def connected(monkeypatch, tmp_path):
+    """A collector with a fake rig, without advice, which a fake rig cannot feed."""
+    path, _ = fake(monkeypatch, tmp_path)
+    with Collector(advice=False) as made:
+        made.connect(path, tmp_path / "s")
+        yield made
+
+
+def in_background(call):
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    return thread
+
+
+# -------------------------------------------------------------------------------------------------- recording
+
+
+def test_placements_are_recorded_one_by_one(connected, tmp_path):
+    shares = []
+    assert connected.task().title == "Placement 1 of 3" and connected.task().guidance.startswith("put the board")
+    lights = connected.capture(lambda share, text: shares.append(share))
+    assert connected.finished == (1,) and connected.task().title == "Placement 2 of 3"
+    assert [light.name for light in lights][0] == "scan" and connected.lights[1] == lights
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
+    assert sorted(np.degrees(list(connected.view.rows)).round()) == list(range(-4, 5))
+    assert connected.view.frames["left"].image.shape == (SIZE[1], SIZE[0], 3)
+    connected.close()
+    assert validate(tmp_path / "s") == [] and open_session(tmp_path / "s").placements == (1,)
+    assert "unfinished" not in json.loads((tmp_path / "s" / "session.json").read_text())
+
+
+def test_a_session_goes_on_and_may_be_longer_than_planned(monkeypatch, tmp_path):
+    for number in (1, 2, 3):
+        path, _ = fake(monkeypatch, tmp_path, count=2)
+        with Collector(advice=False) as made:
+            made.connect(path, tmp_path / "s")
+            assert made.finished == tuple(range(1, number))
+            made.capture()
+    assert open_session(tmp_path / "s").placements == (1, 2, 3)
+
+
+def test_a_list_of_placements_has_an_end(monkeypatch, tmp_path):
+    path, _ = fake(monkeypatch, tmp_path, placements=[{"number": 4, "board": False}])
+    with Collector() as made:
+        made.connect(path, tmp_path / "s")
+        assert made.task().guidance.startswith("take the board away")
+        made.capture()
+        assert made.task() is None
+        with pytest.raises(RecordingError, match="plan of this rig is done"):
+            made.capture()
+
+
+def test_views_held_close_come_first(monkeypatch, tmp_path):
+    path, _ = fake(monkeypatch, tmp_path, intrinsics_images=2)
+    with Collector() as made:
+        made.connect(path, tmp_path / "s")
+        assert made.task().close == ("left", 0) and "hold the board close" in made.task().guidance
+        (light,) = made.capture()  # noise shows no board: the view is still to be taken
+        assert light.state == "bad" and made.task().close == ("left", 0)
+
+
+def test_the_last_placement_can_be_recorded_again(connected):
+    connected.capture()
+    connected.capture()
+    assert connected.again() == 2 and connected.finished == (1,) and 2 not in connected.lights
+    assert connected.task().placement.number == 2
+    connected.capture()
+    assert connected.finished == (1, 2)
+
+
+def test_stop_ends_a_capture_and_nothing_of_it_counts(connected):
+    def stop_at_third(share, text):
+        if text.startswith("stop 3"):
+            threads.append(in_background(connected.stop))
+            connected._stopped.wait(WAIT_S)
+
+    threads, head = [], connected.rig.head
+    with pytest.raises(Interrupted, match="placement 1 does not count"):
+        connected.capture(stop_at_third)
+    threads[0].join(WAIT_S)
+    assert not threads[0].is_alive() and head.stops and connected.finished == ()
+    assert len(connected.view.rows) <= 3
+    connected.capture()
+    assert connected.finished == (1,)
+
+
+def test_one_thing_at_a_time(connected, monkeypatch):
+    monkeypatch.setattr(collector, "WAIT_S", 0.05)
+    begun, go_on = threading.Event(), threading.Event()
+    thread = in_background(lambda: connected.capture(lambda *_: (begun.set(), go_on.wait(WAIT_S))))
+    assert begun.wait(WAIT_S)
+    with pytest.raises(Busy, match="wait until it is done, or press stop"):
+        connected.move_to(0.1)
+    assert connected.look().ranges is None  # the devices are left alone
+    go_on.set()
+    thread.join(WAIT_S)
+    assert connected.finished == (1,)
+
+
+def test_closing_stops_the_head_whatever_happened(connected):
+    head = connected.rig.head
+    head.fail = LineLost("the line to the head is lost: check its plug")
+    with pytest.raises(LineLost, match="check its plug"):
+        connected.capture()
+    stops = head.stops
+    connected.close()
+    assert head.stops > stops and not connected.connected and connected.finished == ()
+    connected.close()
+
+
+def test_the_head_goes_where_it_is_sent(connected):
+    assert connected.move_to(0.05) == pytest.approx(0.05)
+    assert connected.look().pitch == pytest.approx(0.05) and connected.view.measured
+
+
+def test_advice_is_asked_from_the_third_placement_on(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(collector, "advise", lambda session: asked.append(len(session.placements)) or "put it there")
+    path, _ = fake(monkeypatch, tmp_path, count=9)
+    with Collector() as made:
+        made.connect(path, tmp_path / "s")
+        lights = [made.capture() for _ in range(4)]
+        assert made.task().guidance == "put it there"
+    assert asked == [3, 4]
+    assert [found[-1].name for found in lights] == ["camera left"] * 2 + ["information"] * 2
+
+
+# ----------------------------------------------------------------------------------------------- the live view
+
+
+def test_a_look_shows_scan_and_images(connected):
+    view = connected.look()
+    assert view.ranges.shape == view.bearings.shape and list(view.frames) == ["left"] and view.trouble == ""
+
+
+def test_a_lost_camera_is_said_and_comes_back(connected):
+    camera = connected.rig.cameras["left"]
+    connected.look()
+    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    assert "camera left is lost: its plug" in connected.look().trouble and "left" not in connected.view.frames
+    with pytest.raises(LineLost, match="its plug"):
+        connected.capture()
+    camera.newest = newest
+    assert connected.look().trouble == "" and "left" in connected.view.frames
+
+
+def test_a_lost_line_is_looked_for(connected):
+    connected.rig.lrf.lost = 1
+    connected.look()
+    assert connected.rig.lrf.reconnects == 1 and connected.view.trouble == ""
+    connected.rig.lrf.lost = 2
+    assert "line is lost" in connected.look().trouble
+
+
+# --------------------------------------------------------------------------------------------------- bad input
+
+
+def test_nothing_works_without_a_rig(tmp_path):
+    made = Collector()
+    for call in (made.capture, made.again, made.calibrate, lambda: made.move_to(0.0)):
+        with pytest.raises(DeviceError, match="press connect"):
+            call()
+    made.stop()
+    assert made.look().ranges is None and made.task() is None
+
+
+@pytest.mark.parametrize(
+    "rig, said",
+    [("practise", "emulated are practice, sim_quick, sim_lms221"), ("missing.json", "No such file.*emulate")],
+)
+def test_a_rig_that_is_not_there(rig, said, tmp_path):
+    with pytest.raises(RigFileError, match=said):
+        Collector().connect(rig, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_port_that_is_not_there(tmp_path):
+    data = rig_data(cameras=())
+    data["devices"]["head"]["port"] = str(tmp_path / "ttyUSB7")
+    (tmp_path / "rig.json").write_text(json.dumps(data))
+    made = Collector()
+    with pytest.raises(PortError, match="head: .*ttyUSB7"):
+        made.connect(tmp_path / "rig.json", tmp_path / "s")
+    assert not made.connected and not (tmp_path / "s").exists()
+
+
+def test_a_session_of_another_rig(connected, monkeypatch, tmp_path):
+    connected.capture()
+    connected.close()
+    path, _ = fake(monkeypatch, tmp_path)
+    data = json.loads(path.read_text())
+    data["board"]["corners_m"][1] = [0.5, 0]
+    path.write_text(json.dumps(data))
+    other = make_rig(data)
+    other.head.emergency_stop = other.head.stop
+    monkeypatch.setattr(collector, "Rig", opened(other))
+    with pytest.raises(SessionError, match="board.corners_m"):
+        connected.connect(path, tmp_path / "s")
+    assert not connected.connected
+
+
+def test_nothing_to_calibrate_or_to_repeat(connected):
+    with pytest.raises(RecordingError, match="at least three placements"):
+        connected.calibrate()
+    with pytest.raises(RecordingError, match="no placement to record again"):
+        connected.again()
+
+
+def test_data_without_a_board_give_no_calibration(connected):
+    connected.capture()
+    with pytest.raises(ValueError):
+        connected.calibrate()
+
+
+# ---------------------------------------------------------------------------------------------------- pictures
+
+
+def test_a_scan_from_above_is_drawn_where_it_is():
+    view, bearings = TopView(VIEW, (400, 300)), np.radians([60.0, 90.0, 120.0])
+    empty = view.draw(np.array([1.5, np.nan, np.nan]) * np.nan, bearings)
+    middle, right = (view.draw(np.where(np.arange(3) == i, 1.5, np.nan), bearings) for i in (1, 0))
+    painted = [np.argwhere((image != empty).any(axis=2)).mean(axis=0) for image in (middle, right)]
+    assert painted[0][1] == pytest.approx(199.5, abs=1.5) and painted[1][1] > 240  # bearing 60 deg is to the right
+    assert painted[0][0] < painted[1][0]  # straight ahead is up
+    far = view.draw(np.full(3, 7.0), bearings)
+    assert far.shape == (300, 400, 3) and (far != middle).any()
+
+
+@pytest.mark.parametrize("far, reach", [(0.5, 2.0), (3.5, 4.0), (81.0, 82.0), (300.0, 82.0)])
+def test_the_view_reaches_as_far_as_the_points(far, reach):
+    assert reach_of(np.column_stack([np.zeros(20), np.full(20, far)])) == reach
+    assert reach_of(np.zeros((0, 2))) == 2.0
+
+
+def test_a_sweep_grows_line_by_line():
+    picture = SweepPicture(VIEW, np.radians([-10.0, 10.0]), np.radians(1.0), (400, 300))
+    bearings = np.linspace(*VIEW, 101)
+    empty = picture.draw({}, bearings)
+    ranges = np.full(101, 4.0)
+    ranges[80:] = 1.0  # near at the large bearings, which are on the left
+    high = picture.draw({np.radians(9.0): ranges}, bearings)
+    rows, columns = np.nonzero((high != empty).any(axis=2))
+    assert rows.max() < 75 and columns.min() < 50 and columns.max() > 380
+    left, right = high[rows[0] + 2, 60].astype(int), high[rows[0] + 2, 350].astype(int)
+    assert left.sum() > right.sum() + 100  # near is bright
+    low = picture.draw({np.radians(-9.0): ranges}, bearings)
+    assert np.nonzero((low != empty).any(axis=2))[0].min() > 200
+    nothing = picture.draw({0.0: np.full(101, np.nan)}, bearings)
+    assert (np.ptp(nothing[(nothing != empty).any(axis=2)], axis=1) == 0).all()  # grey
+
+
+def test_images_become_files_no_wider_than_asked():
+    image = np.zeros((30, 40, 3), np.uint8)
+    for width, expected in ((20, (15, 20, 3)), (400, (30, 40, 3))):
+        assert cv2.imdecode(np.frombuffer(jpeg(image, width), np.uint8), 1).shape == expected
+    assert (cv2.imdecode(np.frombuffer(png(image + 7), np.uint8), 1) == 7).all()
+
+
+# ------------------------------------------------------------------------------------------------------- words
+
+
+def test_lights_say_their_state_in_signs_and_words():
+    found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
+    said = words.lights("Quality", found)
+    for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
+        assert sign in said
+    assert "→ next" in words.lights("", [Light("information", "warn", "put it there")])
+    assert "as soon as a placement is recorded" in words.lights("Quality", ())
+
+
+def test_errors_are_said_or_not():
+    assert words.error("failed", "") == ""
+    assert "check the plug" in words.error("connecting failed", "check the plug") and "✕" in words.error("a", "b")
+
+
+@pytest.mark.parametrize("answer, said", [("yes", "✓ can be trusted"), ("with care", "! use"), ("no", "✕ cannot be")])
+def test_a_result_says_whether_to_trust_it(answer, said):
+    sigma = np.full(3, 0.5)
+    poses = {"left": (np.array([90.0, 1.0, -2.0]), np.array([120.0, 30.0, -4.0]), sigma, sigma)}
+    sentences = ("Use this calibration with care: few placements.", "Record next: there.")
+    shown = words.result(result.Result(answer, sentences, "joint", poses, None, None))
+    for text in (said, "Few placements.", "Record next", "90.00 ± 0.50", "-4.0 ± 0.5", "left"):
+        assert text in shown
+    assert "<table" not in words.result(result.Result("no", sentences, "", {}, None, None))
+
+
+def test_advice_where_nothing_is_determined_yet(monkeypatch):
+    def refuse(prepared):
+        raise result.DegenerateGeometry("one placement only")
+
+    monkeypatch.setattr(result, "prepare", lambda session: session)
+    monkeypatch.setattr(result, "calibrate_jointly", refuse)
+    assert result.advise(None) == "not determined yet: one placement only"
+
+
+# ------------------------------------------------------------------------------------------------- the buttons
+
+
+@pytest.fixture
+def panel(monkeypatch, tmp_path):
+    path, _ = fake(monkeypatch, tmp_path)
+    with Panel(path, tmp_path / "s", advice=False) as made:
+        yield made
+
+
+def pressed(panel, name):
+    """Press a button and wait until its work is done."""
+    getattr(panel.parts, name).click()
+    panel._job.result(WAIT_S)
+    return panel.parts
+
+
+def wait_until(holds):
+    done = threading.Event()
+    for _ in range(int(WAIT_S / 0.05)):
+        if holds():
+            return
+        done.wait(0.05)
+    pytest.fail("it does not happen")
+
+
+def test_buttons_do_it_all(panel):
+    parts = panel.parts
+    assert parts.capture.disabled and parts.close.disabled and not parts.connect.disabled and not parts.stop.disabled
+    pressed(panel, "connect")
+    assert "ready" in parts.state.value and not parts.capture.disabled and parts.calibrate.disabled
+    wait_until(lambda: all(picture.image.value for picture in parts.pictures.values()))
+    assert set(parts.pictures) == {"scan", "sweep", "left"}
+    before = parts.pictures["sweep"].image.value
+    pressed(panel, "capture")
+    assert "scan" in parts.lights.value and "recorded: 1" in parts.task.value and not parts.calibrate.disabled
+    wait_until(lambda: parts.pictures["sweep"].image.value != before)
+    pressed(panel, "again")
+    assert "nothing is recorded yet" in parts.task.value
+    parts.slider.value = 3.0
+    pressed(panel, "go")
+    wait_until(lambda: "+3.00°" in parts.pitch.value)
+    pressed(panel, "close")
+    assert "not connected" in parts.state.value and parts.capture.disabled and parts.error.value == ""
+
+
+def test_errors_appear_in_the_panel(panel, tmp_path):
+    panel.parts.rig.value = str(tmp_path / "missing.json")
+    parts = pressed(panel, "connect")
+    assert "connecting failed" in parts.error.value and "missing.json" in parts.error.value
+    assert "not connected" in parts.state.value and not parts.connect.disabled
+    with pytest.raises(RigFileError):
+        panel.connect()
+    panel.parts.rig.value = str(tmp_path / "rig.json")
+    assert pressed(panel, "connect").error.value == ""
+    panel.collector.rig.head.fail = OutOfRange("pitch 80 deg is beyond the head's limits: ask for less")
+    assert "ask for less" in pressed(panel, "go").error.value
+    panel.collector.rig.head.fail = None
+    pressed(panel, "capture")
+    assert "calibrating failed" in pressed(panel, "calibrate").error.value and "ready" in parts.state.value
+
+
+def test_a_lost_camera_is_said_in_the_panel_until_it_is_back(panel):
+    panel.connect()
+    camera, parts = panel.collector.rig.cameras["left"], panel.parts
+    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    wait_until(lambda: "camera left is lost: its plug" in parts.error.value)
+    camera.newest = newest
+    wait_until(lambda: parts.error.value == "")
+
+
+def test_what_nobody_expects_is_said_too(panel, monkeypatch, caplog):
+    panel.connect()
+    monkeypatch.setattr(panel.collector, "move_to", lambda pitch: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        panel.go()
+    assert "ZeroDivisionError" in panel.parts.error.value and "failed while" in caplog.text
+
+
+def test_drivers_report_into_the_panel(panel):
+    panel.connect()
+    widgets.logging.getLogger("lrfcal_lib.drivers").warning("the head does not tell its tilt")
+    assert "does not tell its tilt" in panel.parts.notes.value
+    panel.close()
+    assert panel._notes not in widgets.logging.getLogger("lrfcal_lib").handlers
+
+
+def test_stop_ends_what_a_button_began(panel):
+    panel.connect()
+    begun = threading.Event()
+    note = panel.collector._note
+    panel.collector._note = lambda *event: (note(*event), begun.set(), panel.collector._stopped.wait(WAIT_S))
+    panel.parts.capture.click()
+    assert begun.wait(WAIT_S)
+    panel.parts.stop.click()
+    panel._job.result(WAIT_S)
+    assert "does not count" in panel.parts.error.value and panel.collector.finished == ()
+
+
+def test_shown_with_words_for_those_who_do_not_run_it(panel, monkeypatch):
+    import IPython.display
+
+    shown = []
+    monkeypatch.setattr(IPython.display, "display", lambda data, raw: shown.append(data))
+    panel.show()
+    assert shown[0]["text/plain"].startswith("The data collection panel")
+    assert shown[0]["application/vnd.jupyter.widget-view+json"]["model_id"] == panel.parts.root.model_id
+
+
+# ------------------------------------------------------------------------------------------- an emulated rig
+
+
+def test_an_emulated_rig_by_its_name(tmp_path):
+    """Connected, looked through, sent too far, and recorded with; the notebook calibrates one."""
+    with Panel("practice", tmp_path / "s") as panel:
+        panel.connect()
+        rig, parts = panel.collector.rig, panel.parts
+        assert panel.collector.emulated and set(parts.pictures) == {"scan", "sweep", "left", "right"}
+        assert (parts.slider.min, parts.slider.max) == pytest.approx((-60, 45))
+        with pytest.raises(OutOfRange, match="ask for less"):
+            panel.collector.move_to(np.radians(70))
+        lights = panel.capture()
+        assert {light.name: light.state for light in lights}["scan"] == "ok", lights
+        wait_until(lambda: parts.pictures["left"].image.value)
+        assert "The emulated board moves by itself" in parts.task.value
+    assert validate(tmp_path / "s") == [] and rig.stated.control is not None
+
+
+def test_the_emulated_rigs_are_those_that_there_are():
+    assert collector.PRACTICE_RIGS == practice.NAMES
+    with pytest.raises(ValueError, match="no set-up 'nowhere'"):
+        practice.emulated("nowhere")
