@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from concurrent.futures import Future
 from dataclasses import replace
 
 import cv2
@@ -150,8 +151,6 @@ def test_no_image_while_the_head_moves(rig):
 
 def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
     """The drawing process is replaced by one that ends when it is told."""
-    from concurrent.futures import Future
-
     world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
     server, asked = CameraServer(world), []
 
@@ -166,8 +165,38 @@ def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
     until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1, "the wish for a new one")
     asked[-1][1].set_result(b"new")
     assert server.image("left", timeout=DEADLINE)[1] == b"new"
-    server.start()
     server.close()
+
+
+def test_an_image_is_drawn_only_where_the_head_rests_long_enough(setup, placements):
+    world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
+    for rest_s, drawn in ((1e6, False), (0.0, True)):
+        server, asked = CameraServer(world, rest_s=rest_s), []
+        server._pool.submit = lambda *args, asked=asked: asked.append(args) or Future()
+        world.head.go(world.clock.now(), 0.01 if drawn else -0.01, 2.0)
+        until(lambda: world.head.settled(world.clock.now()), "rest")
+        assert server.image("left", timeout=0.3) == (None, None) and bool(asked) == drawn
+        server.close()
+
+
+def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
+    small = replace(setup, rig=scaled(setup.rig, 64))
+    with EmulatedRig(small, placements=placements) as rig:
+        until(lambda: rig._cameras.image("left")[0] is not None, "an image")
+        for process in rig._cameras._pool._processes.values():
+            process.kill()
+        rig.place(2)
+        until(lambda: rig._cameras.image("left") == (None, None) and rig.error() is not None, "the error")
+    assert "the process that draws the images ended" in caplog.text
+
+
+def test_what_was_not_started_can_be_closed(tmp_path):
+    EmulatedRig("sim_quick", folder=tmp_path / "rig").close()
+    assert list((tmp_path / "rig").iterdir()) == []
+
+
+def test_a_rig_file_lets_cameras_be_silent_while_the_head_moves(rig):
+    assert all(camera["silence_s"] >= 60 for camera in rig.rig_file()["devices"]["cameras"].values())
 
 
 def test_control_socket(rig):

@@ -356,6 +356,28 @@ def test_a_request_interrupts_a_stream_that_then_goes_on(lms):
     assert found[0][4] == 0xBA and [raw[4] for raw in found[1:]].count(0xB0) >= 3 and whole >= 4
 
 
+def test_a_stream_that_this_machine_is_too_slow_for_leaves_scans_out(lms, monkeypatch, caplog):
+    bench = lms(baudrate=38400)
+    device = bench.device
+    monkeypatch.setattr(device.clock, "now", lambda: bench.now)
+
+    def gaps(late):
+        """Turns between the scans of a second after the machine did nothing for a while."""
+        before = len(device.scans)
+        bench.now += late
+        bench.run(1.0)
+        return np.diff([record.turn for record in list(device.scans)[before - 1 :]])
+
+    bench.send(STREAM, wait=2.0)
+    usual = set(gaps(0.0))
+    assert len(usual) == 1 and set(gaps(0.9)) == usual and device.left_out == 0  # it may catch up
+    bench.run(3.0)
+    assert max(gaps(1.5)) * TURN > 1.2 and device.left_out == 1
+    assert "too slowly for time_scale 1: 1." in caplog.text
+    bench.run(3.0)
+    assert max(gaps(0.8)) > max(usual) and device.left_out == 2 and len(caplog.records) == 1
+
+
 def test_nothing_is_streamed_while_the_variant_changes(lms):
     bench = lms(baudrate=500000)
     bench.send(STREAM)

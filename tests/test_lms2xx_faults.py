@@ -2,7 +2,9 @@
 everything works again soon after the fault ended.
 """
 
+import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -14,7 +16,7 @@ from lrfcal_lib.drivers.lms2xx import crc16, decode_scan, encode_scan
 from lrfcal_lib.drivers.lms2xx_device import LMS2xx
 from lrfcal_lib.drivers.lms2xx_replies import Configuration
 
-DEVICES = 8
+DEVICES = 12
 SCALE = 2.0  # seconds of the devices in one of the host
 RECOVERY_S, HANG_S = 3.0, 30.0  # the second one is for machines that are busy with something else
 STAMP_S = 0.6  # of the devices: below the delay that the fault 'delay' makes
@@ -119,14 +121,14 @@ class Campaign:
     def accept(self, readings):
         self.readings += readings
 
-    def check(self):
+    def check(self, late_s):
         """Every scan accepted is one that the device made, at its time, and none came twice."""
         made = {record.telegram[4:-3]: record for record in self.device.scans}  # without address, status, checksum
         found = [made.get(reading.telegrams[0][4:-3]) for reading in self.readings]
         assert None not in found
         assert np.all(np.diff([record.number for record in found]) > 0)
         for reading, record in zip(self.readings, found, strict=True):
-            assert abs(reading.time_s - record.time_s * SCALE) < STAMP_S
+            assert abs(reading.time_s - record.time_s * SCALE) < STAMP_S + late_s * SCALE
             unit = {"cm": 0.01, "mm": 0.001}[decode_scan(record.telegram).unit]
             valid = reading.reasons == 0
             np.testing.assert_allclose(reading.ranges[valid], record.words[valid] * unit)
@@ -138,33 +140,52 @@ def share(kinds, times, rng):
     return [list(part) for part in np.array_split(rng.permutation(everything), DEVICES)]
 
 
+class Hiccups(threading.Thread):
+    """Longest time for which this machine let a thread wait that was due, s: a scan may come in so much later."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.longest, self.over = 0.0, threading.Event()
+
+    def run(self):
+        while not self.over.is_set():
+            begin = time.monotonic()
+            time.sleep(0.01)
+            self.longest = max(self.longest, time.monotonic() - begin - 0.01)
+
+
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("faults"), np.random.default_rng(5)
     parts = zip(share(STREAMED, 14, rng), share(KINDS, 10, rng), strict=True)
+    hiccups = Hiccups()
+    hiccups.start()
     with ThreadPoolExecutor(DEVICES) as pool:
         runs = [pool.submit(Campaign(folder, number).run, *part) for number, part in enumerate(parts)]
-        return [run.result() for run in runs]
+        found = [run.result() for run in runs]
+    hiccups.over.set()
+    return found, hiccups.longest
 
 
 def test_hundreds_of_faults_of_many_kinds_were_injected(campaigns):
-    counts = sum((one.device.faults.counts for one in campaigns), start=type(campaigns[0].device.faults.counts)())
+    counts = sum((one.device.faults.counts for one in campaigns[0]), start=Counter())
     assert sum(counts.values()) >= 500
     assert sum(count > 0 for count in counts.values()) >= 20
 
 
 def test_no_call_hangs(campaigns):
-    assert max(max(one.calls) for one in campaigns) < HANG_S
+    assert max(max(one.calls) for one in campaigns[0]) < HANG_S
 
 
 def test_no_wrong_scan_is_accepted(campaigns):
+    campaigns, hiccup_s = campaigns
     for one in campaigns:
-        one.check()
+        one.check(hiccup_s)
     assert sum(len(one.readings) for one in campaigns) > 400
 
 
 def test_everything_works_again_soon(campaigns):
-    seconds = [seconds for one in campaigns for _, seconds in one.recoveries]
+    seconds = [seconds for one in campaigns[0] for _, seconds in one.recoveries]
     assert np.percentile(seconds, 90) < RECOVERY_S  # all of them where the machine is not busy
 
 

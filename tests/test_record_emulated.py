@@ -14,6 +14,7 @@ from lrfcal_lib.drivers.emulators import camera as emulated_camera
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.evaluate import trusted_sigma
+from lrfcal_lib.joint_calibration import calibrate_jointly
 from lrfcal_lib.pairing import observe_all
 from lrfcal_lib.pipeline import calibrate_cameras, calibrate_platform, prepare
 from lrfcal_lib.session import model_to_json, open_session, validate
@@ -101,13 +102,18 @@ def test_the_recording_is_sound(recorded_session, setup):
         assert states["scan"] != "bad" and states["camera left"] == "ok", states
 
 
-def calibrated(session):
+@pytest.fixture(scope="module")
+def prepared(recorded_session, simulated_session):
+    """Of the recorded session, then of the simulated one."""
+    return [prepare(session) for session in (recorded_session, simulated_session)]
+
+
+def calibrated(prepared):
     """Preprocessing, platform, and the camera's pose by the method of the paper."""
-    prepared = prepare(session)
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
     solutions, problems = calibrate_cameras(observe_all(prepared, platform.T_head_lrf), [METHOD])
     assert problems == {}
-    return prepared, platform, solutions["left", METHOD]
+    return platform, solutions["left", METHOD]
 
 
 def nees(miss, covariance):
@@ -115,9 +121,8 @@ def nees(miss, covariance):
     return miss @ np.linalg.solve(covariance, miss)
 
 
-def test_the_recording_calibrates_as_the_simulated_session(recorded_session, simulated_session, setup):
-    found = [calibrated(session) for session in (recorded_session, simulated_session)]
-    prepared, platforms, (recorded, expected) = zip(*found, strict=True)
+def test_the_recording_calibrates_as_the_simulated_session(recorded_session, prepared, setup):
+    platforms, (recorded, expected) = zip(*[calibrated(one) for one in prepared], strict=True)
     miss = difference(recorded.transform, expected.transform)
     assert nees(miss, covariance_of(recorded) + covariance_of(expected)) < chi2.ppf(0.999, 6)
     miss = difference(recorded.transform, setup[0].rig.cameras[0].mounting)
@@ -130,3 +135,15 @@ def test_the_recording_calibrates_as_the_simulated_session(recorded_session, sim
         boards = [one.scans[placement] for one in prepared]
         assert boards[0].normal @ boards[1].normal > np.cos(np.radians(5.0))
         assert boards[0].distance == pytest.approx(boards[1].distance, abs=0.04)
+
+
+def test_the_joint_estimate_is_that_of_the_simulated_session(prepared, setup):
+    joints = [calibrate_jointly(one) for one in prepared]
+    recorded, expected = (one.solution.camera("left") for one in joints)
+    miss = difference(recorded.transform, expected.transform)
+    assert nees(miss, covariance_of(recorded) + covariance_of(expected)) < chi2.ppf(0.999, 6)
+    miss = difference(recorded.transform, setup[0].rig.cameras[0].mounting)
+    assert nees(miss, covariance_of(recorded)) < chi2.ppf(0.999, 6)
+    assert np.linalg.norm(miss[:3]) < np.radians(2) and np.linalg.norm(miss[3:]) < 0.06
+    (axis, covariance), (other, its) = (one.axis_parameters() for one in joints)
+    assert nees(axis - other, covariance + its) < chi2.ppf(0.999, 4)

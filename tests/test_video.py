@@ -156,6 +156,21 @@ def test_stream_that_is_silent_for_too_long(server):
         assert camera.newest(timeout=WAIT_S).image.shape == (48, 64, 3)
 
 
+def test_a_stream_that_ended_or_fell_silent_is_at_its_end_however_often_it_is_asked(server):
+    for end in (server.stop, lambda: setattr(server, "paused", True)):
+        stream = MjpegStream(server.url, 0.5)
+        assert stream.grab()
+        end()
+        while stream.grab():
+            pass
+        assert not stream.grab() and stream.get(cv2.CAP_PROP_FRAME_WIDTH) == 64
+        stream._image = None  # as of a stream whose first image never came
+        assert stream.get(cv2.CAP_PROP_FRAME_WIDTH) == stream.get(cv2.CAP_PROP_FRAME_HEIGHT) == 0
+        if not server.paused:
+            server.start()
+        stream.release()
+
+
 def test_closing_wakes_who_waits(server):
     camera = Camera.open(server.url, name="left")
     camera.newest(timeout=WAIT_S)

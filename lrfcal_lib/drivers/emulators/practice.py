@@ -37,16 +37,13 @@ def practice_setup():
     return setup, [replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1])) for p in found]
 
 
-def emulated(name, *, cameras=True, speed=None):
-    """An emulated rig that is not started yet, what `record` needs to know of it, and the host clock of its devices.
+def emulated(name):
+    """An emulated rig that is not started yet, what recording needs to know of it, and the host clock of its devices.
 
     Parameters
     ----------
     name : str
-        Of :data:`NAMES`.
-    cameras : bool
-    speed : float, optional
-        Times as fast as real devices; 1, and 2 for 'practice'.
+        Of :data:`NAMES`. 'practice' runs twice as fast as real devices, the others as slow.
 
     Returns
     -------
@@ -61,15 +58,13 @@ def emulated(name, *, cameras=True, speed=None):
     ValueError
         For another name.
     """
-    begun, speed = time.time(), speed or (FAST if name == PRACTICE else 1.0)
     if name != PRACTICE:
-        rig = EmulatedRig(name, cameras=cameras, time_scale=speed)
-        return rig, rig.rig_file, lambda: begun + speed * (time.time() - begun)
-    setup, placements = practice_setup()
-    head = {"baudrate": 38400, "go_speed": 60.0}
-    rig = EmulatedRig(setup, placements=placements, cameras=cameras, time_scale=speed, platform={"settle": 0.0},
-                      head_options=head)  # fmt: skip
-    return rig, lambda: _quick(rig), lambda: begun + speed * (time.time() - begun)
+        rig = EmulatedRig(name)
+        return rig, rig.rig_file, time.time
+    begun, (setup, placements) = time.time(), practice_setup()
+    rig = EmulatedRig(setup, placements=placements, time_scale=FAST, platform={"settle": 0.0},
+                      head_options={"baudrate": 38400, "go_speed": 60.0})  # fmt: skip
+    return rig, lambda: _quick(rig), lambda: begun + FAST * (time.time() - begun)
 
 
 def _quick(rig):
@@ -77,6 +72,5 @@ def _quick(rig):
     data = rig.rig_file()
     data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
     for camera in rig.setup.rig.cameras:
-        if camera.name in data["rig"]["cameras"]:
-            data["rig"]["cameras"][camera.name]["intrinsics"] = model_to_json(camera.model)
+        data["rig"]["cameras"][camera.name]["intrinsics"] = model_to_json(camera.model)
     return data

@@ -72,7 +72,8 @@ class EmulatedRig:
     """
 
     def __init__(self, setup="sim_quick", *, folder=None, seed=0, placements=None, time_scale=1.0, lrf_options=None,
-                 head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0, rest_s=0.5):  # fmt: skip
+                 head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0,
+                 rest_s=0.5):  # fmt: skip
         setup = _setup(setup)
         rig = replace(setup.rig, platform=replace(setup.rig.platform, **(platform or {})))
         setup, self.clock = replace(setup, rig=rig), Clock(time_scale)
