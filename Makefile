@@ -2,6 +2,8 @@
 SESSION ?=
 PYTHON ?= python3
 RUN := .venv/bin/python
+# Open3D brings dash, whose extension makes JupyterLab ask whether to rebuild itself
+NO_BUILD_QUESTION := --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
 SIMULATED := sim_lms221 sim_quick
 # one thread a process: two notebooks run side by side, and sums come out the same on every machine
 export OMP_NUM_THREADS ?= 1
@@ -33,7 +35,7 @@ notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")
 
 lab: setup
-	$(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab notebooks
+	$(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab $(NO_BUILD_QUESTION) notebooks
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py

@@ -122,8 +122,17 @@ def execute(path, environment, folder=None):
     try:
         client.execute(env={**os.environ, **environment})
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
-        return notebook, _plain(str(problem)) or type(problem).__name__
-    return notebook, ""
+        return _without_widgets(notebook), _plain(str(problem)) or type(problem).__name__
+    return _without_widgets(notebook), ""
+
+
+def _without_widgets(notebook):
+    """Leave out live widgets: without their kernel they show an error, and pages would load them from elsewhere."""
+    notebook.metadata.pop("widgets", None)
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+    return notebook
 
 
 def store(path, session_path):

@@ -15,20 +15,13 @@ from lrfcal_lib.drivers.errors import DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import RigFileError, checked, read_rig_file, rig_of
 from lrfcal_lib.panel.result import advise, calibrate_recording
+from lrfcal_lib.panel.tasks import next_task
 
 PRACTICE_RIGS = ("practice", "sim_quick", "sim_lms221")
 ADVICE_FROM = 3  # placements, below which every other one helps
 WAIT_S = 3.0  # for a look at the rig to end
 AGAIN_S = 0.1  # between stops, until whoever moves the head has noticed
 RECONNECT_S = 2.0
-GUIDE = (
-    "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
-    "about 1.2 m ahead, a little to the left, turned by a third of a turn, facing left by 30 degrees",
-    "about 2 m ahead, a little to the right, turned by another third of a turn, facing right by 30 degrees",
-    "about 2.5 m ahead, higher or lower than before, leaning back by 30 degrees",
-    "about 1 m ahead, turned by half a turn, leaning forward by 30 degrees",
-    "about 1.7 m ahead, at the edge of what all cameras see",
-)
 
 
 class Busy(RuntimeError):
@@ -37,26 +30,6 @@ class Busy(RuntimeError):
 
 class Interrupted(RuntimeError):
     """The user stopped what was under way."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is recorded next.
-
-    Attributes
-    ----------
-    title : str
-    guidance : str
-        Where to put the board.
-    placement : Placement or None
-    close : (str, int) or None
-        Camera and number of a view of the board held close, for its intrinsics.
-    """
-
-    title: str
-    guidance: str
-    placement: object = None
-    close: tuple | None = None
 
 
 @dataclass
@@ -279,32 +252,7 @@ class Collector:
         Task or None
             None where the plan is done.
         """
-        if self.recording is None:
-            return None
-        views = self.recording.close_views_to_do()
-        return self._close_task(*views[0]) if views else self._placement_task()
-
-    def _close_task(self, camera, view):
-        wanted = self.rig.stated.plan.intrinsics_images
-        title = f"Close view {view + 1} of {wanted}, camera '{camera}'"
-        guidance = "hold the board close, tilted otherwise than before, all of its pattern in the image"
-        return Task(title, guidance, close=(camera, view))
-
-    def _placement_task(self):
-        left, plan = self.recording.to_do(), self.rig.stated.plan
-        if not left and not plan.placements:  # nothing is listed: one more can always be had
-            left = [p for p in plan.to_do(max(self.finished) + 1) if p.number not in self.finished][:1]
-        if not left:
-            return None
-        of = max(len(self.recording.plan), left[0].number)
-        done = sum(p.number in self.finished for p in self.recording.plan)
-        return Task(f"Placement {done + 1} of {of}", self._where(left[0], done), left[0])
-
-    def _where(self, placement, done):
-        """Where to put the board, in words."""
-        if placement.purpose == "scene":
-            return "take the board away: this sweep shows the room"
-        return self._told or f"put the board {GUIDE[done % len(GUIDE)]}"
+        return None if self.recording is None else next_task(self.recording, self._told)
 
     def capture(self, progress=None):
         """Record the next task; the board is where it should be, or an emulated rig puts it there.
