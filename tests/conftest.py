@@ -30,3 +30,17 @@ def lms400_session(real_data, tmp_path_factory):
     target = tmp_path_factory.mktemp("sessions") / "lms400_zed"
     import_lasersetero(real_data / "lms400_zed", target)
     return target
+
+
+LONGEST = (
+    "test_notebooks_recording",
+    "test_notebooks",
+    "test_panel_browser",
+    "test_record_emulated",
+    "test_real_lms400",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first, so that test runners side by side finish together."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
