@@ -420,6 +420,16 @@ def test_old_and_repeated_scans_are_refused():
     assert ScanClock().place(-1, 3.0) == (3.0, 0)
 
 
+def test_an_old_scan_that_comes_first_after_a_change_has_its_own_instant():
+    clock, counts = ScanClock(), {"dropped": 0, "stale": 0}
+    streamed, requested = (Assembler((180, 0.5), INDEXED, 38400, False, counts, clock) for _ in range(2))
+    raws = [encode_scan(np.full(361, 2.0), indices=(turn, 0)) for turn in (54, 70)]
+    first = streamed.feed(raws[0], 50.0)
+    old = requested.feed(raws[1], 50.0 + 16 * TURN_S + 0.7)
+    assert old.time_s - first.time_s == pytest.approx(16 * TURN_S) and counts["dropped"] == 0
+    assert requested.feed(raws[0], 51.5) is None and counts["stale"] == 1
+
+
 def test_beams_have_their_own_instants():
     for variant, first_deg in (((180, 1.0), 0), ((180, 0.5), 0), ((100, 0.5), 40), ((100, 0.25), 40)):
         counts = {"dropped": 0, "stale": 0}

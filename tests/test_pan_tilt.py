@@ -273,8 +273,8 @@ def test_speed_nought_is_not_stop(make):
     device, head = opened(make, dataclasses.replace(FAST, tilt_speed=0, degrees_per_second=2.0), tells=False)
     head.move_to(0.5 * DEGREE)
     assert [frame.data2 for frame in device.frames if frame.command2 == pelco_d.UP] == [0]
-    assert device.frames[-1].command2 == 0
-    assert device.elevation() == pytest.approx(1.0, abs=0.6)  # 4 deg/s, twice what was stated
+    wait_until(lambda: device.frames[-1].command2 == 0)
+    assert 0.4 < device.elevation() < 3.0  # 1.0 at 4 deg/s, twice what was stated; more where the machine is busy
 
 
 # ------------------------------------------------------------------------------------------------- timed moves

@@ -1,6 +1,5 @@
 """The board in a sweep and its edges, against scans made by intersecting rays with planes."""
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -590,22 +589,21 @@ def test_another_variant_is_refused(function):
 @pytest.fixture(scope="module")
 def real(lms400_session):
     session = open_session(lms400_session)
-    begin = time.perf_counter()
     scans = {p: scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements}
     edges = {p: scan.edge_points(b) for p, b in scans.items()}
-    return scans, edges, time.perf_counter() - begin
+    return scans, edges
 
 
 def test_every_placement_of_the_recording_has_a_board(real):
-    scans, _, seconds = real
-    assert len(scans) == 20 and seconds < 15  # 3 s on an idle core
+    scans, _ = real
+    assert len(scans) == 20
     for placement, b in scans.items():
         assert b.mask.sum() > 0.97 * np.isfinite(b.sweep.ranges).sum()
         assert b.sigma_range < (0.011 if placement == 10 else 0.007)
 
 
 def test_the_recordings_sides_are_straight_and_long(real):
-    _, edges, _ = real
+    _, edges = real
     assert sum(len(e.sides) for e in edges.values()) >= 40
     for placement, e in edges.items():
         for side in e.sides:
@@ -618,7 +616,7 @@ def test_the_recordings_sides_are_straight_and_long(real):
 
 
 def test_the_recordings_opposite_sides_are_as_far_apart_as_the_board_is_wide(real):
-    scans, edges, _ = real
+    scans, edges = real
     widths = []
     for placement, e in edges.items():
         right, left = ([x for x in e.sides if x.end == end and x.angle > np.radians(40)] for end in (-1, 1))

@@ -131,11 +131,13 @@ class Assembler:
         Merge four partial scans of 180 deg into one of 721 values.
     counts : dict
         'dropped' (scans between two telegrams that were not sent or got lost) and 'stale' are counted up.
+    clock : ScanClock, optional
+        Of the scans before, where the mirror went on turning: an old telegram that comes first is then known as such.
     """
 
-    def __init__(self, variant, configuration, baudrate, interlaced, counts):
+    def __init__(self, variant, configuration, baudrate, interlaced, counts, clock=None):
         self.variant, self.configuration, self.baudrate, self.interlaced = variant, configuration, baudrate, interlaced
-        self.counts, self._clock, self._parts = counts, ScanClock(), []
+        self.counts, self._clock, self._parts, self._first = counts, clock or ScanClock(), [], True
 
     @property
     def turns(self):
@@ -184,7 +186,8 @@ class Assembler:
         if start_s is None:
             self.counts["stale"] += 1
             return None
-        self.counts["dropped"] += max(0, step // self.turns - 1)
+        self.counts["dropped"] += 0 if self._first else max(0, step // self.turns - 1)
+        self._first = False
         reading = self._reading(raw, scan, start_s)
         return self._merge(int(scan.partial[0]), reading) if self.interlaced else reading
 

@@ -27,7 +27,7 @@ from lrfcal_lib.drivers.lms2xx_replies import (
     parse_status,
     parse_type,
 )
-from lrfcal_lib.drivers.lms2xx_scans import VALUES, Assembler
+from lrfcal_lib.drivers.lms2xx_scans import VALUES, Assembler, ScanClock
 
 logger = logging.getLogger(__name__)
 INSTALLATION = b"\x00"  # data of MODE
@@ -44,7 +44,7 @@ class LMS2xxSetup:
         self.status = self.configuration = self.variant = None
         self._address, self._password, self._clock, self._log = address, bytes(password), clock, log
         self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), threading.Event()
-        self._link = self._assembler = self._settled = None
+        self._link = self._assembler = self._settled = self._scan_clock = None
 
     @classmethod
     def open(
@@ -125,7 +125,7 @@ class LMS2xxSetup:
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
         options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted}
-        self._link = Link(self.port, first, self._counts, **options)
+        self._link, self._scan_clock = Link(self.port, first, self._counts, **options), ScanClock()
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - time.monotonic())
         self._link.hush()
@@ -144,7 +144,8 @@ class LMS2xxSetup:
         if self.variant not in VALUES:
             raise WrongDevice(f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does")
         self._settled = (self.baudrate, self.variant, self.configuration)
-        self._assembler = Assembler(self.variant, self.configuration, self.baudrate, interlaced, self._counts)
+        told = self.variant, self.configuration, self.baudrate
+        self._assembler = Assembler(*told, interlaced, self._counts, self._scan_clock)
 
     def _opened(self):
         if self._link is None:
