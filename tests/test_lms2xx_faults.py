@@ -39,7 +39,7 @@ class Campaign:
 
     def run(self, streamed, requested):
         """All faults of this device: those of a stream, then those of requests."""
-        with self.device, LMS2xx.open(self.device.path, clock=lambda: time.time() * SCALE) as self.lms:
+        with self.device, LMS2xx.open(self.device.path, clock=self.now) as self.lms:
             self.lms.start()
             self.accept(self.lms.take(1, timeout=HANG_S))
             for kind in streamed:
@@ -54,6 +54,10 @@ class Campaign:
         return self
 
     # ------------------------------------------------------------------------------------------ causing a fault
+
+    def now(self):
+        """Clock of the driver; not time.time(), which may be set meanwhile."""
+        return float(self.device.clock.host(self.device.clock.now())) * SCALE
 
     def disturb(self, kind):
         """Inject a fault; in a stream wait until it happened and ended."""
@@ -79,7 +83,7 @@ class Campaign:
 
     def fresh(self):
         """A scan that was begun after this call."""
-        self.accept([self.lms.newest(after=time.time() * SCALE, timeout=HANG_S)])
+        self.accept([self.lms.newest(after=self.now(), timeout=HANG_S)])
 
     def request(self):
         self.accept([self.lms.request()])

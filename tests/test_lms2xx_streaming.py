@@ -20,7 +20,8 @@ def stream(folder, rate):
     """Everything that came through, the device's own record of the same time, and what the driver counted."""
     indexed = Configuration().changed(unit="mm", realtime_indices=True)
     device = EmulatedLms(path=folder / f"lrf{rate}", baudrate=rate, configuration=indexed)
-    with device, LMS2xx.open(device.path) as lms:
+    clock = device.clock  # of the host, which may be set meanwhile: not by time.time()
+    with device, LMS2xx.open(device.path, clock=lambda: float(clock.host(clock.now()))) as lms:
         before = lms.counts
         lms.start()
         readings = lms.take(1, timeout=30)

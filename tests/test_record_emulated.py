@@ -62,7 +62,7 @@ def simulated_session(setup, tmp_path_factory):
 @pytest.fixture(scope="module")
 def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
-    folder, begun = tmp_path_factory.mktemp("recorded"), time.time()
+    folder, begun = tmp_path_factory.mktemp("recorded"), time.monotonic()
     with EmulatedRig(
         setup[0], placements=setup[1], time_scale=QUICKLY, platform={"settle": 0.2}, rest_s=2.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
@@ -71,7 +71,7 @@ def recorded_session(setup, tmp_path_factory):
         data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
-        with Rig.open(stated, clock=lambda: begun + QUICKLY * (time.time() - begun)) as rig:
+        with Rig.open(stated, clock=lambda: begun + QUICKLY * (time.monotonic() - begun)) as rig:
             record(rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself")))
     return open_session(folder / "s")
 

@@ -4,6 +4,7 @@ import json
 import math
 import socket
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from fake_rig import SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, Configuration, parse_configuration
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
 
 # ------------------------------------------------------------------------------------------------------ rig file
@@ -353,6 +354,14 @@ def fake_openers(monkeypatch, **instead):
     for name, device in (("head", head), ("lrf", Lrf(head, clock)), ("camera", Camera("left", head, clock))):
         opener(name, device)
     return made
+
+
+def test_the_clock_of_a_rig_is_not_set_by_others(monkeypatch):
+    clock = host_clock()
+    before, wall = clock(), time.time()
+    assert before == pytest.approx(wall, abs=1.0)
+    monkeypatch.setattr(time, "time", lambda: wall + 1e6)
+    assert 0 <= clock() - before < 100
 
 
 def test_all_devices_are_closed_again(monkeypatch):

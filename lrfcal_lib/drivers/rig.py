@@ -26,6 +26,12 @@ GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
 
 
+def host_clock():
+    """A clock, time.time() at first, that nobody sets while it runs: a step would tear scans and pitch apart."""
+    zero = time.time() - time.monotonic()
+    return lambda: zero + time.monotonic()
+
+
 class Rig:
     """The devices of a rig file; a context manager that stops the head and closes all of them.
 
@@ -44,14 +50,15 @@ class Rig:
         self._closing = contextlib.ExitStack()
 
     @classmethod
-    def open(cls, stated, *, log=LOG, clock=time.time):
+    def open(cls, stated, *, log=LOG, clock=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
         Parameters
         ----------
         stated : RigFile
         log : logging.Logger
-        clock : callable
+        clock : callable, optional
+            :func:`host_clock` by default.
 
         Returns
         -------
@@ -62,6 +69,7 @@ class Rig:
         DeviceError
             With the device in the message; those opened before are closed again.
         """
+        clock = clock or host_clock()
         with contextlib.ExitStack() as stack:
             head = stack.enter_context(_named("head", _open_head, stated, log, clock))
             lrf = stack.enter_context(_named("lrf", _open_lrf, stated, log, clock))
