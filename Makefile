@@ -35,7 +35,8 @@ notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")
 
 lab: setup
-	$(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab $(NO_BUILD_QUESTION) notebooks
+	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \
+	LRFCAL_CACHE="$$folder" $(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab $(NO_BUILD_QUESTION) notebooks
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.cache import cached
 from lrfcal_lib.geometry import (
     DegenerateGeometry,
     TiltAxis,
@@ -33,6 +34,7 @@ RIGHT_ANGLE = 0.15  # largest |cosine| between two sides that are taken for the 
 PLATFORM_POINTS = 40  # per edge
 
 
+@cached
 def prepare(session):
     """Preprocess scans and images, and name the sides that scans cross.
 
@@ -314,6 +316,7 @@ class Calibration:
     joint: JointCalibration | None = None
 
 
+@cached
 def calibrate(session, methods=tuple(METHODS), joint=True):
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 

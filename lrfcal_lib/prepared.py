@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lrfcal_lib.board import Board
+from lrfcal_lib.cache import cached
 from lrfcal_lib.preprocess import image, scan
 from lrfcal_lib.preprocess.image import Outline
 from lrfcal_lib.session import Session, SessionError
@@ -78,6 +79,7 @@ class Prepared:
     problems: dict = field(default_factory=dict)
 
 
+@cached
 def prepare_scans(session):
     """The board in every sweep of a session, and its edge points in both variants.
 

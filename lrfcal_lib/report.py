@@ -18,7 +18,9 @@ from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from lrfcal_lib.cache import VARIABLE as CACHE
 from lrfcal_lib.notebook import ROOT, SCRATCH, SHIPPED
 from lrfcal_lib.session import SessionError, open_session
 
@@ -87,7 +89,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     out = Path(out or ROOT / "reports" / session_path.name).resolve()
     _clear(out)
     paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb") if notebooks is None else map(Path, notebooks))
-    runs = _execute_all(paths, session_path, out, jobs)
+    with TemporaryDirectory(prefix="lrfcal-") as cache:  # a fresh one: a report stands for what it was made from
+        environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(out), CACHE: cache}
+        runs = _execute_all(paths, environment, out, jobs)
     found = _collect(out, [run.name for run in runs])
     _write_index(out, session, runs, found, time.monotonic() - begin)
     return runs
@@ -135,7 +139,7 @@ def _without_widgets(notebook):
     return notebook
 
 
-def store(path, session_path):
+def store(path, session_path, cache=""):
     """Execute a notebook and store it in place as run from top to bottom.
 
     Parameters
@@ -143,6 +147,8 @@ def store(path, session_path):
     path : Path
     session_path : Path or None
         What the notebook works on if it asks for a session.
+    cache : str
+        Folder of stages that other notebooks have worked out (see :mod:`lrfcal_lib.cache`).
 
     Returns
     -------
@@ -156,7 +162,8 @@ def store(path, session_path):
     """
     import nbformat
 
-    notebook, error = execute(path, {} if session_path is None else {"LRFCAL_SESSION": str(session_path)})
+    environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
+    notebook, error = execute(path, environment | {CACHE: cache})
     if error:
         return error
     if _asks_for_session(notebook) and not open_session(session_path).simulated:
@@ -226,7 +233,9 @@ def _report(session, options):
 
 def _store_all(session):
     open_session(session)
-    errors = {path.name: store(path, session.resolve()) for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
+    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
+    with TemporaryDirectory(prefix="lrfcal-") as cache:
+        errors = {path.name: store(path, session.resolve(), cache) for path in paths}
     for name, error in errors.items():
         print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
     return 1 if any(errors.values()) else 0
@@ -248,13 +257,13 @@ def _clear(out):
         (out / name).mkdir()
 
 
-def _execute_all(paths, session_path, out, jobs):
+def _execute_all(paths, environment, out, jobs):
     """Execute and convert notebooks side by side; the bar shows on a terminal only."""
     from tqdm import tqdm
 
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
-        futures = {pool.submit(_run, path, session_path, out, jobs): path for path in reversed(paths)}
+        futures = {pool.submit(_run, path, environment, out, jobs): path for path in reversed(paths)}
         with tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
             for future in as_completed(futures):
                 bar.set_postfix_str(futures[future].stem)
@@ -262,10 +271,10 @@ def _execute_all(paths, session_path, out, jobs):
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _run(path, session_path, out, jobs):
+def _run(path, environment, out, jobs):
     """Execute one notebook and write its HTML."""
     begin = time.monotonic()
-    environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(out), "LRFCAL_NOTEBOOK": path.stem}
+    environment = environment | {"LRFCAL_NOTEBOOK": path.stem}
     if jobs > 1:  # side by side, more threads only get in each other's way
         environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     notebook, error = execute(path, environment)

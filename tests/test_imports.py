@@ -10,7 +10,7 @@ import pytest
 LIBRARY = Path(__file__).resolve().parents[1] / "lrfcal_lib"
 # a module may import from its own rank and below
 RANKS = [
-    {"geometry", "board", "features", "codecs"},
+    {"geometry", "board", "features", "codecs", "cache"},
     {"camera"},
     {"session"},
     {"preprocess", "importers"},
