@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import binom
 
 from lrfcal_lib.board import Board, Chessboard
 from lrfcal_lib.camera import CameraModel, project
@@ -99,6 +100,24 @@ def test_sigma_is_the_scatter_of_a_clear_bend():
 def test_a_small_bend_is_measured_but_does_not_count():
     found = bend_of(a_face(np.random.default_rng(3), bend=(0.0, 0.0, 0.02)))
     assert found.p_value < 1e-3 and not found.bends
+
+
+def a_triangle(rng, lines=22, beams=25, noise=0.01):
+    """A coarse sweep of a flat triangle: few points, 25 parts of very different weight."""
+    height = np.linspace(0.01, 0.37, lines)
+    share = 1 - height / 0.38
+    flat = np.concatenate([np.linspace([0.0, y], [0.315 * s, y], int(2 + beams * s))
+                           for y, s in zip(height, share, strict=True)])  # fmt: skip
+    noise = noise * rng.standard_normal(len(flat))
+    return Face(flat, noise, np.full(len(flat), 0.98), np.zeros(len(flat)), hull(flat))
+
+
+def test_coarse_sweeps_of_flat_boards_seldom_look_bent():
+    """Five percent of them at a level of 5 %, or fewer: the scatter of few parts must not be trusted too far."""
+    rng = np.random.default_rng(11)
+    p_values = np.array([bend_of(a_triangle(rng)).p_value for _ in range(400)])
+    assert np.sum(p_values < 0.05) <= binom.ppf(0.999, len(p_values), 0.05)
+    assert np.sum(p_values < 0.001) <= 2
 
 
 def test_outliers_do_not_bend_a_board():

@@ -258,10 +258,10 @@ def bend_of(face, placement=0, level=0.0):
     columns = _surface(face, face.flat[known])
     height = face.height[known] - (level * np.nan_to_num(face.around) * face.by_range)[known]
     found, miss, used = _robust_fit(columns, height)
-    covariance, free = _covariance(columns[used], miss[used], part[used])
-    q, of_q = found[3:], covariance[3:, 3:]
-    p_value = float(f_distribution.sf(q @ np.linalg.solve(of_q, q) / 3, 3, free))
-    size, sigma = _height_range(face, q, of_q)
+    by_parts, by_points = _covariances(columns[used], miss[used], part[used])
+    q = found[3:]
+    p_value = max(_p_value(q, *by_parts), _p_value(q, *by_points))
+    size, sigma = _height_range(face, q, by_parts[0])
     return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
 
 
@@ -272,13 +272,28 @@ def _part_of(face):
     return column @ [1, PARTS]
 
 
-def _covariance(columns, miss, part):
-    """Sandwich covariance with parts of the board as its independent pieces, and the degrees of freedom."""
-    score = np.zeros((PARTS**2, columns.shape[1]))
-    np.add.at(score, part, columns * miss[:, None])
+def _covariances(columns, miss, part):
+    """Covariances of the quadratic terms with their degrees of freedom: from the scatter over parts, and over points.
+
+    The first one leaves out each part in turn (the jackknife, without refitting): plain scores of so few parts would
+    call a flat board bent six times too often. Few parts may agree by luck, so that points have their say as well.
+    """
+    pieces, unknowns = np.unique(part), columns.shape[1]
     bread = np.linalg.inv(columns.T @ columns)
-    pieces, unknowns = len(np.unique(part)), columns.shape[1]
-    return bread @ (score.T @ score) @ bread * pieces / (pieces - unknowns), pieces - unknowns
+    moved = np.stack([_without(columns[part == p], miss[part == p], bread) for p in pieces])
+    by_parts = (len(pieces) - 1) / len(pieces) * moved.T @ moved
+    by_points = bread * (miss @ miss) / (len(miss) - unknowns)
+    return (by_parts[3:, 3:], len(pieces) - unknowns), (by_points[3:, 3:], len(miss) - unknowns)
+
+
+def _without(columns, miss, bread):
+    """How far the coefficients move when these points are left out of a fit, shape (6,)."""
+    return bread @ np.linalg.solve(np.eye(len(bread)) - columns.T @ columns @ bread, columns.T @ miss)
+
+
+def _p_value(q, covariance, free):
+    """Of quadratic terms on a flat board."""
+    return float(f_distribution.sf(q @ np.linalg.solve(covariance, q) / len(q), len(q), free))
 
 
 def _height_range(face, q, covariance):
