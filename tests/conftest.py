@@ -1,13 +1,28 @@
 """Fixtures shared by all tests."""
 
 import os
+import shutil
+from contextlib import suppress
 from pathlib import Path
+from tempfile import mkdtemp
 
 import matplotlib
 import pytest
+from shared import FOLDER, shared_folder, stages
 
 matplotlib.use("Agg")
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure(config):
+    """A folder that all processes of this test run share; they inherit its name."""
+    if not hasattr(config, "workerinput"):
+        os.environ[FOLDER] = mkdtemp(prefix="lrfcal-tests-")
+
+
+def pytest_unconfigure(config):
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ.pop(FOLDER), ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
@@ -23,13 +38,28 @@ def real_data():
 
 
 @pytest.fixture(scope="session")
-def lms400_session(real_data, tmp_path_factory):
-    """Folder of the session imported from lms400_zed, made once a test run."""
+def lms400_session(real_data):
+    """Folder of the session imported from lms400_zed, the same for all processes of a test run."""
     from lrfcal_lib.importers import import_lasersetero
 
-    target = tmp_path_factory.mktemp("sessions") / "lms400_zed"
-    import_lasersetero(real_data / "lms400_zed", target)
+    target = shared_folder() / "lms400_zed"
+    if not target.exists():
+        own = Path(mkdtemp(dir=shared_folder())) / target.name
+        import_lasersetero(real_data / "lms400_zed", own)
+        with suppress(OSError):  # another process was faster
+            own.rename(target)
     return target
+
+
+@pytest.fixture(scope="session")
+def lms400(lms400_session):
+    """The calibrated recording; what the notebooks of this test run have worked out of it is not done again."""
+    from lrfcal_lib import cache, pipeline
+    from lrfcal_lib.session import open_session
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(cache.VARIABLE, str(stages()))
+        return pipeline.calibrate(open_session(lms400_session))
 
 
 LONGEST = (
@@ -46,15 +76,7 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
 
 
-REAL_TIME = (
-    "test_emulat",
-    "test_lms2xx_device",
-    "test_lms2xx_faults",
-    "test_lms2xx_streaming",
-    "test_pan",
-    "test_record_",
-    "test_video",
-)
+REAL_TIME = ("test_record", "test_video")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -3,11 +3,10 @@
 import os
 import subprocess
 import sys
-from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import nbformat
+from shared import stages
 
 from lrfcal_lib import cache
 
@@ -36,12 +35,6 @@ WITH_SESSION = [path for path in NOTEBOOKS if asks_for_session(path)]
 WITHOUT_SESSION = [path for path in NOTEBOOKS if path not in WITH_SESSION]
 
 
-@lru_cache
-def stages():
-    """Folder of what the notebooks of this test run begin with, removed at its end."""
-    return TemporaryDirectory(prefix="lrfcal-tests-")
-
-
 def run_nbval(path, session=None):
     """Run a notebook under nbval, comparing outputs where there are any and no other session is asked for."""
     strict = has_outputs(path) and session is None
@@ -49,7 +42,7 @@ def run_nbval(path, session=None):
     command += ["--nbval" if strict else "--nbval-lax", "--nbval-current-env", f"--nbval-cell-timeout={CELL_SECONDS}"]
     command += ["--nbval-sanitize-with", "tests/nbval_sanitize.cfg", str(path)]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
-    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: stages().name}
+    environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
     environment |= {} if session is None else {"LRFCAL_SESSION": str(session)}
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 

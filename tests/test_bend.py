@@ -14,7 +14,7 @@ from lrfcal_lib.board import Board, Chessboard
 from lrfcal_lib.camera import CameraModel, project
 from lrfcal_lib.evaluate.diagnosis import bend_words, bends_table, board_maps
 from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.pipeline import prepare_images, prepare_scans
+from lrfcal_lib.pipeline import prepare_scans
 from lrfcal_lib.plots.diagnosis import board_bend
 from lrfcal_lib.preprocess.bend import (
     Bend,
@@ -254,10 +254,9 @@ def test_flat_simulated_boards_do_not_bend(name):
     assert not any(b.bends for b in found.placements.values()) and bend_words(found) == []
 
 
-def test_real_boards_that_bend_are_found(lms400_session):
+def test_real_boards_that_bend_are_found(lms400):
     """The list was known when the threshold of 6 mm was chosen; 5 and 7 are flat by any measure."""
-    prepared = prepare_images(prepare_scans(open_session(lms400_session)))
-    found = board_bends(prepared, board_maps(prepared))
+    found = board_bends(lms400.prepared, board_maps(lms400.prepared))
     bent = {p for p, b in found.placements.items() if b.bends}
     assert {15, 16, 18, 20} <= bent and not bent & {1, 2, 3, 4, 5, 6, 7, 9, 13, 17}
     assert found.level_applied and 0.004 < found.level < 0.008

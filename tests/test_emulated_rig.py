@@ -18,7 +18,7 @@ from lrfcal_lib.drivers.control import ask
 from lrfcal_lib.drivers.emulators import EmulatedRig, Head
 from lrfcal_lib.drivers.emulators.camera import CameraServer, scaled
 from lrfcal_lib.drivers.emulators.line import Clock
-from lrfcal_lib.drivers.emulators.run import main
+from lrfcal_lib.drivers.emulators.run import main, summary
 from lrfcal_lib.drivers.emulators.world import EmulatedWorld
 from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
 from lrfcal_lib.drivers.rig_file import read_rig_file
@@ -265,8 +265,16 @@ def test_own_placements_and_unknown_setups(setup, tmp_path):
     assert list((tmp_path / "rig").iterdir()) == []
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         EmulatedRig("x")
-    with pytest.raises(ValueError, match="time_scale"):
-        main(["sim_quick", "--no-cameras", "--time-scale", "0"])
+    for scale in ("0", "16"):
+        with pytest.raises(ValueError, match=f"time_scale is {scale}.0"):
+            main(["sim_quick", "--no-cameras", "--time-scale", scale])
+
+
+def test_a_rig_that_is_sped_up_says_what_it_is_for(setup):
+    with EmulatedRig(setup, cameras=False, time_scale=4) as rig:
+        assert "4 times as fast: for stop-and-go, not for continuous sweeps" in summary(rig)
+    with EmulatedRig(setup, cameras=False) as rig:
+        assert "times as fast" not in summary(rig)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -432,6 +432,8 @@ def test_a_clock_runs_at_its_scale_and_back():
     assert clock.device(clock.host(3.0)) == pytest.approx(3.0, abs=1e-4)
     with pytest.raises(ValueError, match="time_scale is 0"):
         Clock(0)
+    with pytest.raises(ValueError, match="time_scale is 8.1: .* at most 8"):
+        Clock(8.1)
 
 
 def until(condition, what="it"):

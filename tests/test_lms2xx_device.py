@@ -13,6 +13,7 @@ import serial
 
 from lrfcal_lib.drivers import lms2xx_link, serial_port
 from lrfcal_lib.drivers.emulators import EmulatedLms
+from lrfcal_lib.drivers.emulators.lms2xx_scans import SyntheticSource
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
 from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
 from lrfcal_lib.drivers.lms2xx_device import LMS2xx
@@ -407,6 +408,18 @@ def test_instants_rise_even_if_the_first_scan_came_late():
         np.testing.assert_allclose(instants[-50:], times[-50:], atol=0.002)
 
 
+@pytest.mark.parametrize("times", [2, 4, 8])
+def test_no_scan_of_a_device_that_runs_faster_than_the_clock_is_refused(times):
+    """Emulated ones do; every turn is a scan, and some come later than others."""
+    clock, turns = ScanClock(), np.arange(3000)
+    late = np.random.default_rng(times).exponential(0.002, len(turns))
+    arrivals = np.maximum.accumulate(5.0 + turns * TURN_S / times + late)
+    placed = [clock.place(turn % 256, arrival) for turn, arrival in zip(turns.tolist(), arrivals, strict=True)]
+    assert [step for _, step in placed[1:]] == [1] * (len(turns) - 1)
+    instants = np.array([instant for instant, _ in placed], float)
+    assert np.all(np.diff(instants) > 0) and np.abs(instants - arrivals).max() < 0.05
+
+
 def test_old_and_repeated_scans_are_refused():
     clock = ScanClock()
     assert clock.place(250, 10.0) == (10.0, 0)
@@ -697,6 +710,26 @@ def test_a_stream_comes_back_by_itself_with_the_same_settings(emulated):
     faults = ("unplug", "reboot", "rate")
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(interrupt, faults, [emulated(baudrate=9600) for _ in faults]))
+
+
+@pytest.mark.parametrize("scale", [4.0, 8.0])
+def test_a_stream_that_the_emulator_is_too_slow_for_goes_on(emulated, scale):
+    """As of a moving head, whose scans take some 20 ms each to be cast: some are left out, none is late."""
+
+    class Slow(SyntheticSource):
+        def scan(self, *args):
+            time.sleep(0.02)
+            return super().scan(*args)
+
+    device = emulated(source=Slow(), baudrate=500000, time_scale=scale)
+    with LMS2xx.open(device.path, baudrate=500000) as lms:
+        lms.start()
+        numbers, end = [], time.monotonic() + 3.0
+        while time.monotonic() < end:
+            numbers.append(record_of(device, lms.newest(timeout=DEADLINE_S))[0].number)
+        assert lms.counts["reconnects"] == 0
+        lms.stop()
+    assert device.left_out > 0 and np.all(np.diff(numbers) > 0) and len(numbers) > 10
 
 
 def test_a_stream_on_a_lost_line_can_be_stopped(emulated):

@@ -2,13 +2,13 @@
 everything works again soon after the fault ended.
 """
 
-import threading
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from hiccups import Hiccups
 
 from lrfcal_lib.drivers.emulators import FAULTS, EmulatedLms
 from lrfcal_lib.drivers.errors import DeviceError
@@ -18,7 +18,7 @@ from lrfcal_lib.drivers.lms2xx_replies import Configuration
 
 DEVICES = 12
 SCALE = 2.0  # seconds of the devices in one of the host
-RECOVERY_S, HANG_S = 3.0, 30.0  # the second one is for machines that are busy with something else
+RECOVERY_S, HANG_S = 3.0, 30.0  # the second one only guards against hanging
 STAMP_S = 0.6  # of the devices: below the delay that the fault 'delay' makes
 KINDS = [name for name, fault in FAULTS.items() if "lrf" in fault.devices]
 LONG = {"unplug", "reboot", "rate", "deaf", "echo"}  # they last for a while, so there are fewer of them
@@ -120,7 +120,7 @@ class Campaign:
         while not (worked and self.survive(call)):
             assert time.monotonic() < begin + HANG_S, f"no recovery from {kind}"
             worked = self.survive(lambda: self.lms.reconnect(deadline=10))
-        self.recoveries.append((kind, time.monotonic() - begin))
+        self.recoveries.append((kind, begin, time.monotonic()))
 
     def accept(self, readings):
         self.readings += readings
@@ -144,20 +144,6 @@ def share(kinds, times, rng):
     return [list(part) for part in np.array_split(rng.permutation(everything), DEVICES)]
 
 
-class Hiccups(threading.Thread):
-    """Longest time for which this machine let a thread wait that was due, s: a scan may come in so much later."""
-
-    def __init__(self):
-        super().__init__(daemon=True)
-        self.longest, self.over = 0.0, threading.Event()
-
-    def run(self):
-        while not self.over.is_set():
-            begin = time.monotonic()
-            time.sleep(0.01)
-            self.longest = max(self.longest, time.monotonic() - begin - 0.01)
-
-
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("faults"), np.random.default_rng(5)
@@ -168,7 +154,8 @@ def campaigns(tmp_path_factory):
         runs = [pool.submit(Campaign(folder, number).run, *part) for number, part in enumerate(parts)]
         found = [run.result() for run in runs]
     hiccups.over.set()
-    return found, hiccups.longest
+    hiccups.join()
+    return found, hiccups
 
 
 def test_hundreds_of_faults_of_many_kinds_were_injected(campaigns):
@@ -182,15 +169,18 @@ def test_no_call_hangs(campaigns):
 
 
 def test_no_wrong_scan_is_accepted(campaigns):
-    campaigns, hiccup_s = campaigns
+    campaigns, hiccups = campaigns
     for one in campaigns:
-        one.check(hiccup_s)
+        one.check(hiccups.longest)
     assert sum(len(one.readings) for one in campaigns) > 400
 
 
 def test_everything_works_again_soon(campaigns):
-    seconds = [seconds for one in campaigns[0] for _, seconds in one.recoveries]
-    assert np.percentile(seconds, 90) < RECOVERY_S  # all of them where the machine is not busy
+    """All of them, with what this machine withheld from its threads meanwhile taken off."""
+    campaigns, hiccups = campaigns
+    recoveries = [recovery for one in campaigns for recovery in one.recoveries]
+    took = [(end - begin - hiccups.within(begin, end), kind) for kind, begin, end in recoveries]
+    assert len(took) > 500 and max(took)[0] < RECOVERY_S, sorted(took)[-5:]
 
 
 def test_what_the_checksum_cannot_see():

@@ -58,7 +58,8 @@ def test_every_scan_is_delivered_or_counted(streamed, rate):
     assert {sent[n + 1] - sent[n] for n in range(numbers[0], numbers[-1])} == {period * TURNS}
     made = (turns[-1] - turns[0]) // TURNS + 1
     assert made >= STREAM_S / SCAN_S - period
-    unread = sum(record.number > numbers[-1] for record in records)  # came after the last one taken
+    # on a busy machine some came before the first one taken or after the last
+    unread = sum(not numbers[0] <= record.number <= numbers[-1] for record in records)
     assert 0 <= counts["dropped"] + len(readings) - made <= unread * (period - 1)
 
 

@@ -21,8 +21,8 @@ PUBLISHED_STEREO_DEG, PUBLISHED_BASELINE_MM = (0.521, 0.292, -0.014), 117.72
 
 
 @pytest.fixture(scope="module")
-def found(lms400_session):
-    return pipeline.calibrate(open_session(lms400_session))
+def found(lms400):
+    return lms400
 
 
 @pytest.fixture(scope="module")

@@ -347,7 +347,7 @@ def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(tmp_path, monkeyp
     recording = Recording(rig, tmp_path / "s", resume=True)
     with monkeypatch.context() as patch:
         Full(patch, free)
-        with pytest.raises(RecordingError, match="No space left.*free some space; placements 1.*go on with --resume"):
+        with pytest.raises(RecordingError, match="No space left.*free some space; placements 1.*--resume goes on"):
             while True:
                 list(recording.run(recording.to_do()[0]))
     assert rig.head.stops == 1 or free in (0, 15)  # between two placements the head rests

@@ -27,24 +27,45 @@ serial.Serial = Forbidden
 from lrfcal_lib.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
+FULL = """
+import errno, os, sys
+from pathlib import Path
+from lrfcal_lib.__main__ import main
+fsync, table, over = os.fsync, Path(sys.argv[3]) / "lrf" / "index.csv", []
+def full(handle):
+    if over or table.exists() and len(table.read_text().splitlines()) > 7:
+        over.append(True)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    fsync(handle)
+os.fsync = full
+sys.exit(main(sys.argv[1:]))
+"""  # with the seventh scan of the session
+
+
+def emulated(count):
+    """A quick rig with placements of five stops and one image of 64 x 48 pixels."""
+    setup, placements = practice_setup()
+    low = float(np.mean(placements[0].sweep))
+    short = [replace(p, sweep=(low, low + np.radians(4.0)), image_pitch=(low,)) for p in placements[:count]]
+    setup = replace(setup, rig=replace(setup.rig, cameras=setup.rig.cameras[:1]))
+    head = {"baudrate": 38400, "go_speed": 60.0}
+    return EmulatedRig(setup, placements=short, image_width=64, platform={"settle": 0.0}, head_options=head, rest_s=0.1)
 
 
 @pytest.fixture(scope="module")
 def rig():
-    """A quick rig with one placement of five stops and one image of 64 x 48 pixels."""
-    setup, placements = practice_setup()
-    low = float(np.mean(placements[0].sweep))
-    first = replace(placements[0], sweep=(low, low + np.radians(4.0)), image_pitch=(low,))
-    setup = replace(setup, rig=replace(setup.rig, cameras=setup.rig.cameras[:1]))
-    head = {"baudrate": 38400, "go_speed": 60.0}
-    with EmulatedRig(setup, placements=[first], image_width=64, platform={"settle": 0.0}, head_options=head,
-                     rest_s=0.1) as rig:  # fmt: skip
+    """With one placement."""
+    with emulated(1) as rig:
         yield rig
 
 
 @pytest.fixture
 def stated(rig):
     """Its rig file, to be spoilt."""
+    return rig_file(rig)
+
+
+def rig_file(rig):
     data = rig.rig_file()
     data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.02, "gap_s": 0.005}
     data["rig"]["cameras"]["left"]["intrinsics"] = model_to_json(rig.setup.rig.cameras[0].model)
@@ -158,6 +179,39 @@ def test_a_head_at_its_end_stop_ends_the_recording(tmp_path, rig, stated, monkey
     assert code == 2 and "no placement was finished; --resume goes on from there" in err and "Traceback" not in err
     assert "end stop" in err or "limit" in err
     assert stands_still(rig)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """With two placements."""
+    with emulated(2) as rig:
+        yield rig
+
+
+def contents(path, number):
+    """Telegrams and images of a placement, byte for byte."""
+    session = open_session(path)
+    data, rows = (path / "lrf" / "telegrams.bin").read_bytes(), (path / "lrf" / "index.csv").read_text().splitlines()
+    rows = [row.split(",") for row in rows[1:]]
+    telegrams = [data[int(r[1]) : int(r[1]) + int(r[2])] for r in rows if r[3] == str(number)]
+    return telegrams, [session.read_image(image).tobytes() for image in session.images(placement=number)]
+
+
+def test_a_disk_that_is_full_in_a_sweep(tmp_path, two):
+    """The second placement breaks off between its stops; the first one stays, and --resume repeats the second."""
+    path, data = tmp_path / "s", rig_file(two)
+    code, _, err = Program(tmp_path, data, code=FULL).end()
+    assert code == 2 and "Traceback" not in err and "\n" not in err
+    assert "cannot be written (No space left on device): free some space; placements 1 are safe" in err
+    assert "--resume goes on from there" in err and stands_still(two)
+    assert open_session(path).placements == (1,)
+    assert 2 in json.loads((path / "session.json").read_text())["unfinished"]
+    first = contents(path, 1)
+    assert len(first[0]) == 5 and len(first[1]) == 1
+    code, out, err = Program(tmp_path, data, "--resume").end()
+    assert code == 0, err
+    assert validate(path) == [] and open_session(path).placements == (1, 2) and "placements 1, 2 are safe" in out
+    assert contents(path, 1) == first and [len(part) for part in contents(path, 2)] == [5, 1]
 
 
 PHASES = {

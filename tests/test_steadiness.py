@@ -279,26 +279,26 @@ def test_the_figure_marks_the_step():
 
 
 @pytest.fixture(scope="module")
-def lms400(lms400_session):
+def nudged(lms400_session):
     session, rough = open_session(lms400_session), np.array([-0.17, 0.02, 0.0, 0.0, 0.0])
     model = CameraModel(1280, 720, 700.0, 700.0, 640.0, 360.0, rough)
     return {camera: camera_steadiness(session, camera, model=model) for camera in session.cameras}
 
 
-def test_the_nudge_of_a_real_rig_is_found(lms400):
+def test_the_nudge_of_a_real_rig_is_found(nudged):
     """Without being told where the board is: half of the features lie on it or behind it."""
-    for found in lms400.values():
+    for found in nudged.values():
         (step,) = found.steps
         assert (step.before, step.after) == (10, 11)
         assert 0.05 < np.rad2deg(step.angle) < 0.09 and 0.6 < step.size_px < 1.0
         assert not found.problems and len(found.placements) == 20
-    assert "the rig moved by 0.06" in motion_words(lms400)[0]
+    assert "the rig moved by 0.06" in motion_words(nudged)[0]
 
 
-def test_the_scale_of_both_real_cameras_drifts_together(lms400):
-    left, right = (lms400[c].corner_px for c in ("left", "right"))
+def test_the_scale_of_both_real_cameras_drifts_together(nudged):
+    left, right = (nudged[c].corner_px for c in ("left", "right"))
     assert np.corrcoef(left, right)[0, 1] > 0.95
-    assert all(found.scale_drifts for found in lms400.values())
+    assert all(found.scale_drifts for found in nudged.values())
 
 
 def test_findings_of_a_faultless_recording_are_none():

@@ -184,7 +184,7 @@ class Recording:
         except OSError as error:
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
             remedy = "free some space" if full else "check the disk and its permissions"
-            safe = f"{self.safe()}, then go on with --resume" if hasattr(self, "writer") else "then record again"
+            safe = f"{self.safe()}; --resume goes on from there" if hasattr(self, "writer") else "then record again"
             raise RecordingError(f"{self.path}: cannot be written ({error.strerror}): {remedy}; {safe}") from error
 
 

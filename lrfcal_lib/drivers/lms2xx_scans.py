@@ -14,6 +14,7 @@ VALUES = {(100, 1.0): 101, (100, 0.5): 201, (100, 0.25): 401, (180, 1.0): 181, (
 WINDOW_S = 2.0  # arrivals in the last so many seconds tell the host's clock from the device's
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # corrections of the clock up to this are spread over scans; at larger ones scans are left out
+LEAST_S = TURN_S / 100  # between two instants told; far less than between two scans, emulated ones sped up included
 FORGET_S = 30.0  # after such a pause the number of turns in between is not known
 STUBBORN = 5  # so many implausible scan indices in a row: the device counts anew
 
@@ -97,7 +98,7 @@ class ScanClock:
         """An instant after the last one told, or None where the clock was found to be far ahead."""
         if instant < self._told - JITTER_S:
             return None
-        self._told = max(instant, self._told + TURN_S / 4)
+        self._told = max(instant, self._told + LEAST_S)
         return self._told
 
     def _step(self, ahead, elapsed_s):

@@ -25,6 +25,7 @@ RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[
 CHUNK_S = 0.005  # bytes that are due within this time are written at once
 LONGEST_WAIT_S = 0.25
 CLOSED_LOOK_S = 0.02  # how often to see whether somebody opened the port
+FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
 DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
 
 
@@ -34,12 +35,17 @@ class Clock:
     Parameters
     ----------
     scale : float
-        Seconds of the devices in a second of the host.
+        Seconds of the devices in a second of the host, 8 at most.
+
+    Raises
+    ------
+    ValueError
+        For a scale that no rig can be run at.
     """
 
     def __init__(self, scale=1.0):
-        if not 0 < scale < 1000:
-            raise ValueError(f"time_scale is {scale}: it must be positive, 1 for real time")
+        if not 0 < scale <= FASTEST:
+            raise ValueError(f"time_scale is {scale}: it must be positive, 1 for real time, and at most {FASTEST:g}")
         self.scale, self._zero, self._host_zero = scale, time.monotonic(), time.time()
 
     def now(self):

@@ -38,8 +38,10 @@ class EmulatedRig:
     placements : sequence of Placement, optional
         Where the board can be put, see :class:`EmulatedWorld`.
     time_scale : float
-        Seconds of the devices in a second of the host. A stream of scans leaves some out, with a warning, where this
-        machine is too slow for it; 1 is safe, and with a head that rests 8.
+        Seconds of the devices in a second of the host; 1 is safe. Up to 8 does for stop-and-go. A stream of scans
+        leaves some out, with a warning, where this machine is too slow for it, as with a head that moves. The instants
+        of scans need a host clock that runs as fast (`clock` of `LMS2xx.open` and `Rig.open`): by another one they
+        are off by tenths of a second.
     lrf_options : dict, optional
         Of :class:`EmulatedLms`.
     head_options : dict, optional

@@ -11,6 +11,7 @@ from pathlib import Path
 from lrfcal_lib.drivers.emulators.pelco_d import FEEDBACK, REPLIES
 
 LOOK_S = 0.5
+SCALE_HELP = "2 runs all devices twice as fast, 8 at most; stop-and-go only, as sweeps need scans in real time (1)"
 
 
 def parser():
@@ -33,7 +34,7 @@ def parser():
     top.add_argument("--image-width", type=int, help="pixels")
     top.add_argument("--image-rest", type=float, default=0.5, help="s the head rests before an image is drawn (0.5)")
     top.add_argument("--no-cameras", action="store_true")
-    top.add_argument("--time-scale", type=float, default=1.0, help="2 runs all devices twice as fast")
+    top.add_argument("--time-scale", type=float, default=1.0, help=SCALE_HELP)
     return top
 
 
@@ -96,6 +97,8 @@ def summary(rig, file=None):
         f"  control  {rig.control}   one command a line, such as: place 1",
         f"  boards   placements {', '.join(map(str, rig.world.placements))}, or none",
     ]
+    if rig.clock.scale != 1:
+        lines.append(f"  clocks   {rig.clock.scale:g} times as fast: for stop-and-go, not for continuous sweeps")
     if file is not None:
         lines.append(f"  rig file {file}   python -m lrfcal_lib record --help")
     return "\n".join(lines)

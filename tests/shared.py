@@ -1,0 +1,16 @@
+"""What the processes of a test run share."""
+
+import os
+from pathlib import Path
+
+FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
+
+
+def shared_folder():
+    """Folder of this test run, removed at its end."""
+    return Path(os.environ[FOLDER])
+
+
+def stages():
+    """Folder for the stages that notebooks and fixtures begin with (see lrfcal_lib.cache)."""
+    return shared_folder() / "stages"
