@@ -29,7 +29,7 @@ report: setup
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
-	$(RUN) -m pytest -n 3 --dist loadfile
+	$(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")

@@ -63,10 +63,14 @@ def lms400(lms400_session):
 
 
 LONGEST = (
-    "test_notebooks_recording",
     "test_notebooks",
-    "test_panel_browser",
+    "test_notebooks_recording",
     "test_record_emulated",
+    "test_image",
+    "test_panel_browser",
+    "test_lms2xx_device",
+    "test_record_bad_input",
+    "test_pan_tilt",
     "test_real_lms400",
 )
 
