@@ -213,6 +213,7 @@ def test_a_motion_that_nothing_determines(good):
     assert found.sentences()[0].startswith("This calibration cannot be trusted: the data do not determine")
     assert np.isinf(found.errors[2.0]["right_px"]) and np.isfinite(found.errors[2.0]["left_px"])
     assert "no bound in the image of 'right'" in found.sentences()[2]
+    assert not np.isnan(solution.solution.sigma).any(), "rounding errors are no information"
     lost = [d.words for d in observability(solution) if np.isinf(d.sigma)]
     assert lost and any("camera 'right'" in words for words in lost)
 

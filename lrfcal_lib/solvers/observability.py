@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+RANK = 1e-13  # eigenvalues of scaled normal equations below this share of the largest are rounding errors
+
 
 def null_space(hessian, scales, limit=1.0):
     """Directions that normal equations do not determine.
@@ -26,7 +28,7 @@ def null_space(hessian, scales, limit=1.0):
     """
     scales = np.asarray(scales, float)
     values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)
-    bad = values < np.maximum(1e-13 * values[-1], limit**-2)
+    bad = values < np.maximum(RANK * values[-1], limit**-2)
     directions = (_simplest_basis(vectors[:, bad]) * scales[:, None]).T
     peak = np.max(np.abs(directions), axis=1, keepdims=True) if len(directions) else 1.0
     return directions / peak, np.sqrt(np.maximum(values, 0.0))
