@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from contextlib import suppress
 from pathlib import Path
 from tempfile import mkdtemp
@@ -15,7 +16,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config):
-    """A folder that all processes of this test run share; they inherit its name."""
+    """A folder that all processes of this test run share; they inherit its name. And Ctrl-C.
+
+    A shell starts what runs in the background with Ctrl-C ignored, which is inherited as well: the programs that tests
+    interrupt would not notice.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):
         os.environ[FOLDER] = mkdtemp(prefix="lrfcal-tests-")
 

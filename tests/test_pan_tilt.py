@@ -551,7 +551,7 @@ def test_opening_stops_a_head_that_was_left_running(make):
 def test_the_end_of_the_process_stops_the_head(make, way):
     device = make()
     code = f"""
-    import dataclasses, sys, time
+    import time
     from lrfcal_lib.drivers.pan_tilt import HeadSettings, PanTilt
     head = PanTilt.open({str(device.path)!r}, HeadSettings(baudrate=38400, gap_s=0.005))
     head.start_sweep(1.0, speed=1)
