@@ -101,6 +101,7 @@ class _Sources:
     correct: Callable
 
     def transform(self, placement):
+        """Function of LRF points and their pitch: moves them into the frame the camera is fixed to."""
         mount = self.prepared.session.cameras[self.camera].mount
         view = self.prepared.views[self.camera].get(placement)
         image_pitch = 0.0 if mount == "platform" or view is None else view.pitch

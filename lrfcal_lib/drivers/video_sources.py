@@ -79,6 +79,7 @@ class _Device(_Source):
         return f"check the plug of {self.path}, and what 'v4l2-ctl --list-devices' shows"
 
     def open(self):
+        """Open the device; a PortError says what is in the way."""
         if not os.path.exists(self.path):
             there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
             raise PortError(f"there is no camera {self.path}: check its plug; present are {there}")
@@ -91,6 +92,7 @@ class _Device(_Source):
         return capture
 
     def set(self, capture, asked):
+        """Ask for size, frames a second and exposure; what came of it is read back by `got`."""
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         if asked["size"] is not None:
             for key, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), asked["size"], strict=True):
@@ -121,6 +123,7 @@ class _Stream(_Source):
         return f"open {self.path} in a browser, and check network and power of the camera"
 
     def open(self):
+        """Connect: MJPEG over HTTP with our own reader, anything else with FFmpeg."""
         if self.path.startswith("http"):
             with contextlib.suppress(OSError):
                 stream = MjpegStream(self.path, self.silence_s)
@@ -140,6 +143,7 @@ class _Video(_Source):
     """A video file."""
 
     def open(self):
+        """Open the file; a PortError says what is wrong with it."""
         if not os.path.exists(self.path):
             raise PortError(f"there is no video {self.path}: name a file, a device, a folder of images or a URL")
         capture = cv2.VideoCapture(self.path)

@@ -241,6 +241,7 @@ class Line(threading.Thread):
     # ------------------------------------------------------------------------------------------- the thread
 
     def run(self):
+        """Move bytes both ways until the line is closed; what goes wrong is kept in `error`."""
         try:
             while not self._quit:
                 self._listen(self._wait())

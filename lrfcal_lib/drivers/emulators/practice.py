@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
 
 from lrfcal_lib.drivers.emulators.camera import scaled
 from lrfcal_lib.drivers.emulators.rig import EmulatedRig
+from lrfcal_lib.drivers.rig import host_clock
 from lrfcal_lib.session import model_to_json
 from lrfcal_lib.simulate.placements import pairs
 from lrfcal_lib.simulate.record import PLACES, random
@@ -58,13 +58,14 @@ def emulated(name):
     ValueError
         For another name.
     """
+    clock = host_clock()
     if name != PRACTICE:
         rig = EmulatedRig(name)
-        return rig, rig.rig_file, time.time
-    begun, (setup, placements) = time.time(), practice_setup()
+        return rig, rig.rig_file, clock
+    begun, (setup, placements) = clock(), practice_setup()
     rig = EmulatedRig(setup, placements=placements, time_scale=FAST, platform={"settle": 0.0},
                       head_options={"baudrate": 38400, "go_speed": 60.0})  # fmt: skip
-    return rig, lambda: _quick(rig), lambda: begun + FAST * (time.time() - begun)
+    return rig, lambda: _quick(rig), lambda: begun + FAST * (clock() - begun)
 
 
 def _quick(rig):
