@@ -17,9 +17,10 @@ from lrfcal_lib.solvers.pose import apply_pose, gradient_by_pose, move_pose, pos
 
 SUBSETS = 400
 ROTATIONS = 200
+FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 
 
-def starting_transform(obs, kinds=("planes", "lines", "scene")):
+def starting_transform(obs, kinds=("planes", "lines", "scene"), required=True):
     """A start value of ``T_camera_source`` from whatever the observations hold.
 
     Parameters
@@ -28,6 +29,8 @@ def starting_transform(obs, kinds=("planes", "lines", "scene")):
     kinds : sequence of str
         Ways to try, in this order: 'planes' (closed form of Zhang and Pless in random subsets of the placements),
         'lines' (many start rotations at once), 'scene' (perspective n points).
+    required : bool
+        False: where no way determines the pose, one that fits the planes all the same.
 
     Returns
     -------
@@ -45,17 +48,19 @@ def starting_transform(obs, kinds=("planes", "lines", "scene")):
             return ways[kind](obs)
         except DegenerateGeometry as error:
             reasons.append(f"{kind}: {error}")
+    if not required:
+        return start_from_planes(obs, required=False)
     raise DegenerateGeometry("no start value, give T0. " + " | ".join(reasons))
 
 
-def start_from_planes(obs):
-    """Closed form from planes, least trimmed squares over placements; needs three placements."""
-    sets = plane_sets(obs)
-    check_normals(sets, obs.camera)
+def start_from_planes(obs, required=True):
+    """Closed form from planes, least trimmed squares over placements; needs three placements where `required`."""
+    sets = plane_sets(obs, 3 if required else 1)
+    if required:
+        check_normals(sets, obs.camera)
     triangles = compress(sets, 1.0)
-    solid = full_planes(triangles)
-    candidates = _plane_candidates(sets, triangles, solid)
-    best = candidates[np.argsort(_trimmed(candidates, triangles, sets, solid))[:8]]
+    candidates, flat = _plane_candidates(sets, triangles)
+    best = candidates[np.argsort(_trimmed(candidates, triangles, sets, flat))[:8]]
     refined, *_ = minimise(
         lambda pose: plane_block(pose, triangles / 0.005, sets.boards, None, sets.count),
         best,
@@ -65,19 +70,30 @@ def start_from_planes(obs):
         max_iterations=25,
     )
     every = np.concatenate([refined, best])
-    return pose_transform(every[np.argmin(_trimmed(every, triangles, sets, solid))])
+    return pose_transform(every[np.argmin(_trimmed(every, triangles, sets, flat))])
 
 
-def full_planes(triangles):
-    """True when the scans of most placements span a plane (a sweep), False for single scan lines.
+def common_plane(triangles):
+    """The plane that all points of a recording lie in, and whether they do.
 
     Parameters
     ----------
     triangles : ndarray, shape (p, 4, 4)
         From :func:`lrfcal_lib.solvers.planes.compress`.
+
+    Returns
+    -------
+    frame : ndarray, shape (4, 4)
+        Turns rows ``[p, 1]`` into rows of a frame whose plane z = 0 it is:
+    flat : bool
+        True for single scan lines in one plane of the LRF: how far noise scatters them within it tells nothing.
     """
-    spread = np.linalg.svd(_centred(triangles)[0], compute_uv=False)
-    return bool(np.median(spread[:, 1] / np.maximum(spread[:, 0], 1e-300)) > 0.02)
+    root, centre = _centred(triangles.reshape(1, -1, 4))
+    _, spread, axes = np.linalg.svd(root[0])
+    frame = np.eye(4)
+    frame[:3, :3] = axes.T * np.array([1.0, 1.0, np.linalg.det(axes)])
+    frame[3, :3] = -centre[0] @ frame[:3, :3]
+    return frame, bool(spread[2] < FLAT * spread[0])
 
 
 def _centred(triangles):
@@ -153,18 +169,25 @@ def _rotation_from_lines(triangles, normal, offset):
     return _proper(np.stack([first, second, np.cross(first, second)], axis=-1))
 
 
-def _plane_candidates(sets, triangles, solid):
-    """Closed forms of minimal subsets; a grid of rotations where there are too few placements."""
-    size, p = (3 if solid else 5), len(sets.placements)
-    if p < size:
-        return _rotation_grid_on_planes(sets, triangles)
+def _plane_candidates(sets, triangles):
+    """Closed forms of minimal subsets, for planes and for lines; a grid of rotations where there are too few.
+
+    Also whether the points leave one plane at all.
+    """
+    p, (frame, flat) = len(sets.placements), common_plane(triangles)
+    found = []
+    if p >= 3 and not flat:
+        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
+    if p >= 5:
+        found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
+    return np.concatenate(found) if found else _rotation_grid_on_planes(sets, triangles), flat
+
+
+def _subsets(p, size):
+    """Sets of placements to try: many minimal ones, and all together."""
     if comb(p, size) <= SUBSETS:
-        subsets = np.array(list(combinations(range(p), size)))
-    else:
-        rng = np.random.default_rng(0)
-        subsets = np.argsort(rng.random((SUBSETS, p)), axis=1)[:, :size]
-    whole = closed_form(triangles, sets.boards, solid)[None]
-    return np.concatenate([closed_form(triangles[subsets], sets.boards[subsets], solid), whole])
+        return np.array(list(combinations(range(p), size))), np.arange(p)[None]
+    return np.argsort(np.random.default_rng(0).random((SUBSETS, p)), axis=1)[:, :size], np.arange(p)[None]
 
 
 def _rotation_grid_on_planes(sets, triangles):
@@ -184,11 +207,11 @@ def _rotation_grid_on_planes(sets, triangles):
     return found[ahead.all(axis=1)] if ahead.all(axis=1).any() else found
 
 
-def _trimmed(candidates, triangles, sets, solid):
+def _trimmed(candidates, triangles, sets, flat):
     """Least trimmed mean square (m^2) of candidates: over more placements than a closed form uses."""
     residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
     squares = np.sort(np.sum(residuals**2, axis=2) / np.maximum(sets.count, 1), axis=1)
-    keep = min(max(squares.shape[1] // 2 + 2, 5 if solid else 7), squares.shape[1])
+    keep = min(max(squares.shape[1] // 2 + 2, 7 if flat else 5), squares.shape[1])
     return squares[:, :keep].mean(axis=1)
 
 

@@ -27,7 +27,7 @@ from lrfcal_lib.solvers.pose import (
     pose_array,
     rotate_points,
 )
-from lrfcal_lib.solvers.start import closed_form, full_planes, start_from_planes, starting_transform
+from lrfcal_lib.solvers.start import closed_form, start_from_planes, starting_transform
 
 TILT_LEVER = 0.3  # metres, about half a board: turns an offset into the tilt that bends as much
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
@@ -35,7 +35,6 @@ INTRINSIC_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 
 __all__ = [
     "closed_form",
-    "full_planes",
     "solve_zhang_pless",
     "solve_zhang_pless_batch",
     "solve_zhang_pless_joint",
@@ -75,10 +74,10 @@ def solve_zhang_pless(obs, T0=None, *, loss=None, scale=1.0, weighted=True, max_
     ValueError
         When an observation is not finite.
     """
-    sets = plane_sets(obs)
+    sets = plane_sets(obs, 3 if required else 1)
     if required:
         check_normals(sets, obs.camera)
-    T0 = starting_transform(obs, kinds=("planes",)) if T0 is None else T0
+    T0 = starting_transform(obs, ("planes",), required) if T0 is None else T0
     options = dict(loss=loss, scale=scale, max_iterations=max_iterations)
     return _refine(sets, pose_array(T0), weighted, obs.camera, required=required, **options)
 
@@ -106,13 +105,13 @@ def solve_zhang_pless_batch(sets, T0, *, loss=None, scale=1.0, weighted=True, ma
 
 
 def _refine(sets, pose, weighted, camera, *, loss, scale, max_iterations, required=True):
-    """Iterate with the compression renewed (it hardly depends on the pose)."""
-    evaluate, rest = _compressed(sets, pose, weighted)
+    """Iterate with the compression renewed; from an unweighted estimate, because weights of a bad pose hold it there."""
     earlier = []
-    for _ in range(4 if weighted else 0):
+    for weigh in (False, True, True, True, True) if weighted else ():
+        evaluate, _ = _compressed(sets, pose, weigh)
         pose, _, _, history = minimise(evaluate, pose, move_pose, loss=loss, scale=scale, max_iterations=max_iterations)
         earlier.append(history)
-        evaluate, rest = _compressed(sets, pose, weighted)
+    evaluate, rest = _compressed(sets, pose, weighted)
     count = int(sets.count.sum())
     return solve(
         evaluate,
@@ -172,7 +171,7 @@ def solve_zhang_pless_joint(obs, T0=None, *, sigma_plane=None, loss=None, scale=
     DegenerateGeometry
         See :func:`solve_zhang_pless`.
     """
-    sets = plane_sets(obs)
+    sets = plane_sets(obs, 3 if required else 1)
     if required:
         check_normals(sets, obs.camera)
     if obs.pattern_points.shape[0] < 4 or not np.isfinite(obs.pattern_pixels).any():
