@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from lrfcal_lib.camera import project_jacobians
 from lrfcal_lib.candidates import camera_poses, outline, own_placements
-from lrfcal_lib.solvers.edge_likelihood import edge_shift
+from lrfcal_lib.solvers.edge_likelihood import edge_shift, flip_sigma
 from lrfcal_lib.solvers.joint_blocks import named_blocks
 from lrfcal_lib.solvers.least_squares import whiten
 from lrfcal_lib.solvers.observability import reduced_hessian
@@ -195,19 +195,19 @@ def _beams(candidates, solution, rate):
     direction = np.column_stack([along / length[:, None], np.zeros(edges)])[edge]
     across = np.linalg.norm(np.cross(ray, direction), axis=-1)
     radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
-    sigma = radius * np.exp(solution.state.sensor[2])
+    step = np.sqrt(rate.bearing_step * rate.pitch_step) * distance
+    sigma, _ = flip_sigma(np.exp(solution.state.sensor[2]), radius, step)
     shift = edge_shift(solution.state.sensor[1], radius, rate.background)[0]
     density = _density(points, distance, bearing, rate)
     free = np.maximum(length[edge] - 4 * radius, 0.0)  # beams near a corner are not used
     number = density * free * across / len(ALONG) * sigma * (Z_NODES[1] - Z_NODES[0])
-    step = np.sqrt(rate.bearing_step * rate.pitch_step) * distance
     rows = np.sum((density * free * across * 4 * step).reshape(len(points), edges, -1), axis=2) / len(ALONG)
     kept = np.minimum(1.0, rate.cells / np.maximum(rows, 1e-9))[:, edge] * rate.edge_share
     outside = (shift[..., None] - Z_NODES * sigma[..., None]) * (across / np.abs(ray[..., 2]))[..., None]
-    return _beam_group(candidates, solution, local, edge, outside, radius, number * kept, rate.background)
+    return _beam_group(candidates, solution, local, edge, outside, (radius, step), number * kept, rate.background)
 
 
-def _beam_group(candidates, solution, local, edge, outside, radius, number, background):
+def _beam_group(candidates, solution, local, edge, outside, sizes, number, background):
     """Beams at distances outside the edges (n, points, z), each as a hit and as a miss."""
     n, shape = len(candidates), outside.shape
     normal = np.column_stack([solution.data.lines[edge, :2], np.zeros(len(edge))])
@@ -218,7 +218,8 @@ def _beam_group(candidates, solution, local, edge, outside, radius, number, back
     used = np.concatenate([(number[..., None] * p).reshape(n, -1) for p in (share, 1 - share)], axis=1)
     hit = np.broadcast_to(np.arange(2 * bearing.shape[1]) < bearing.shape[1], used.shape)
     wide = np.broadcast_to(edge[None, :, None], shape).reshape(n, -1)
-    twice = {"bearing": bearing, "pitch": pitch, "edge": wide, "radius": np.repeat(radius, len(Z_NODES), axis=1)}
+    radius, step = (np.repeat(size, len(Z_NODES), axis=1) for size in sizes)
+    twice = {"bearing": bearing, "pitch": pitch, "edge": wide, "radius": radius, "step": step}
     group = {name: np.concatenate([value, value], axis=1) for name, value in twice.items()}
     b = group["bearing"]
     group["ray"] = np.stack([np.cos(b), np.sin(b), 0 * b], axis=-1)

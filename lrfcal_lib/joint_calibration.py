@@ -18,7 +18,6 @@ from lrfcal_lib.solvers.platform_blocks import chart_parameters
 from lrfcal_lib.solvers.pose import pose_array
 
 LAPSE = 0.01  # share of beams about an edge that something else than the edge decides
-LEAST_SPAN = np.radians(2.0)  # of the images' pitch at one placement, for the scale of the pitch
 LEAST_SWEEP = np.radians(1.0)  # of the scan lines' pitch, for the axis
 LEAST_SIDES = 8  # of all placements, for a spread of the edge bias from side to side
 
@@ -31,6 +30,7 @@ class JointCalibration:
     ----------
     prepared : Prepared
     observations : JointObservations
+        Those that took part.
     solution : JointSolution
     settings : dict
         What was unknown, and why (see :func:`joint_settings`): keyword arguments of `solve_joint`.
@@ -108,33 +108,24 @@ def joint_settings(prepared, observations):
     Returns
     -------
     dict
-        Keyword arguments of :func:`lrfcal_lib.solvers.joint.solve_joint`: the axis where something sweeps; the scale of
-        the pitch where cameras on the head see one board at several pitch angles; a pitch error of every sweep where
-        cameras on the base show that there is one; a spread of the edge bias where there are sides enough; the stated
-        platform as a prior with its stated standard deviations.
+        Keyword arguments of :func:`lrfcal_lib.solvers.joint.solve_joint`: the axis and the scale of
+        the pitch where something sweeps; a pitch error of every sweep where cameras on the base show that there is one;
+        a spread of the edge bias where there are sides enough; the stated platform as a prior with its stated standard
+        deviations.
     """
     session, noise = prepared.session, prepared.pitch_noise
-    sensor = ["range_offset", "edge_log_odds", "edge_log_softness"]
-    if image_span(observations) > LEAST_SPAN:
+    sensor, axis = ["range_offset", "edge_log_odds", "edge_log_softness"], bool(sweep_span(observations) > LEAST_SWEEP)
+    if axis:  # a wrong scale that is held at zero goes into the axis
         sensor.append("pitch_scale")
     sides = len(np.unique(observations.beam_placement * 100 + observations.beam_edge))
     settings = {"sensor": tuple(sensor), "noise": "estimate", "lapse": LAPSE, "sides": sides >= LEAST_SIDES}
-    settings["axis"] = bool(sweep_span(observations) > LEAST_SWEEP)
+    settings["axis"] = axis
     if noise.offset:
         settings["sweep"] = "offset_stretch" if noise.stretch else "offset"
         settings["sweep_sigma"] = (noise.offset, noise.stretch or 0.01)
     if session.T_head_lrf is not None and settings["axis"]:
         settings["prior"] = PlatformPrior(session.T_head_lrf, *session.platform_sigma)
     return settings
-
-
-def image_span(observations):
-    """Largest pitch range over which one camera on the head sees one board, radians."""
-    on_head = np.array([mount == "head" for mount in observations.mounts], bool)
-    rows = on_head[observations.view_camera] if len(observations.view_camera) else np.zeros(0, bool)
-    key = observations.view_camera[rows] * 10000 + observations.view_placement[rows]
-    spans = [np.ptp(observations.view_pitch[rows][key == k]) for k in np.unique(key)]
-    return float(max(spans, default=0.0))
 
 
 def sweep_span(observations):
@@ -165,7 +156,7 @@ def calibrate_jointly(prepared, views=None):
     observations = observe_joint(prepared, all_views(prepared) if views is None else views)
     settings = joint_settings(prepared, observations)
     solution = solve_joint(observations, required=False, **settings)
-    return JointCalibration(prepared, observations, solution, settings, {})
+    return JointCalibration(prepared, solution.observations, solution, settings, {})
 
 
 def leave_out(joint, groups=8):

@@ -87,7 +87,7 @@ def _faces(prepared, index, count):
 
 
 def _beams(prepared, index, count):
-    keys = ("bearing", "pitch", "hit", "edge", "radius", "background", "placement")
+    keys = ("bearing", "pitch", "hit", "edge", "radius", "background", "step", "placement")
     out, edges = {key: [] for key in keys}, list(prepared.board.edges)
     for placement, i in index.items():
         named = {side: edges.index(name) for side, name in prepared.names.get(placement, {}).items()}
@@ -96,6 +96,7 @@ def _beams(prepared, index, count):
             rows = thin(np.flatnonzero(cells.side == side), count)
             for key in ("bearing", "pitch", "hit", "radius", "background"):
                 out[key].append(getattr(cells, key)[rows])
+            out["step"].append(cells.step[rows] * cells.range_m[rows])
             out["edge"].append(np.full(len(rows), edge))
             out["placement"].append(np.full(len(rows), i))
     kinds = {"hit": bool, "edge": int, "placement": int}

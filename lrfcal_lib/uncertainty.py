@@ -97,10 +97,18 @@ def information(solution):
     return reduced_hessian(np.swapaxes(J, -1, -2) @ J, solution.unknowns.shared) / solution.solution.inflation
 
 
-def unseen_motions(solution):
-    """Directions of the shared unknowns that the data do not determine, shape (m, c)."""
-    scales = [SCALES.get(name, 1.0) for name in solution.solution.names]
-    return null_space(information(solution).sum(axis=0), scales, UNSEEN)[0]
+def unseen_motions(solution, index=None):
+    """Directions that the data do not determine, shape (m, k): of all shared unknowns or, by `index`, some of them.
+
+    What stays open beside those leaves no trace: cameras that planes fix are known, whatever the edge bias.
+    """
+    names = np.array(solution.solution.names)
+    index = np.arange(len(names)) if index is None else np.asarray(index, int)
+    order = np.concatenate([index, np.setdiff1d(np.arange(len(names)), index)])
+    scales = np.array([SCALES.get(name, 1.0) for name in names[order]])
+    whole = information(solution).sum(axis=0)[np.ix_(order, order)] * scales[:, None] * scales
+    own, ones = reduced_hessian(whole[None], len(index))[0], np.ones(len(index))
+    return null_space(own, ones, UNSEEN)[0] * scales[: len(index)]
 
 
 def chain_of(solution, camera=None, clustered=True):
@@ -136,7 +144,10 @@ def chain_of(solution, camera=None, clustered=True):
     pose = pose_array(solution.transforms[camera]) if camera else None
     sweep = solution.data.sweep_sigma if solution.unknowns.sweep != "none" else (0.0, 0.0)
     sweep = (sweep[0], sweep[1] * (solution.unknowns.sweep == "offset_stretch"))
-    unseen = np.hstack([unseen_motions(solution), np.zeros((len(unseen_motions(solution)), 1))])[:, index]
+    known = np.array(index) >= 0
+    motions = unseen_motions(solution, np.array(index)[known])
+    unseen = np.zeros((len(motions), len(wanted)))
+    unseen[:, known] = motions
     head = pose_array(solution.T_head_lrf)
     return Chain(head, pose, "head" if on_head else "platform", covariances, unseen, sweep)
 
@@ -144,7 +155,7 @@ def chain_of(solution, camera=None, clustered=True):
 def _spread_out(covariance, index):
     """Covariance of `COLUMNS` from one of other unknowns; zero for what is known (index -1)."""
     wide = np.zeros((len(covariance) + 1,) * 2)
-    wide[:-1, :-1] = covariance
+    wide[:-1, :-1] = np.where(np.isfinite(covariance), covariance, 0.0)  # what has no bound is among the unseen motions
     return wide[np.ix_(index, index)]
 
 

@@ -156,7 +156,8 @@ def _placement(bench, pose, rng, images, span, noise, reach):
     hit, u, edge, r = _cast(bench, pose, true, bearings, rng, noise)
     line, beam = np.nonzero(hit)
     near = _near_edges(hit, u, reach)
-    row, b = np.nonzero(near)
+    row, b = np.nonzero(near.any(axis=0))
+    step = np.where(near[1][row, b], bench.step, bench.pitch_step)
     face = {
         "range": r[line, beam] + bench.range_offset + noise * bench.sigma_range * rng.standard_normal(len(line)),
         "bearing": bearings[beam], "pitch": pitch[line], "sigma": np.full(len(line), bench.sigma_range),
@@ -164,6 +165,7 @@ def _placement(bench, pose, rng, images, span, noise, reach):
     beams = {
         "bearing": bearings[b], "pitch": pitch[row], "hit": hit[row, b], "edge": edge[row, b],
         "radius": _radius(bench, r[row, b]), "background": np.zeros(len(row)),
+        "step": step * r[row, b],
     }  # fmt: skip
     at = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1]
     views = _views(bench, pose, at, rng, noise)
@@ -222,15 +224,15 @@ def _cast(bench, pose, pitch, bearings, rng, noise):
 
 
 def _near_edges(hit, u, reach):
-    """Beams within some beams of a change between board and background."""
-    near = np.zeros(hit.shape, bool)
+    """Beams within some beams of a change between board and background, across and along the scan lines (2, l, b)."""
+    near = np.zeros((2, *hit.shape), bool)
     for axis in (0, 1):
         change = np.diff(hit, axis=axis)
         at = np.nonzero(change)
         for k in range(-reach + 1, reach + 1):
             index = list(at)
             index[axis] = np.clip(index[axis] + k, 0, hit.shape[axis] - 1)
-            near[tuple(index)] = True
+            near[(axis, *index)] = True
     return near & np.isfinite(u)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 ROOT_2PI = np.sqrt(2 * np.pi)
+LEAST_STEP = 0.15  # of a beam step: least softness, so that an edge between two beams is put into their middle
 _X = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]  # dense where the share of a disc changes least
 
 
@@ -86,6 +87,28 @@ def edge_shift(log_odds, radius, background=0.0):
     """
     x, slope = disc_edge(log_odds + np.asarray(background, float))
     return radius * x, radius * slope
+
+
+def flip_sigma(softness, radius, step):
+    """Standard deviation of where readings flip, with a floor: beams a step apart cannot show a sharper edge.
+
+    Parameters
+    ----------
+    softness : array_like
+        Standard deviation in spot radii.
+    radius, step : array_like
+        Of the spot, and between neighbouring beams at the board, metres.
+
+    Returns
+    -------
+    sigma : ndarray
+        Metres.
+    share : ndarray
+        ``d ln sigma / d ln softness``, between 0 (all floor) and 1.
+    """
+    soft = softness * np.asarray(radius, float)
+    sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
+    return sigma, (soft / sigma) ** 2
 
 
 def _mills(z):

@@ -25,12 +25,14 @@ from lrfcal_lib.solvers.joint_noise import (
     LARGEST_SHARE,
     ROUGH_MISS,
     estimate_noise,
+    image_misses,
     misfits,
     rough_misses,
     same_levels,
     view_misses,
 )
-from lrfcal_lib.solvers.joint_start import start_states
+from lrfcal_lib.solvers.joint_observations import JointObservations
+from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
 from lrfcal_lib.solvers.joint_warnings import joint_warnings
 from lrfcal_lib.solvers.least_squares import minimise, solve, whiten
 from lrfcal_lib.solvers.platform import AXIS_NAMES, AXIS_WORDS
@@ -76,7 +78,7 @@ class JointSolution:
     misfit : dict of int to float
         Normalised squared residuals of each placement (1 is what the noise explains).
     excluded : dict of int or str to str
-        Placements (and cameras) left out, with the reason.
+        Placements (and, under names of their own, cameras and single images) left out, with the reason.
     unobservable : tuple of str
         Motions that the data do not determine, in words.
     lens : ndarray, shape (c, c)
@@ -89,6 +91,8 @@ class JointSolution:
     state : JointState
     unknowns : Unknowns
     data : JointData
+    observations : JointObservations
+        Without what is excluded.
     """
 
     T_head_lrf: RigidTransform
@@ -107,6 +111,7 @@ class JointSolution:
     state: JointState
     unknowns: Unknowns
     data: JointData
+    observations: JointObservations
 
     @property
     def converged(self):
@@ -246,8 +251,9 @@ def solve_joint(
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
     excluded = blind
     if start is None:
+        obs, lost = without_lost_placements(obs)
         obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
-        excluded = excluded | bad
+        excluded = excluded | lost | bad
     data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), side_sigma=side_sigma, prior=prior)
     state = _converge(start, data, coarse(unknowns), max_iterations)
     state = _converge(state, data, unknowns, max_iterations, LAST_STEP)
@@ -273,6 +279,21 @@ def without_blind_cameras(obs, required):
     return (obs.with_cameras([n for n in obs.cameras if n not in blind]) if blind else obs), words
 
 
+def without_lost_placements(obs):
+    """Leave out placements that no image shows and whose scans cross fewer than two edges, by name."""
+    count = np.zeros((len(obs.placements), len(obs.edges)), int)
+    np.add.at(count, (obs.beam_placement[obs.beam_hit], obs.beam_edge[obs.beam_hit]), 1)
+    crossed = np.sum(count >= FEWEST_ANGLE_POINTS, axis=1)
+    lost = (crossed < 2) & ~np.isin(np.arange(len(crossed)), obs.view_placement)
+    words = {
+        int(p): f"placement {p}: no image shows the board and scans cross {n} edges, two needed; left out"
+        for p, n in zip(obs.placements[lost], crossed[lost], strict=True)
+    }
+    if lost.all():
+        raise DegenerateGeometry("; ".join(words.values()))
+    return obs.select(obs.placements[~lost]), words
+
+
 def settle(state, data, unknowns, iterations):
     """Estimate unknowns and noise levels in turn until they agree."""
     for _ in range(NOISE_ROUNDS):
@@ -284,20 +305,53 @@ def settle(state, data, unknowns, iterations):
 
 
 def drop_contradictions(obs, state, data, unknowns):
-    """Leave out placements whose residuals are far larger than those of the others."""
+    """Leave out placements whose residuals are far larger than the others', or the one image that makes them so."""
     found = misfits(named_blocks(state, data, unknowns), data)
     level = np.median(found)
-    bad = np.flatnonzero(found > CONTRADICTION * max(level, 1.0))
+    limit, rows, words = CONTRADICTION * max(level, 1.0), [], {}
+    bad = np.flatnonzero(found > limit)
+    for i in bad:
+        row, board = wrong_image(obs, state, data, unknowns, i, limit)
+        why = f"residuals are {np.sqrt(found[i] / level):.0f} times those of the others"
+        if row is None:
+            words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
+        else:
+            rows, state.boards[i] = [*rows, row], board
+            words[image_name(obs, row)] = f"{image_name(obs, row)}: with it {why}; the image is left out"
     if len(bad) == 0:
         return obs, state, data, {}
-    words = {
-        int(obs.placements[i]): f"placement {obs.placements[i]}: its residuals are "
-        f"{np.sqrt(found[i] / level):.0f} times those of the others; left out"
-        for i in bad
-    }
-    obs = obs.select(np.delete(obs.placements, bad))
-    own = {key: np.delete(getattr(state, key), bad, axis=0) for key in OWN}
+    kept = ~np.isin(obs.placements, list(words))
+    obs = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), rows)).select(obs.placements[kept])
+    own = {key: getattr(state, key)[kept] for key in OWN}
     return obs, replace(state, **own), with_levels(gather(obs), data), words
+
+
+def image_name(obs, row):
+    """A view in words."""
+    pitch, camera = np.degrees(obs.view_pitch[row]), obs.cameras[obs.view_camera[row]]
+    return f"placement {obs.placements[obs.view_placement[row]]}, image of '{camera}' at {pitch:.1f} deg"
+
+
+def wrong_image(obs, state, data, unknowns, i, limit):
+    """The view without which placement i agrees with the others (None where there is none), and its board then.
+
+    Every view is left out once, in copies of the placement, with all that the placements share held.
+    """
+    rows = np.flatnonzero(obs.view_placement == i)
+    if len(rows) < 2:
+        return None, None
+    copies = np.full(len(rows), i)
+    own = {key: getattr(state, key)[copies] for key in OWN}
+    own["boards"] = boards_in_images(obs, state.head, state.cameras, np.roll(rows, -1))
+    groups = {name: {key: v[copies] for key, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
+    groups["view"]["used"][range(len(rows)), range(len(rows))] = False
+    groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
+    data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
+    lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
+    state = _converge(replace(state, **own), data, lone, START_STEPS)
+    found = misfits(named_blocks(state, data, lone), data)
+    best = int(np.argmin(found))
+    return (rows[best], state.boards[best]) if found[best] <= limit else (None, None)
 
 
 def with_levels(data, like):
@@ -370,10 +424,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
             state = replace(state, head=pose_array(known))
         rough = min(rough, np.median(rough_misses(state, data)))
-        kept, fitting, bad = without_contradictions(obs, state, data)
-        cut = replace(gather(kept) if bad else data, sweep_sigma=tuple(sweep_sigma))
-        state, cost = a_few_steps(fitting, cut, unknowns)
-        badness = cost / count_rows(cut) + LEFT_OUT * len(bad) / len(obs.placements)
+        kept, state, bad, cost = agreeing_start(obs, state, data, unknowns, tuple(sweep_sigma))
+        badness = cost + LEFT_OUT * max(left_out_shares(obs, bad))
         if best is None or badness < least:
             best, least = (kept, state, bad), badness
         if least < GOOD_START and (T0 is None or number):
@@ -385,27 +437,59 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm "
             "or more off where the images put it; check that images and scans carry the right numbers"
         )
-    if len(bad) > LARGEST_SHARE * len(obs.placements):
+    if max(left_out_shares(obs, bad)) > LARGEST_SHARE:
         raise DegenerateGeometry(
-            f"{len(bad)} of {len(obs.placements)} placements contradict the others: their images put the board "
-            f"elsewhere than their scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry the "
+            f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
+            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry the "
             "right numbers"
         )
     return best
 
 
+def left_out_shares(obs, bad):
+    """Shares of the placements, and of the images of the others, that a start value leaves out."""
+    placements = sum(not isinstance(name, str) for name in bad)
+    return placements / len(obs.placements), (len(bad) - placements) / max(len(obs.view_camera), 1)
+
+
+def agreeing_start(obs, state, data, unknowns, sweep_sigma):
+    """A few steps without what contradicts a start value; what a rough one leaves out is judged again by the rest.
+
+    Returns the observations kept, the state, what is left out in words, and the mean cost.
+    """
+    for _ in range(2):
+        kept, fitting, bad = without_contradictions(obs, state, data)
+        cut = replace(gather(kept) if bad else data, sweep_sigma=sweep_sigma)
+        found, cost = a_few_steps(fitting, cut, unknowns)
+        if not bad:
+            break
+        state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
+    return kept, found, bad, cost / count_rows(cut)
+
+
 def without_contradictions(obs, state, data):
-    """Leave out the placements whose scans lie far off where their images put the board."""
-    misses = rough_misses(state, data)
-    bad = misses > max(ROUGH_MISS, 5 * np.median(misses))
-    if not bad.any():
+    """Leave out images that put the board far off where it was scanned, and placements of which none is left."""
+    place, count = obs.view_placement, len(obs.placements)
+    boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place))) if len(place) else state.boards[:0]
+    misses, alone = image_misses(state, data, boards, place), ~np.isin(np.arange(count), place)
+    wrong = misses > max(ROUGH_MISS, 5 * np.median(misses)) if len(place) else np.zeros(0, bool)
+    good = alone | np.isin(np.arange(count), place[~wrong])
+    if not wrong.any():
         return obs, state, {}
+    rows, first = np.unique(place[~wrong], return_index=True)
+    own = {key: getattr(state, key).copy() for key in OWN}
+    own["boards"][rows] = boards[~wrong][first]
     words = {
-        int(p): f"placement {p}: the scan is {1000 * miss:.0f} mm off where its image puts the board; left out"
-        for p, miss in zip(obs.placements[bad], misses[bad], strict=True)
+        int(obs.placements[i]): f"placement {obs.placements[i]}: the scan is {1000 * misses[place == i].min():.0f} mm "
+        "off where its image puts the board; left out"
+        for i in np.flatnonzero(~good)
     }
-    own = {key: getattr(state, key)[~bad] for key in OWN}
-    return obs.select(obs.placements[~bad]), replace(state, **own), words
+    single = np.flatnonzero(wrong & good[place])
+    for row in single:
+        name = image_name(obs, row)
+        words[name] = f"{name}: it puts the board {1000 * misses[row]:.0f} mm off the scan; the image is left out"
+    kept = obs.keep(view=~np.isin(np.arange(len(place)), single)).select(obs.placements[good])
+    return kept, replace(state, **{key: value[good] for key, value in own.items()}), words
 
 
 def a_few_steps(state, data, unknowns):
@@ -513,7 +597,7 @@ def _wrap(obs, data, unknowns, found, excluded):
         noise_levels(data),
         dict(zip(obs.placements.tolist(), misfits(blocks, data).tolist(), strict=True)),
         excluded, found.unobservable, lens, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
-        unknowns, data,
+        unknowns, data, obs,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
+from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.solvers.least_squares import Block
 from lrfcal_lib.solvers.platform import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.solvers.platform_blocks import prior_terms
@@ -22,7 +22,7 @@ SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "
 EXTRA = ("size",)  # one unknown an edge
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
-USUAL_SOFTNESS, SOFTNESS_SPREAD = 0.15, 1.0  # spot radii, and how widely its logarithm may differ
+USUAL = {"edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}  # and how widely they may differ
 SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
 AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
 
@@ -306,12 +306,13 @@ def beam_block(state, data, unknowns):
     u, by_o, by_d, by_t, a, t, n = edge_distance(state, data, group, ray)
     own = np.take_along_axis(state.sides, group["edge"], axis=1)
     shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"] + own)
-    sigma = np.where(group["used"], group["radius"], 1.0) * np.exp(state.sensor[2])
+    radius = np.where(group["used"], group["radius"], 1.0)
+    sigma, share_soft = flip_sigma(np.exp(state.sensor[2]), radius, group["step"])
     margin = shift - u
     cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
-    sensor = np.stack([0 * u, slope, -margin], axis=-1)
+    sensor = np.stack([0 * u, slope, -margin * share_soft], axis=-1)
     size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
     np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
     np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
@@ -424,15 +425,20 @@ def prior_block(state, data, unknowns):
     return Block(np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=cost)
 
 
-def softness_block(state, unknowns):
-    """A weak expectation of the softness, for data that do not show it; every placement holds a part."""
+def usual_block(state, unknowns, name):
+    """A weak expectation of one of `USUAL`, for data that do not show it; every placement holds a part."""
     p, c = len(state.boards), unknowns.cameras
+    (usual, spread), number = USUAL[name], SENSOR.index(name)
     full = np.zeros(len(unknowns.mask))
-    full[4 + 6 * c + SENSOR.index("edge_log_softness")] = 1.0
+    full[4 + 6 * c + number] = 1.0
     J = np.zeros((p, 1, unknowns.shared + unknowns.own))
     J[:, 0, : unknowns.shared] = full[unknowns.mask]
-    away = state.sensor[2] - np.log(USUAL_SOFTNESS)
-    return Block(np.full((p, 1), away), J, np.full((p, 1), 1 / (SOFTNESS_SPREAD * np.sqrt(p))))
+    away = (state.sensor[number] - usual) / (spread * np.sqrt(p))
+    # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with the softness squared:
+    # without this curvature steps overshoot twofold
+    bend = np.sqrt(1 + 2 * max(usual - state.sensor[number], 0.0)) if name == "edge_log_softness" else 1.0
+    cost = np.full((p, 1), 0.5 * away**2)
+    return Block(np.full((p, 1), away / bend), J * bend / (spread * np.sqrt(p)), np.ones((p, 1)), cost=cost)
 
 
 def joint_blocks(state, data, unknowns):
@@ -453,15 +459,14 @@ def joint_blocks(state, data, unknowns):
 
 
 def named_blocks(state, data, unknowns):
-    """Residuals by name: face (metres), beam (likelihoods), view (radians and metres), sweep, side, softness, prior."""
+    """Residuals by name: face (metres), beam (likelihoods), view (radians and metres), sweep, side, `USUAL`, prior."""
     makers = {"face": face_block, "beam": beam_block, "view": view_block}
     blocks = {n: make(state, data, unknowns) for n, make in makers.items() if getattr(data, n)["used"].any()}
     if SWEEPS[unknowns.sweep]:
         blocks["sweep"] = sweep_block(state, data, unknowns)
     if unknowns.sides:
         blocks["side"] = side_block(state, data, unknowns)
-    if "edge_log_softness" in unknowns.sensor:
-        blocks["softness"] = softness_block(state, unknowns)
+    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in unknowns.sensor}
     if data.prior is not None and unknowns.axis:
         blocks["prior"] = prior_block(state, data, unknowns)
     return blocks

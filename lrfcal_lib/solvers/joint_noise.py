@@ -183,10 +183,19 @@ def misfits(blocks, data):
 
 def rough_misses(state, data):
     """Median distance of every board's face points from where the start value puts the board, metres, (p,)."""
-    used = data.face["used"]
-    off = np.where(used, np.abs(on_board(state, data)[..., 2]), np.nan)
-    with np.errstate(all="ignore"):
-        return np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in off])
+    return _medians(np.abs(on_board(state, data)[..., 2]), data.face["used"])
+
+
+def image_misses(state, data, boards, placement):
+    """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
+    o, d = rays(state, data, data.face)[:2]
+    x = (o + (data.face["range"] - state.sensor[0])[..., None] * d)[placement] - boards[:, None, :, 3]
+    return _medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
+
+
+def _medians(values, used):
+    """Medians of the used values of every row; 0 where there are none."""
+    return np.array([np.median(row[mine]) if mine.any() else 0.0 for row, mine in zip(values, used, strict=True)])
 
 
 def view_misses(state, data):
@@ -196,8 +205,7 @@ def view_misses(state, data):
         return np.zeros(len(used))
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=())
     shift = view_block(state, data, lone).residuals.reshape(used.shape + (6,))[..., 3:]
-    off = np.where(used, np.linalg.norm(shift, axis=-1), np.nan)
-    return np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else 0.0 for row in off])
+    return _medians(np.linalg.norm(shift, axis=-1), used)
 
 
 def same_levels(before, after):

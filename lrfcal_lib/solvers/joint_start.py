@@ -51,7 +51,7 @@ def start_states(obs, T0=None):
                 cameras = [
                     known[i] if i in known else _camera_from_sweeps(obs, i, head) for i in range(len(obs.cameras))
                 ]
-                state = _state(obs, head, cameras)
+                state = state_of(obs, head, cameras)
             except (DegenerateGeometry, np.linalg.LinAlgError) as error:
                 reasons.append(str(error))
                 continue
@@ -156,7 +156,7 @@ def _axis_of_turns(turns, motions, T_camera_lrf):
     return head_from_axis(TiltAxis(direction, lrf.apply(point)))
 
 
-def _state(obs, head, cameras):
+def state_of(obs, head, cameras):
     """All unknowns from an axis and the cameras: boards from their first images, or from the scans alone."""
     poses = np.stack([pose_array(T) for T in cameras]) if cameras else np.zeros((0, 3, 4))
     sensor = np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0])
@@ -172,13 +172,14 @@ def _boards(obs, head, cameras):
     boards = np.zeros((len(obs.placements), 3, 4))
     seen, first = np.unique(obs.view_placement, return_index=True)
     if len(seen):
-        boards[seen] = _boards_in_images(obs, pose_array(head), cameras, first)
+        boards[seen] = boards_in_images(obs, pose_array(head), cameras, first)
     for placement in np.setdiff1d(np.arange(len(boards)), seen):
         boards[placement] = pose_array(board_from_scan(obs, placement, head))
     return boards
 
 
-def _boards_in_images(obs, head, cameras, views):
+def boards_in_images(obs, head, cameras, views):
+    """``T_platform_board`` (n, 3, 4) from some views, each by itself; `head` and `cameras` as in JointState."""
     camera, pose = obs.view_camera[views], obs.view_pose[views]
     back = np.swapaxes(cameras[camera][..., :3], -1, -2)
     rotation = back @ pose[:, :3, :3]

@@ -15,10 +15,9 @@ from scipy.stats import f as f_distribution
 
 from lrfcal_lib.board import corners_of_lines
 from lrfcal_lib.geometry import DegenerateGeometry, fit_line, fit_plane, hat, lrf_to_platform, polar_to_points, tilt
-from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
+from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift, flip_sigma
 
 LAPSE = 0.005  # share of beams that something else than the edge decides
-LEAST_STEP = 0.15  # of a beam step: least softness, so that an edge between two beams is put into their middle
 FEWEST_CELLS = 8
 ROUNDS = 40
 
@@ -97,7 +96,7 @@ class _Rays:
     hit: np.ndarray
     radius: np.ndarray
     background: np.ndarray
-    least: np.ndarray
+    step: np.ndarray
 
     def distances(self, lines):
         """Between rays and the lines of their sides, positive outside, and its derivative by a shift of the line."""
@@ -195,8 +194,8 @@ def find_rays(cells, pose, bend, names, model):
     origin = (tilt(model.T_head_lrf.translation, cells.pitch) - pose[:3, 3]) @ pose[:3, :3]
     at = _meet_face(origin, direction, bend)
     side = np.array([number[s] for s in cells.side], int)
-    least = LEAST_STEP * cells.range_m * cells.step
-    return _Rays(at[:, :2], direction, side, cells.hit, cells.radius, cells.background, least), tuple(found.values())
+    step = cells.range_m * cells.step
+    return _Rays(at[:, :2], direction, side, cells.hit, cells.radius, cells.background, step), tuple(found.values())
 
 
 def _meet_face(origin, direction, bend):
@@ -232,7 +231,7 @@ def _evaluate(rays, lines, middle, model):
     """Cost (s,), gradient (s, 2) and information (s, 2, 2) by shifts outwards and turns of the lines."""
     u, factor = rays.distances(lines)
     shift, _ = edge_shift(model.log_odds, rays.radius, rays.background)
-    sigma = np.maximum(model.softness * rays.radius, rays.least)
+    sigma, _ = flip_sigma(model.softness, rays.radius, rays.step)
     cost, score, information, _ = beam_terms(shift - u, sigma, rays.hit, LAPSE)
     normal = lines[rays.side, :2]
     turned = np.stack([-normal[:, 1], normal[:, 0]], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from lrfcal_lib.board import corners_of_lines, outline_lines
 from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
+from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.solvers.least_squares import Block, minimise
 from lrfcal_lib.solvers.observability import reduced_hessian
 from lrfcal_lib.solvers.outline_ml import FEWEST_CELLS, LAPSE, face_surface, find_rays, start_lines
@@ -34,7 +34,7 @@ class _Sweeps:
     hit: np.ndarray
     radius: np.ndarray
     background: np.ndarray
-    least: np.ndarray
+    step: np.ndarray
     used: np.ndarray
 
 
@@ -133,8 +133,8 @@ def _gather(sweeps, edges, model):
     def pad(values, fill=0.0):
         return np.stack([np.concatenate([v, np.full((width - len(v),) + v.shape[1:], fill, v.dtype)]) for v in values])
 
-    names = ("at", "direction", "hit", "radius", "background", "least")
-    whole = {name: pad([getattr(found, name) for found, _ in rays], name in ("radius", "least")) for name in names}
+    names = ("at", "direction", "hit", "radius", "background", "step")
+    whole = {name: pad([getattr(found, name) for found, _ in rays], name in ("radius", "step")) for name in names}
     used = pad([np.ones(len(edge), bool) for _, edge in rays], False)
     return _Sweeps(edge=pad([edge for _, edge in rays], 0), used=used, **whole), starts
 
@@ -182,7 +182,7 @@ def _blocks(state, data, factor, softness, model, free):
     turned, normal = _turned(pose, data.at), lines[data.edge, :2]
     outside = np.sum(normal * (turned + pose[:, None, 1:]), axis=-1) + lines[data.edge, 2]
     shift, slope = edge_shift(log_odds + deviation[rows, data.edge], data.radius, data.background)
-    margin, sigma = shift - factor * outside, np.maximum(softness * data.radius, data.least)
+    margin, sigma = shift - factor * outside, flip_sigma(softness, data.radius, data.step)[0]
     cost, score, information, _ = beam_terms(margin, sigma, data.hit, LAPSE)
     root = np.sqrt(np.maximum(information, 1e-4 / sigma**2)) * data.used
     quarter = np.stack([-turned[..., 1], turned[..., 0]], axis=-1)

@@ -105,7 +105,7 @@ def solve_zhang_pless_batch(sets, T0, *, loss=None, scale=1.0, weighted=True, ma
 
 
 def _refine(sets, pose, weighted, camera, *, loss, scale, max_iterations, required=True):
-    """Iterate with the compression renewed; from an unweighted estimate, because weights of a bad pose hold it there."""
+    """Iterate with the compression renewed, from an unweighted estimate: weights of a bad pose would hold it there."""
     earlier = []
     for weigh in (False, True, True, True, True) if weighted else ():
         evaluate, _ = _compressed(sets, pose, weigh)
