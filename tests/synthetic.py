@@ -62,6 +62,24 @@ def scan_edge_crossings(T_lrf_board, corners=CORNERS):
     return (outline + share[:, None] * (following - outline))[hit] * [1.0, 1.0, 0.0], np.flatnonzero(hit)
 
 
+def near_lines(rng, count):
+    """Rig and observations of single scan lines on small boards 0.4 to 0.9 m away, the camera turned by up to a radian.
+
+    Ranges have 4 mm of noise: a few per cent of a line's length.
+    """
+    rig, poses, corners = random_rig(rng), [], 0.5 * CORNERS
+    turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3))
+    T = RigidTransform.from_components(rig.T_camera_lrf.translation, turn * rig.T_camera_lrf.rotation)
+    for _ in range(count):
+        turn = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)) * Rotation.from_euler("x", 180, degrees=True)
+        centre = np.array([rng.uniform(-0.3, 0.3), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(0.4, 0.9)
+        middle = turn.apply([*corners.mean(axis=0), 0.0])
+        poses.append(RigidTransform.from_components(T.apply(centre) - middle, turn))
+    rig = Rig(T, rig.T_head_lrf, rig.model)
+    options = {"noise": 1.0, "sigma_range": 0.004, "sigma_across": 1e-3, "pattern": False}
+    return rig, camera_observations(rng, rig, poses, corners=corners, **options)
+
+
 def polar_noise(points, sigma_range, sigma_across):
     """Covariance of points with independent noise along and across the ray from the origin, shape (n, 3, 3)."""
     along = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -94,6 +112,7 @@ def camera_observations(
     source="lrf",
     face=40,
     pattern=True,
+    corners=CORNERS,
 ):
     """What a camera and one scan (``source='lrf'``) or a sweep (``source='platform'``) see of boards.
 
@@ -101,7 +120,7 @@ def camera_observations(
     serve as scene points. With a sweep, crossings lie on all edges and face points all over the board.
     """
     model, p = rig.model, len(poses)
-    exact = _exact(rng, rig, poses, source, face)
+    exact = _exact(rng, rig, poses, source, face, corners)
     spread = 1e-3 if source == "platform" else 0.0
     crossing, on_face, scene = (
         _measured(rng, x, noise, sigma_range, sigma_across, s)
@@ -151,11 +170,11 @@ def _measured(rng, points, noise, sigma_range, sigma_across, spread):
     return _draw(rng, points, covariance, noise), covariance, half_step
 
 
-def _exact(rng, rig, poses, source, face):
+def _exact(rng, rig, poses, source, face, outline=CORNERS):
     """Noise-free observations: points (crossings, face, outline corners) with placements, lines, pixels, pattern."""
-    lines, corners = _outline_lines(CORNERS), np.column_stack([CORNERS, np.zeros(4)])
+    lines, corners = _outline_lines(outline), np.column_stack([outline, np.zeros(4)])
     boards = [rig.T_camera_lrf.inv() * pose for pose in poses]
-    crossings = [_source_crossings(rng, board, source) for board in boards]
+    crossings = [_source_crossings(rng, board, source, outline) for board in boards]
     faces = [_face(rng, b, c[0], source, face) for b, c in zip(boards, crossings, strict=True)]
     groups = [[c[0] for c in crossings], faces, [board.apply(corners) for board in boards]]
     image = [
@@ -188,13 +207,13 @@ def _outline_lines(corners):
     return np.column_stack([normal, -np.sum(normal * corners, axis=1)])
 
 
-def _source_crossings(rng, T_source_board, source):
+def _source_crossings(rng, T_source_board, source, outline):
     """Crossings of one scan line, or points along all four edges for a sweep."""
     if source == "lrf":
-        return scan_edge_crossings(T_source_board)
+        return scan_edge_crossings(T_source_board, outline)
     edges = np.repeat(np.arange(4), 3)
     share = rng.uniform(0.1, 0.9, len(edges))[:, None]
-    flat = CORNERS[edges] + share * (np.roll(CORNERS, -1, axis=0)[edges] - CORNERS[edges])
+    flat = outline[edges] + share * (np.roll(outline, -1, axis=0)[edges] - outline[edges])
     return T_source_board.apply(np.column_stack([flat, np.zeros(len(flat))])), edges
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.uncertainty import projection_sigma
 
 MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
 FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -155,3 +156,60 @@ def test_what_is_unobservable_has_no_small_sigma():
     found = solve_joint(obs, required=False)
     assert len(found.unobservable) >= 4
     assert not np.any(found.solution.sigma[:4] < 0.5)
+
+
+@MOUNTS
+def test_a_placement_that_no_image_shows_is_left_out_by_name(mount):
+    obs, truth, _ = draw(rng(), mount=mount)
+    found = solve_joint(obs.keep(view=obs.view_placement != 4, beam=obs.beam_placement != 4))
+    assert list(found.excluded) == [5] and "no image shows the board and scans cross 0 edges" in found.excluded[5]
+    assert 5 not in found.observations.placements and worst(found, replace_boards(truth, 4)) < 4.5
+    with pytest.raises(DegenerateGeometry, match="placement 1: no image .*placement 10: no image"):
+        solve_joint(obs.keep(view=np.zeros(len(obs.view_pitch), bool), beam=obs.beam_edge == 0).with_cameras([]))
+
+
+def replace_boards(truth, out):
+    """The truth without one placement."""
+    return replace(truth, **{key: np.delete(getattr(truth, key), out, axis=0) for key in ("boards", "sweeps", "sides")})
+
+
+@MOUNTS
+@pytest.mark.parametrize("number", [0, -1])
+def test_one_wrong_image_of_several_costs_the_image_not_the_placement(mount, number):
+    obs, truth, _ = draw(rng(), mount=mount)
+    wrong, other = (np.flatnonzero(obs.view_placement == i)[number] for i in (2, 7))
+    pose = obs.view_pose.copy()
+    pose[wrong] = pose[other]
+    found = solve_joint(replace(obs, view_pose=pose), noise="estimate")
+    assert len(found.boards) == 10 and len(found.observations.view_pitch) == len(obs.view_pitch) - 1
+    (words,) = found.excluded.values()
+    assert "placement 3, image of " in words and "the image is left out" in words
+    assert worst(found, truth) < 4.5
+
+
+def test_an_edge_bias_that_nothing_bounds_leaves_cameras_that_planes_fix():
+    obs, _, rig = draw(rng())
+    found = solve_joint(obs.keep(beam=~obs.beam_hit), required=False)
+    assert found.unobservable == ("the edge bias",)
+    assert projection_sigma(found, "left", rig.model, [1.5], (4, 3)).rms()[0] < 20
+
+
+@pytest.mark.parametrize("settings", [{"spot": (0.004, 0.0)}, {"spot": (0.012, 0.0044), "softness": 0.05}])
+def test_sigma_is_honest_where_beams_are_wider_apart_than_readings_flip(settings):
+    """Mean normalised squared error of axis and cameras; chance alone exceeds 1.38 once in a thousand."""
+    square = 0.0
+    for seed in range(10):
+        obs, truth, _ = draw(rng(seed), **settings)
+        found = solve_joint(obs)
+        error, k = state_errors(found.state, truth, found.unknowns)[:16], found.solution.covariance[:16, :16]
+        square += error @ np.linalg.solve(k, error) / 160
+        assert found.converged
+    assert 0.7 < square < 1.38
+
+
+@MOUNTS
+def test_a_scale_of_the_pitch_that_nothing_shows_stays_within_what_is_usual(mount):
+    obs, *_ = draw(rng(), mount=mount, see_span=np.radians(0.5), pitch_step=np.radians(0.25), see_images=1)
+    found = solve_joint(obs, sensor=("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale"), required=False)
+    assert not any("scale of the pitch" in words for words in found.unobservable)
+    assert abs(found.sensor["pitch_scale"]) < 0.15 and found.covariance("pitch_scale")[0, 0] ** 0.5 < 0.051

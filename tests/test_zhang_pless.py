@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_observations, near_lines, random_board_poses, random_rig
 
 from lrfcal_lib.camera import project
 from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
@@ -22,9 +22,9 @@ from lrfcal_lib.solvers.planes import (
     range_weights,
 )
 from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform
+from lrfcal_lib.solvers.start import common_plane
 from lrfcal_lib.solvers.zhang_pless import (
     closed_form,
-    full_planes,
     solve_zhang_pless,
     solve_zhang_pless_batch,
     solve_zhang_pless_joint,
@@ -44,7 +44,7 @@ def test_closed_form_is_exact_on_exact_data(source):
     rig, obs = make(1, source=source)
     sets = plane_sets(obs)
     triangles = compress(sets, 1.0)
-    assert full_planes(triangles) == (source == "platform")
+    assert common_plane(triangles)[1] == (source == "lrf")
     found = pose_transform(closed_form(triangles, sets.boards, source == "platform"))
     angle, distance = transform_difference(found, rig.T_camera_lrf)
     assert angle < 1e-9 and distance < 1e-9
@@ -243,3 +243,41 @@ def test_too_few_placements_are_refused():
     _, obs = make(19)
     with pytest.raises(DegenerateGeometry, match="2 placements with a board pose"):
         solve_zhang_pless(obs.select([1, 2]))
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_single_lines_near_by_are_no_sweeps(seed):
+    """36 lines at 0.4 to 0.9 m: 4 mm of noise are 4 % of their length, yet they leave the scan plane nowhere."""
+    rng = np.random.default_rng(100)
+    rig, obs = near_lines(np.random.default_rng(seed), 36)
+    halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(40)]
+    for some in (obs, *halves):
+        found, right = solve_zhang_pless(some), solve_zhang_pless(some, rig.T_camera_lrf)
+        assert transform_difference(found.transform, right.transform)[0] < 1e-6
+    assert len(find_outlying_placements(obs).inliers) == 36
+
+
+def test_lines_in_another_common_plane_of_the_source():
+    """Single shots of a head that was pitched and shifted, in the frame of its base."""
+    rig, obs = make(22)
+    moved = replace(obs, plane_points=OFF.apply(obs.plane_points))
+    found = solve_zhang_pless(moved)
+    assert transform_difference(found.transform * OFF, rig.T_camera_lrf)[1] < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_weights_never_hold_a_bad_start(seed):
+    rig, obs = make(seed, noise=1.0)
+    rng = np.random.default_rng(seed)
+    bad = RigidTransform.from_components(rng.normal(0, 0.3, 3), Rotation.from_rotvec(rng.normal(0, 0.6, 3)))
+    weighted, plain = (solve_zhang_pless(obs, rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False))
+    rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in (weighted, plain)]
+    assert rms[0] < 1.3 * rms[1]
+
+
+@pytest.mark.parametrize(("count", "spread"), [(12, 1e-4), (2, 0.6)])
+def test_what_is_not_required_needs_no_start_value(count, spread):
+    _, obs = make(17, spread=spread, source="platform")
+    few = obs.select(range(1, count + 1))
+    found = solve_zhang_pless(few, required=False)
+    assert found.unobservable and np.abs(plane_residuals_m(few, found.transform)).max() < 1e-3
