@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.evaluate import handed_over, plane_residuals_of, rms, trusted_sigma
+from lrfcal_lib.evaluate import handed_over, plane_residuals_of, rms
 from lrfcal_lib.pipeline import calibrate, color_cloud
 from lrfcal_lib.reconstruct import write_ply
 from lrfcal_lib.session import open_session
@@ -66,7 +66,7 @@ def calibration_record(calibration, method):
 
 def _sensor(solution):
     """What the joint estimate says about range finder and pitch; None where it was not estimated."""
-    sigma = dict(zip(solution.solution.names, trusted_sigma(solution.solution).tolist(), strict=True))
+    sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
     named = {name: {"value": solution.sensor[name], "sigma": sigma[name]} for name in solution.sensor if name in sigma}
     return named | {"noise": solution.noise, "excluded_placements": solution.excluded}
 
@@ -79,8 +79,8 @@ def _camera(model, obs, solution):
     return {
         "maps": f"{obs.source} to {obs.camera}",
         **_transform(solution.transform),
-        "sigma": dict(zip(solution.names[:6], trusted_sigma(solution)[:6].tolist(), strict=True)),
-        "covariance": solution.covariance[:6, :6].tolist(),
+        "sigma": dict(zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)),
+        "covariance": solution.trusted[:6, :6].tolist(),
         "intrinsics": _intrinsics(solution.model or model),
         "converged": bool(solution.converged),
         "unobservable": list(solution.unobservable),

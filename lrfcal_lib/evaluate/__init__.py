@@ -24,7 +24,6 @@ from lrfcal_lib.evaluate.tables import (
     scans_table,
     stereo_check,
     sweeps_table,
-    trusted_sigma,
 )
 from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, edge_point_table, read_truth
 
@@ -35,5 +34,5 @@ __all__ = [
     "joint_table", "left_out_residuals", "method_comparison", "noise_table", "outline_table", "pitch_errors_table",
     "pitch_models_table", "placements_table", "plane_residuals_of", "platform_calibration_table", "poses_under",
     "random_halves", "read_truth", "rms", "scans_table", "steadiness_table", "steps_table", "stereo_check",
-    "sweeps_table", "trusted_sigma",
+    "sweeps_table",
 ]  # fmt: skip

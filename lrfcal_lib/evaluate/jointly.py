@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.tables import rms, trusted_sigma, unit_of
+from lrfcal_lib.evaluate.tables import rms, unit_of
 from lrfcal_lib.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
 from lrfcal_lib.solvers.camera import edge_residuals_px
 from lrfcal_lib.solvers.edge_likelihood import disc_edge, edge_shift
@@ -40,9 +40,10 @@ def joint_table(joint):
     spread = solution.sigma_placements
     spread = np.full(len(solution.names), np.nan) if spread is None else spread
     rows = []
-    for name, value, noise, scatter in zip(solution.names, solution.parameters, solution.sigma, spread, strict=True):
+    columns = solution.parameters, solution.sigma, spread, solution.trusted_sigma
+    for name, *values in zip(solution.names, *columns, strict=True):
         unit, factor = _unit(name)
-        rows.append((name, unit, factor * value, factor * noise, factor * scatter, factor * np.fmax(noise, scatter)))
+        rows.append((name, unit, *(factor * value for value in values)))
     columns = ["parameter", "unit", "value", "sigma_noise", "sigma_placements", "sigma"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -168,7 +169,7 @@ def own_sigma(solution, camera):
     """Standard deviations of a camera's pose without the part of the intrinsics, which all placements share."""
     index = solution.columns(f"{camera}_")
     lens = np.diag(solution.lens)[index]
-    return np.sqrt(np.maximum(trusted_sigma(solution.camera(camera)) ** 2 - lens, 0.0))
+    return np.sqrt(np.maximum(solution.camera(camera).trusted_sigma ** 2 - lens, 0.0))
 
 
 def joint_errors(joint, truth):
@@ -189,7 +190,7 @@ def joint_errors(joint, truth):
     rows = [("tilt axis", turn, np.linalg.norm(sigma[:2]), shift, np.linalg.norm(sigma[2:]))]
     for camera, found in solution.transforms.items():
         turn, shift = transform_difference(found, truth.cameras[camera])
-        spread = trusted_sigma(solution.camera(camera))
+        spread = solution.camera(camera).trusted_sigma
         rows.append((f"camera {camera}", turn, np.linalg.norm(spread[:3]), shift, np.linalg.norm(spread[3:])))
     factors = np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1000.0, 1000.0])
     columns = ["rotation_error_deg", "rotation_sigma_deg", "translation_error_mm", "translation_sigma_mm"]

@@ -267,7 +267,7 @@ def camera_calibration_table(solutions):
     """
     rows = []
     for (camera, method), solution in solutions.items():
-        sigma = trusted_sigma(solution)
+        sigma = solution.trusted_sigma
         for name, value, spread in zip(solution.names, solution.parameters, sigma, strict=True):
             unit, factor = unit_of(name)
             rows.append((camera, method, name, unit, factor * value, factor * spread))
@@ -449,12 +449,6 @@ def axis_knowledge_table(platform):
         unit, factor = ("deg", np.rad2deg(1.0)) if name.startswith("axis") else ("mm", 1000.0)
         rows.append((name, unit, factor * data, factor * rough, "data" if data < rough else "rough measurement"))
     return pd.DataFrame(rows, columns=["parameter", "unit", "sigma_data", "sigma_rough", "better"])
-
-
-def trusted_sigma(solution):
-    """Standard deviations to trust: the larger of propagated noise and spread over placements, shape (k,)."""
-    spread = solution.sigma_placements
-    return solution.sigma if spread is None else np.fmax(solution.sigma, spread)
 
 
 def unit_of(parameter):

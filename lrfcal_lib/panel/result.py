@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.evaluate import handed_over, trusted_sigma
+from lrfcal_lib.evaluate import handed_over
 from lrfcal_lib.export import calibration_record, write_calibration
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.joint_calibration import calibrate_jointly
@@ -87,7 +87,7 @@ def poses(found, method):
     out = {}
     for (camera, name), solution in found.solutions.items():
         if name == method:
-            sigma, scale = trusted_sigma(solution)[:6], np.repeat([np.degrees(1), 1000.0], 3)
+            sigma, scale = solution.trusted_sigma[:6], np.repeat([np.degrees(1), 1000.0], 3)
             values = scale * np.concatenate([solution.transform.rotation.as_rotvec(), solution.transform.translation])
             out[camera] = (values[:3], values[3:], *np.split(scale * sigma, 2))
     return out

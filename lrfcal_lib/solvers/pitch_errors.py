@@ -160,7 +160,7 @@ def estimate_pitch_errors(
     for name in names:
         found, state = _solve_model(name, data, state, sigmas, required)
         if name == "direction":
-            direction = float(state[1]), _direction_sigma(found, len(data.cameras))
+            direction = float(state[1]), float(found.trusted_sigma[6 * len(data.cameras)])
         previous = models.get(names[names.index(name) - 1]) if models else None
         models[name] = _model(name, data, state, found, previous, sigma)
     return PitchErrors(data.placements, data.direction, *direction, models, wanted_model(models))
@@ -192,12 +192,6 @@ def _solve_model(name, data, state, sigmas, required):
         freedom=data.n_numbers - 6,
     )
     return found, found.state
-
-
-def _direction_sigma(found, cameras):
-    clustered = found.covariance_placements
-    chosen = found.covariance if clustered is None else clustered
-    return float(np.sqrt(chosen[6 * cameras, 6 * cameras]))
 
 
 def _model(name, data, state, found, previous, sigma):
@@ -256,7 +250,7 @@ def _own_sigmas(name, found, p, cameras, level):
     if name == "none":
         return np.zeros(p), np.zeros(p)
     if name == "direction":
-        return np.full(p, _direction_sigma(found, cameras)), np.zeros(p)
+        return np.full(p, found.trusted_sigma[6 * cameras]), np.zeros(p)
     own = found.jacobian[..., 6 * cameras :]
     inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own) * level
     sigma = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
