@@ -199,6 +199,10 @@ class PlatformCalibration:
             found["joint"] = chart_parameters(pose_array(self.joint[0])), self.joint[1]
         return found
 
+    def axis_with(self, method):
+        """Name of the axis that goes with the camera poses of a method."""
+        return "joint" if method == "joint" else "combined"
+
     def transform(self, method):
         """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
         special = {"stated": self.stated, "combined": self.T_head_lrf}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.evaluate.tables import rms, unit_of
+from lrfcal_lib.evaluate.tables import ends_of, rms, unit_of
 from lrfcal_lib.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
+from lrfcal_lib.pairing import likely_outline_of
 from lrfcal_lib.solvers.camera import edge_residuals_px
 from lrfcal_lib.solvers.edge_likelihood import disc_edge, edge_shift
 from lrfcal_lib.solvers.joint import solve_again
@@ -111,6 +115,38 @@ def joint_fit(joint):
     plane = on_board(solution.state, solution.data)[..., 2][used]
     edges = [edge_misses_px(joint, camera) for camera in joint.observations.cameras]
     return {"plane_rms_mm": 1000 * rms(plane), "edge_rms_px": rms(np.concatenate(edges))}
+
+
+def size_error(joint):
+    """How much larger the board is in the cloud than stated, ranges as recorded.
+
+    An offset of all ranges would stretch the cloud until it fits a board whose size is stated wrong, so it is left out;
+    the offset that the maker admits is a part of the expected error.
+
+    Parameters
+    ----------
+    joint : JointCalibration
+
+    Returns
+    -------
+    error, sigma : float
+        Mean relative error of the lengths whose ends beams decide, and its standard deviation: scatter over placements,
+        range offset, edge bias. NaN with fewer than three placements.
+    """
+    prepared, model = joint.prepared, replace(joint.edge_model(), range_offset=0.0)
+    true, edges, found = prepared.board.lengths(), prepared.board.edges, []
+    for placement in joint.solution.boards:
+        with suppress(DegenerateGeometry):
+            measured, across = likely_outline_of(prepared, placement, model)
+            own = [v / true[k] - 1 for k, v in measured.lengths.items() if ends_of(edges, k, across) == "scan"]
+            found += [np.mean(own)] if own else []
+    if len(found) < 3:
+        return np.nan, np.nan
+    beams, faces = joint.solution.data.beam, joint.solution.data.face
+    slope = edge_shift(model.log_odds, np.median(beams["radius"][beams["used"]]))[1]
+    bias = 2 * slope * model.log_odds_sigma / np.mean(list(true.values()))
+    offset = prepared.session.lrf.admitted_offset / np.median(faces["range"][faces["used"]])
+    return float(np.mean(found)), float(np.linalg.norm([np.std(found, ddof=1) / np.sqrt(len(found)), offset, bias]))
 
 
 def edge_misses_px(joint, camera):

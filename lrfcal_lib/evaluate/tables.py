@@ -546,13 +546,13 @@ def _placement_lengths(prepared, placement, variant, measure):
         length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):
-            ends = _ends(prepared.board.edges, name, across)
+            ends = ends_of(prepared.board.edges, name, across)
         if _seen_in_image(prepared, placement, name):
             rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
     return rows
 
 
-def _ends(edges, name, across):
+def ends_of(edges, name, across):
     """What decides the ends of an edge: its neighbours in the image, beams, or the recorded pitch."""
     if across is None:
         return "image"
