@@ -162,7 +162,7 @@ def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
 
 def _answered(found, reasons):
     """A verdict with more reasons, the worst first."""
-    reasons = sorted((*found.reasons, *reasons), key=lambda r: r.answer != NO)
+    reasons = sorted((*reasons, *found.reasons), key=lambda r: r.answer != NO)
     answer = NO if any(r.answer == NO for r in reasons) else CARE if reasons else YES
     return replace(found, answer=answer, reasons=tuple(reasons))
 
@@ -183,23 +183,23 @@ def judge(calibration, method=None, **options):
     Verdict
         'no' without errors where nothing is handed over.
     """
-    prepared = calibration.prepared
+    prepared, joint = calibration.prepared, calibration.joint
+    # also where the joint estimate is not handed over: a wrong size may be why
+    sizes = [] if joint is None else [*_range_offset(joint), *_size(joint)]
     try:
         method = method or handed_over(calibration)
     except ValueError as error:
         found = calibration.problems.items()
         why = "; ".join([f"nothing can be handed over ({error})", *(f"{' '.join(k)}: {v}" for k, v in found)])
-        return Verdict(NO, (Reason(NO, "handed over", why),), {}, np.nan, 0.0, None)
+        return _answered(Verdict(NO, (), {}, np.nan, 0.0, None), [*sizes, Reason(NO, "handed over", why)])
     if method == "joint":
-        found = verdict(calibration.joint.solution, prepared.models, **sight_of(prepared) | options)
+        found = verdict(joint.solution, prepared.models, **sight_of(prepared) | options)
     else:
         found = _without_joint(calibration, method, options.get("distances", DISTANCES))
     reasons, words = _left_out(calibration, method)
-    if calibration.joint is not None:  # also where it is not handed over: a wrong size may be why
-        reasons += [*_range_offset(calibration.joint), *_size(calibration.joint)]
     axis = calibration.platform.axis_with(method)
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", words)
-    return replace(_answered(found, reasons), notes=notes)
+    return replace(_answered(found, sizes + reasons), notes=notes)
 
 
 def sight_of(prepared):

@@ -40,8 +40,8 @@ __all__ = [
     "PAPER_EDGES_MM", "Truth", "axis_errors", "axis_knowledge_table", "bends_table", "best_method",
     "camera_calibration_table", "camera_errors", "diagnose", "edge_bias_mm", "edge_lengths", "edge_misses_px",
     "edge_point_table", "edge_summary", "findings_in_words", "handed_over", "intrinsics_table", "joint_errors",
-    "joint_fit", "joint_table", "left_out_residuals", "method_comparison", "noise_table", "outline_table", "pitch_errors_table",
-    "pitch_models_table", "placements_table", "plane_residuals_of", "platform_calibration_table", "poses_under",
-    "random_halves", "read_truth", "rms", "scans_table", "size_error", "steadiness_table", "steps_table",
-    "stereo_check", "sweeps_table",
+    "joint_fit", "joint_table", "left_out_residuals", "method_comparison", "noise_table", "outline_table",
+    "pitch_errors_table", "pitch_models_table", "placements_table", "plane_residuals_of", "platform_calibration_table",
+    "poses_under", "random_halves", "read_truth", "rms", "scans_table", "size_error", "steadiness_table",
+    "steps_table", "stereo_check", "sweeps_table",
 ]  # fmt: skip

@@ -7,7 +7,7 @@ independent numbers are placements, not points: neighbouring points err together
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -104,7 +104,8 @@ class PitchErrors:
     direction : ndarray of int, shape (p,)
     direction_offset, direction_sigma : float
         Radians to add to the recorded pitch of sweeps with direction +1 (and to subtract for -1), with its standard
-        deviation from the scatter over the placements. nan where the sweeps all go one way.
+        deviation, the larger of noise (at the level of the residuals) and scatter over the placements. nan where the
+        sweeps all go one way.
     models : dict of str to PitchModel
     wanted : str
         The model that the data ask for: each larger one must beat the last one wanted with p < 0.01.
@@ -191,7 +192,9 @@ def _solve_model(name, data, state, sigmas, required):
         limit=10.0,
         freedom=data.n_numbers - 6,
     )
-    return found, found.state
+    # the stated sigmas only weigh faces against edges: the level of the noise comes from the residuals
+    level = misfit(data, found.state)[0] / max(data.n_numbers - 6, 1) / sigmas[0] ** 2 / found.inflation
+    return replace(found, covariance=level * found.covariance), found.state
 
 
 def _model(name, data, state, found, previous, sigma):
