@@ -2,16 +2,18 @@
 
 import json
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from shared import DATA
 
 from lrfcal_lib import __main__, verdict
 from lrfcal_lib.export import UNTRUSTED, calibrate_session
 from lrfcal_lib.session import LrfInfo, open_session
 from lrfcal_lib.session.stated import ASSUMED_SYSTEMATIC_ERROR, lrf_from_json, lrf_to_json
+
+DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def lrf(model="SICK LMS400", **options):

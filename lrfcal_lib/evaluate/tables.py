@@ -214,13 +214,15 @@ def best_method(comparison, among=("line", "zhang_pless")):
     Raises
     ------
     ValueError
-        If none of them was judged on left-out placements.
+        If none of them was judged on left-out placements, or there is none.
 
     Notes
     -----
     A rule of thumb, made after the two sessions it was first used on had been seen. It picks one winner by a margin
     that may be within the noise (48.9 against 53.9 px mm on the LMS400 recording).
     """
+    if comparison.empty:
+        raise ValueError("no camera was calibrated by any method")
     mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
     score = mean.reindex(list(among)).prod(axis=1, skipna=False).dropna()
     if score.empty:
