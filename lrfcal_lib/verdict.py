@@ -280,7 +280,7 @@ def _left_out(calibration, method):
     """All placements that the result does not rest on, counted and with their reasons."""
     prepared, excluded = calibration.prepared, {}
     table = placements_table(prepared, calibration.observations).set_index("placement")
-    used = set(table.index[table.used])
+    used = set(table.index[table.used]) - set(prepared.problems)
     if method == "joint":
         used, excluded = set(calibration.joint.solution.boards), calibration.joint.solution.excluded
     lost = [p for p in table.index if p not in used]

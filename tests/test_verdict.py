@@ -84,11 +84,8 @@ def thin(tmp_path_factory):
 def test_a_thin_session_fails_and_says_so(thin, tmp_path, capsys):
     status, said = calibrate_session(thin, tmp_path), capsys.readouterr().out
     assert status == UNTRUSTED == 3
-    assert "This calibration cannot be trusted: " in said
-    file = tmp_path / "calibration.json"
-    if file.is_file():  # what is handed over carries its verdict
-        assert json.loads(file.read_text())["verdict"]["answer"] == "no"
-        assert "Expected error at 2 m" in said and "Handed over: " in said
+    assert "This calibration cannot be trusted: nothing can be handed over" in said
+    assert not (tmp_path / "calibration.json").exists()
 
 
 @pytest.mark.parametrize(("session", "warned"), [("sim_quick", True), ("sim_lms221", False)])
