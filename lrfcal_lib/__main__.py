@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+FEW = 6  # placements
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 
@@ -16,11 +17,16 @@ def _import_lasersetero(args):
 
 
 def _check(args):
-    from lrfcal_lib.session import validate
+    from lrfcal_lib.session import open_session, validate
 
     problems = validate(args.session)
     print("\n".join(problems) or f"{args.session}: nothing to complain about")
-    return 1 if problems else 0
+    if problems:
+        return 1
+    count = len(open_session(args.session).board_placements)
+    if count < FEW:
+        print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
+    return 0
 
 
 def _calibrate(args):
@@ -118,7 +124,7 @@ def main(argv=None):
     -------
     int
         0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after Ctrl-C. ``record`` has
-        its own: 2 after a message that says what to do.
+        its own: 2 after a message that says what to do; ``calibrate`` has 3 where the verdict is 'no'.
     """
     args, args.rest = parser().parse_known_args(argv)
     if args.rest and args.run not in (_report, _emulate):

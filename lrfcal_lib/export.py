@@ -9,20 +9,22 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.evaluate import handed_over, plane_residuals_of, rms, trusted_sigma
+from lrfcal_lib.evaluate import edge_misses_px, handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.pipeline import calibrate, color_cloud
 from lrfcal_lib.reconstruct import write_ply
 from lrfcal_lib.session import open_session
 from lrfcal_lib.solvers.camera import edge_residuals_px
+from lrfcal_lib.verdict import NO, judge
 
 SCHEMA = 1
+UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
 FRAMES = (
     "destination first: p_camera = T_camera_source p_source; metres, radians; "
     "covariances of [w, v]: R <- exp(w) R, t <- t + v"
 )
 
 
-def calibration_record(calibration, method):
+def calibration_record(calibration, method, judged=None):
     """Everything a calibration says, ready for JSON.
 
     Parameters
@@ -30,22 +32,25 @@ def calibration_record(calibration, method):
     calibration : Calibration
     method : str
         The method whose results are handed over; 'joint' brings its own platform, range offset and pitch terms.
+    judged : Verdict, optional
+        On these results, where :func:`lrfcal_lib.verdict.judge` was asked already.
 
     Returns
     -------
     dict
-        Schema, library version, session with the SHA-256 of its files, frames and units, platform, and for each camera
-        its pose, intrinsics, covariance, and residual statistics; with the joint estimate also what it says about the
-        sensor.
+        Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for
+        each camera its pose, intrinsics, covariance, and residual statistics; with the joint estimate also what it says
+        about the sensor.
     """
     prepared, session = calibration.prepared, calibration.prepared.session
     variant = "joint" if method == "joint" else "half_step"
     cameras = {
         camera: _camera(prepared.models[camera], calibration.observations[camera, variant], solution)
+        | (_joint_fit(calibration.joint, camera) if method == "joint" else {})
         for (camera, name), solution in calibration.solutions.items()
         if name == method
     }
-    axis = "joint" if method == "joint" else "combined"
+    axis = calibration.platform.axis_with(method)
     record = {
         "schema": SCHEMA,
         "lrfcal": __version__,
@@ -53,6 +58,7 @@ def calibration_record(calibration, method):
         "inputs_sha256": file_hashes(session.path),
         "conventions": FRAMES,
         "method": method,
+        "verdict": (judged or judge(calibration, method, suggest=False)).record(),
         "platform": _transform(calibration.platform.transform(axis))
         | {
             "maps": "lrf to head",
@@ -66,7 +72,7 @@ def calibration_record(calibration, method):
 
 def _sensor(solution):
     """What the joint estimate says about range finder and pitch; None where it was not estimated."""
-    sigma = dict(zip(solution.solution.names, trusted_sigma(solution.solution).tolist(), strict=True))
+    sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
     named = {name: {"value": solution.sensor[name], "sigma": sigma[name]} for name in solution.sensor if name in sigma}
     return named | {"noise": solution.noise, "excluded_placements": solution.excluded}
 
@@ -74,13 +80,18 @@ def _sensor(solution):
 AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
 
 
+def _joint_fit(joint, camera):
+    """Residuals as the joint estimate has them: without the edge bias, from the boards where it puts them."""
+    return {"edge_rms_px": rms(edge_misses_px(joint, camera)), "plane_rms_mm": joint_fit(joint)["plane_rms_mm"]}
+
+
 def _camera(model, obs, solution):
     edge = edge_residuals_px(obs, solution.transform, solution.model)
     return {
         "maps": f"{obs.source} to {obs.camera}",
         **_transform(solution.transform),
-        "sigma": dict(zip(solution.names[:6], trusted_sigma(solution)[:6].tolist(), strict=True)),
-        "covariance": solution.covariance[:6, :6].tolist(),
+        "sigma": dict(zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)),
+        "covariance": solution.trusted[:6, :6].tolist(),
         "intrinsics": _intrinsics(solution.model or model),
         "converged": bool(solution.converged),
         "unobservable": list(solution.unobservable),
@@ -133,7 +144,7 @@ def _plain(value):
 
 
 def calibrate_session(path, out=None):
-    """Calibrate a session from the command line: print what came out, write ``calibration.json`` and ``cloud.ply``.
+    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and ``cloud.ply``.
 
     Parameters
     ----------
@@ -145,23 +156,22 @@ def calibrate_session(path, out=None):
     Returns
     -------
     int
-        0, or 1 when no camera could be calibrated.
+        0, or 3 where the verdict is 'no' (also when no camera could be calibrated and nothing is written).
     """
     found = calibrate(open_session(path))
     folder = Path(out or Path("reports") / Path(path).resolve().name)
     for (camera, method), solution in found.solutions.items():
-        turn, shift = np.rad2deg(solution.parameters[:3]).round(3), (1000 * solution.parameters[3:6]).round(1)
+        scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
+        values, sigma = scale * solution.parameters[:6], scale * solution.trusted_sigma[:6]
+        turn, shift = (f"{values[i].round(2)} +- {sigma[i].round(2)}" for i in (slice(0, 3), slice(3, 6)))
         print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
     for key, why in (found.prepared.problems | found.problems).items():
         print(f"{key}: {why}")
-    try:
+    judged = judge(found)
+    print(*judged.sentences(), sep="\n")
+    if judged.errors:  # otherwise nothing can be handed over
         method = handed_over(found)
-    except ValueError as error:
-        print(f"nothing written: {error}")
-        return 1
-    print(f"handed over: {method}")
-    record = calibration_record(found, method)
-    write_calibration(folder / "calibration.json", record)
-    write_ply(folder / "cloud.ply", color_cloud(found, method))
-    print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")
-    return 0
+        write_calibration(folder / "calibration.json", calibration_record(found, method, judged))
+        write_ply(folder / "cloud.ply", color_cloud(found, method))
+        print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")
+    return UNTRUSTED if judged.answer == NO else 0

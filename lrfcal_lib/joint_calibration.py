@@ -45,11 +45,10 @@ class JointCalibration:
     without: dict
 
     def axis_parameters(self):
-        """The four numbers of the axis and their covariance (the larger of noise and scatter over the placements)."""
-        covariance = trusted(self.solution, "axis"), trusted(self.solution, "offset_")
-        whole = np.zeros((4, 4))
-        whole[:2, :2], whole[2:, 2:] = covariance
-        return chart_parameters(pose_array(self.solution.T_head_lrf)), whole
+        """The four numbers of the axis and their covariance (see `Solution.trusted`); zero where it was not unknown."""
+        found = self.solution.covariance("axis_", "offset_")
+        covariance = found if len(found) else np.zeros((4, 4))
+        return chart_parameters(pose_array(self.solution.T_head_lrf)), covariance
 
     def seen_by(self, camera, solution=None, **options):
         """Observations of a camera made with the platform, range offset and pitch of the joint estimate.
@@ -78,7 +77,8 @@ class JointCalibration:
         EdgeModel
         """
         solution = self.without.get(placement, self.solution)
-        sensor, sigma = solution.sensor, dict(zip(solution.solution.names, solution.solution.sigma, strict=True))
+        sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma, strict=True))
+        sensor = solution.sensor
         return EdgeModel(
             log_odds=sensor["edge_log_odds"],
             log_odds_sigma=float(sigma.get("edge_log_odds", 0.0)),
@@ -89,12 +89,6 @@ class JointCalibration:
             T_head_lrf=solution.T_head_lrf,
             correct=solution.correct,
         )
-
-
-def trusted(solution, prefix):
-    """Covariance of some unknowns: of noise or of the scatter over placements, whichever is larger."""
-    found = [solution.covariance(prefix, clustered) for clustered in (False, True)]
-    return max(found, key=np.trace)
 
 
 def joint_settings(prepared, observations):

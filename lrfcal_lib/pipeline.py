@@ -191,13 +191,17 @@ class PlatformCalibration:
 
     def parameters(self):
         """Angles of the axis out of and within the scan plane, and its offsets within and across it, by method."""
-        found = {name: (s.solution.parameters, trusted_axis_covariance(s)) for name, s in self.solutions.items()}
+        found = {name: (s.solution.parameters, s.solution.trusted) for name, s in self.solutions.items()}
         if self.stated is not None:
             found["stated"] = chart_parameters(pose_array(self.stated)), stated_covariance(self.stated_sigma)
         found["combined"] = chart_parameters(pose_array(self.T_head_lrf)), self.covariance
         if self.joint is not None:
             found["joint"] = chart_parameters(pose_array(self.joint[0])), self.joint[1]
         return found
+
+    def axis_with(self, method):
+        """Name of the axis that goes with the camera poses of a method."""
+        return "joint" if method == "joint" else "combined"
 
     def transform(self, method):
         """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
@@ -246,11 +250,6 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     return PlatformCalibration(T_head_lrf, covariance, solutions, problems, stated, sigma)
 
 
-def trusted_axis_covariance(solution):
-    """The scatter over placements where it is known (it holds model errors too), else the propagated noise."""
-    return solution.covariance if solution.covariance_placements is None else solution.covariance_placements
-
-
 def stated_covariance(sigma):
     """Covariance of the stated axis in the chart, shape (4, 4), from its two standard deviations."""
     return np.diag(np.repeat(np.square(sigma), 2))
@@ -271,7 +270,7 @@ def combine(solution, stated, sigma):
     T_head_lrf : RigidTransform
     covariance : ndarray, shape (4, 4)
     """
-    covariance = trusted_axis_covariance(solution)
+    covariance = solution.solution.trusted
     if stated is None:
         return solution.T_head_lrf, covariance
     prior, known = stated_covariance(sigma), chart_parameters(pose_array(stated))

@@ -137,7 +137,7 @@ def chain_of(solution, camera=None, clustered=True):
     prefix = "" if camera is None else f"{camera}_"
     wanted = [*AXIS_NAMES, *(prefix + name for name in POSE_NAMES), *COLUMNS[10:]]
     index = [found.names.index(name) if name in found.names else -1 for name in wanted]
-    both = [found.covariance, found.covariance_placements if clustered else None]
+    both = [found.covariance, found.trusted if clustered else None]
     covariances = tuple(_spread_out(C, index) for C in both if C is not None)
     number = list(solution.transforms).index(camera) if camera else 0
     on_head = camera is None or solution.data.on_head[number]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from lrfcal_lib.advice import Suggestion, brief, group_sigma, suggest_placement
 from lrfcal_lib.candidates import outline
+from lrfcal_lib.evaluate import handed_over, placements_table, size_error
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.platform import AXIS_NAMES
-from lrfcal_lib.uncertainty import point_sigma, projection_sigma, range_noise
+from lrfcal_lib.solvers.pose import pose_array
+from lrfcal_lib.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 
 YES, CARE, NO = "yes", "with care", "no"
+DISTANCES = (1.0, 2.0, 5.0)  # metres
 FEWEST, FEW = 3, 6  # placements
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
@@ -20,7 +23,11 @@ SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
 SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
 MISFIT = 4.0  # normalised squared residual, relative to the median placement's
 MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
-STATED = 2.5  # residuals in units of the stated noise
+STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a word, and not that noise at all
+DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
+CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
+LOST = 0.1  # share of the placements that may be left out without a warning
+SIZES = "check the stated size of the board and of the squares of its chessboard"
 POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
@@ -35,8 +42,9 @@ class Reason:
     ----------
     answer : {'with care', 'no'}
     kind : str
-        A key: 'convergence', 'unobservable', 'cameras', 'placements', 'parallel', 'distance', 'pitch', 'image pitch',
-        'misfit', 'excluded', 'model error', 'noise', 'warning', 'error'.
+        A key: 'handed over', 'left out', 'range offset', 'size', 'dependent', 'convergence', 'unobservable', 'cameras',
+        'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error', 'noise',
+        'warning', 'error'.
     words : str
     """
 
@@ -64,6 +72,8 @@ class Verdict:
     suggestion : Suggestion or None
     no_suggestion : str
         Why there is none.
+    notes : tuple of str
+        What is handed over, and what became of all placements.
     """
 
     answer: str
@@ -73,6 +83,13 @@ class Verdict:
     sweep_mm: float
     suggestion: Suggestion | None
     no_suggestion: str = ""
+    notes: tuple = ()
+
+    def record(self):
+        """Answer, reasons and expected errors, ready for JSON."""
+        errors = {f"{distance:g}": values for distance, values in self.errors.items()}
+        reasons = [asdict(reason) for reason in self.reasons]
+        return {"answer": self.answer, "reasons": reasons, "notes": list(self.notes), "expected_error_at_m": errors}
 
     def sentences(self):
         """For the first page: the warning before anything else, the errors, what to record next.
@@ -89,10 +106,12 @@ class Verdict:
         words = [r.words for r in self.reasons]
         out = [first + ("; ".join(words) + "." if words else "")]
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
-        out.append(
-            "These are single standard deviations of the calibration, with errors of the model as they show between "
-            f"placements; each range has {brief(self.range_noise_mm)} mm of noise of its own."
-        )
+        out += self.notes
+        if self.errors:
+            out.append(
+                "These are single standard deviations of the calibration, with errors of the model as they show "
+                f"between placements; each range has {brief(self.range_noise_mm)} mm of noise of its own."
+            )
         if self.sweep_mm:
             out.append(f"Of the cloud's error at 2 m, {brief(self.sweep_mm)} mm come from the pitch of single sweeps.")
         out.append(self.suggestion.sentence() if self.suggestion else self.no_suggestion)
@@ -108,7 +127,7 @@ def _error_words(errors):
     return ", ".join(words)
 
 
-def verdict(solution, models, *, distances=(1.0, 2.0, 5.0), suggest=True, **options):
+def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
     """Judge a joint estimate.
 
     Parameters
@@ -127,42 +146,177 @@ def verdict(solution, models, *, distances=(1.0, 2.0, 5.0), suggest=True, **opti
     -------
     Verdict
     """
-    errors = {float(d): expected_errors(solution, models, d) for d in distances}
-    reasons = diagnose(solution) + error_reasons(expected_errors(solution, models, 2.0))
-    reasons.sort(key=lambda r: r.answer != NO)
-    answer = NO if any(r.answer == NO for r in reasons) else CARE if reasons else YES
+    chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
+    field = field_pitches(solution)
+    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
+    reasons = diagnose(solution) + error_reasons(expected_errors(chains, models, 2.0, field))
     suggestion, problem = None, ""
     if suggest:
         try:
             suggestion = suggest_placement(solution, models, **options)
         except DegenerateGeometry as error:
             problem = f"No placement can be suggested: {error}."
-    sweep = 1000 * float(np.sqrt(np.mean(_cloud(solution, 2.0).parts["sweep"] ** 2)))
-    return Verdict(answer, tuple(reasons), errors, 1000 * range_noise(solution), sweep, suggestion, problem)
+    sweep = 1000 * float(np.sqrt(np.mean(_cloud(chains[None], 2.0, field).parts["sweep"] ** 2)))
+    return _answered(Verdict(YES, (), errors, 1000 * range_noise(solution), sweep, suggestion, problem), reasons)
 
 
-def expected_errors(solution, models, distance):
-    """Standard deviations at one distance: 'cloud_mm', and '<camera>_px' of each camera."""
-    low, high = field_pitches(solution)
-    out = {"cloud_mm": 1000 * float(_cloud(solution, distance).rms()[0])}
-    for camera, model in ((c, models[c]) for c in solution.transforms):
-        found = projection_sigma(
-            solution, camera, model, distance, (12, 9), image_pitch=(low + high) / 2, pitches=(low, high)
+def _answered(found, reasons):
+    """A verdict with more reasons, the worst first."""
+    reasons = sorted((*reasons, *found.reasons), key=lambda r: r.answer != NO)
+    answer = NO if any(r.answer == NO for r in reasons) else CARE if reasons else YES
+    return replace(found, answer=answer, reasons=tuple(reasons))
+
+
+def judge(calibration, method=None, **options):
+    """Judge what a calibration hands over, by itself and by what became of the recording.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    method : str, optional
+        Whose camera poses are handed over; as :func:`lrfcal_lib.evaluate.handed_over` says when left out.
+    **options
+        Of :func:`verdict`; what the LRF sees and the board's features are known.
+
+    Returns
+    -------
+    Verdict
+        'no' without errors where nothing is handed over.
+    """
+    prepared, joint = calibration.prepared, calibration.joint
+    # also where the joint estimate is not handed over: a wrong size may be why
+    sizes = [] if joint is None else [*_range_offset(joint), *_size(joint)]
+    try:
+        method = method or handed_over(calibration)
+    except ValueError as error:
+        found = calibration.problems.items()
+        why = "; ".join([f"nothing can be handed over ({error})", *(f"{' '.join(k)}: {v}" for k, v in found)])
+        return _answered(Verdict(NO, (), {}, np.nan, 0.0, None), [*sizes, Reason(NO, "handed over", why)])
+    if method == "joint":
+        found = verdict(joint.solution, prepared.models, **sight_of(prepared) | options)
+    else:
+        found = _without_joint(calibration, method, options.get("distances", DISTANCES))
+    reasons, words = _left_out(calibration, method)
+    axis = calibration.platform.axis_with(method)
+    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", words)
+    return replace(_answered(found, sizes + reasons), notes=notes)
+
+
+def sight_of(prepared):
+    """What the rig can see, for suggestions: keyword arguments of :func:`verdict`."""
+    pattern = prepared.board.pattern
+    features = None if pattern is None else pattern.points()
+    return {"field_of_view": prepared.session.lrf.field_of_view, "features": features}
+
+
+def _without_joint(calibration, method, distances):
+    """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
+    prepared, problems = calibration.prepared, calibration.problems
+    cameras = {camera: s for (camera, name), s in calibration.solutions.items() if name == method}
+    pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
+    field, models = _wide(pitch.min(), pitch.max()), prepared.models
+    chains = {camera: _plain_chain(calibration, camera, cameras.get(camera)) for camera in (None, *cameras)}
+    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
+    joint = calibration.joint
+    why = problems.get(("rig", "joint"), "the session has no cameras") if joint is None else ""
+    why = why or "; ".join(("it has not converged",) * (not joint.solution.converged) + joint.solution.unobservable)
+    placements = min((len(calibration.observations[c, "half_step"].all_placements) for c in cameras), default=0)
+    lost = joint is None or not joint.solution.converged or placements < FEW
+    reasons = [Reason(NO if lost else CARE, "handed over", f"there is no joint estimate to hand over ({why})")]
+    if placements < FEW:
+        reasons.append(Reason(NO, "placements", f"{placements} placements only, {FEW} or more are needed"))
+    reasons += [
+        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({problems.get((c, method), 'no result')})")
+        for c in prepared.views
+        if c not in cameras
+    ]
+    reasons += error_reasons(expected_errors(chains, models, 2.0, field))
+    noise = float(np.median([board.sigma_range for board in prepared.scans.values()]))
+    return _answered(Verdict(YES, (), errors, 1000 * noise, 0.0, None), reasons)
+
+
+def _plain_chain(calibration, camera, solution):
+    """The chain of a camera calibrated by itself, or of the cloud, whose range offset may be what the maker admits."""
+    platform, session, noise = calibration.platform, calibration.prepared.session, calibration.prepared.pitch_noise
+    covariance = np.zeros((len(COLUMNS),) * 2)
+    covariance[:4, :4] = platform.covariance
+    if solution is None:
+        covariance[10, 10] = session.lrf.admitted_offset ** 2
+    else:
+        covariance[4:10, 4:10] = solution.trusted[:6, :6]
+    pose = None if solution is None else pose_array(solution.transform)
+    mount = "head" if solution is None else session.cameras[camera].mount
+    head, unseen = pose_array(platform.T_head_lrf), np.zeros((0, len(COLUMNS)))
+    return Chain(head, pose, mount, (covariance,), unseen, (noise.offset, noise.stretch))
+
+
+def _range_offset(joint):
+    """An offset of all ranges that no working range finder has: something that is stated must be wrong."""
+    solution, admitted = joint.solution.solution, joint.prepared.session.lrf.admitted_offset
+    offset = joint.solution.sensor["range_offset"]
+    margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
+    if abs(offset) > admitted + margin:
+        words = (
+            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that the maker of the "
+            f"range finder admits: {SIZES}, and the unit of the ranges"
         )
-        out[f"{camera}_px"] = float(found.rms()[0])
+        yield Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words)
+
+
+def _size(joint):
+    """Edges in the cloud that contradict the stated ones."""
+    error, sigma = size_error(joint)
+    if abs(error) > CONTRADICTS * sigma:
+        length = 1000 * error * np.mean(list(joint.prepared.board.lengths().values()))
+        words = (
+            f"the board's edges are {abs(length):.0f} mm ({100 * abs(error):.1f} %) "
+            f"{'longer' if error > 0 else 'shorter'} in the cloud than stated, {abs(error) / sigma:.0f} times the "
+            f"expected error: {SIZES}"
+        )
+        yield Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words)
+
+
+def _left_out(calibration, method):
+    """All placements that the result does not rest on, counted and with their reasons."""
+    prepared, excluded = calibration.prepared, {}
+    table = placements_table(prepared, calibration.observations).set_index("placement")
+    used = set(table.index[table.used]) - set(prepared.problems)
+    if method == "joint":
+        used, excluded = set(calibration.joint.solution.boards), calibration.joint.solution.excluded
+    lost = [p for p in table.index if p not in used]
+    if not lost:
+        return [], f"All {len(table)} placements were used."
+    why = [f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})" for p in lost]
+    words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
+    reasons = [Reason(CARE, "left out", words)] if len(lost) > LOST * len(table) else []
+    return reasons, "" if reasons else f"{words}."
+
+
+def expected_errors(chains, models, distance, field):
+    """Standard deviations at one distance: 'cloud_mm' (chain None), and '<camera>_px' of each camera."""
+    out = {"cloud_mm": 1000 * float(_cloud(chains[None], distance, field).rms()[0])}
+    for camera, chain in chains.items():
+        if camera is not None:
+            middle = (field[0] + field[1]) / 2
+            found = projection_sigma(
+                chain, camera, models[camera], distance, (12, 9), image_pitch=middle, pitches=field
+            )
+            out[f"{camera}_px"] = float(found.rms()[0])
     return out
 
 
-def _cloud(solution, distance):
-    low, high = field_pitches(solution)
-    return point_sigma(solution, BEARINGS, np.linspace(low, high, 9), distance, reference=(low + high) / 2)
+def _cloud(chain, distance, field):
+    return point_sigma(chain, BEARINGS, np.linspace(*field, 9), distance, reference=(field[0] + field[1]) / 2)
 
 
 def field_pitches(solution):
     """First and last pitch over which errors are judged: as recorded, but not a narrow strip; radians."""
     groups = (solution.data.face, solution.data.beam)
     pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
-    low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
+    return _wide(*((pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)))
+
+
+def _wide(low, high):
     return min(low, (low + high) / 2 - LEAST_FIELD), max(high, (low + high) / 2 + LEAST_FIELD)
 
 
@@ -188,7 +342,7 @@ def diagnose(solution):
     """
     checks = (
         _convergence, _cameras, _unobservable, _placements, _pitch, _parallel, _distances, _misfit, _excluded,
-        _model_error, _noise, _warnings,
+        _model_error, _noise, _dependent, _warnings,
     )  # fmt: skip
     return [reason for check in checks for reason in check(solution)]
 
@@ -305,7 +459,16 @@ def _noise(solution):
     found |= {"images": solution.noise.get("view_scale", 1.0)}
     large = [f"{name} {scale:.1f} times" for name, scale in found.items() if scale > STATED]
     if large:
-        yield Reason(CARE, "noise", "residuals are larger than the stated noise (" + ", ".join(large) + ")")
+        words = "residuals are larger than the stated noise (" + ", ".join(large) + ")"
+        yield Reason(NO if max(found.values()) > ABSURD else CARE, "noise", words)
+
+
+def _dependent(solution):
+    """Ranges that repeat their neighbours' errors; beams about an edge always do, they share one background."""
+    share = solution.noise.get("face_share", 1.0)
+    if share < DEPENDENT:
+        words = "of the errors of ranges are independent: neighbours err alike (boards that bend, a pitch that is off)"
+        yield Reason(CARE, "dependent", f"only {100 * share:.0f} % {words}")
 
 
 def _warnings(solution):
@@ -315,4 +478,7 @@ def _warnings(solution):
             yield Reason(CARE, "warning", words)
 
 
-__all__ = ["CARE", "NO", "Reason", "Verdict", "YES", "board_middles", "diagnose", "expected_errors", "verdict"]
+__all__ = [
+    "CARE", "NO", "Reason", "Verdict", "YES", "board_middles", "diagnose", "expected_errors", "judge", "sight_of",
+    "verdict",
+]  # fmt: skip

@@ -272,6 +272,9 @@ def test_misfit_model_error_and_noise_are_named(good):
     assert "5.0 times more than noise explains" in words["model error"]
     assert words["noise"] == "residuals are larger than the stated noise (ranges 2.6 times)"
     assert "has not converged" in words["convergence"]
+    absurd = replace(bad, noise=solution.noise | {"view_scale": 11.0, "face_share": 0.05})
+    found = {r.kind: r for r in diagnose(absurd)}
+    assert found["noise"].answer == "no" and found["dependent"].words.startswith("only 5 % of the errors of ranges")
 
 
 def test_large_errors_forbid_trust(good):

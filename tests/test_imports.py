@@ -15,7 +15,7 @@ RANKS = [
     {"session"},
     {"preprocess", "importers"},
     {"solvers"},
-    {"uncertainty", "candidates", "forecast", "advice", "residuals", "verdict"},
+    {"uncertainty", "candidates", "forecast", "advice", "residuals"},
     {"reconstruct", "prepared"},
     {"pairing"},
     {"joint_pairing"},
@@ -23,6 +23,7 @@ RANKS = [
     {"fused_outline"},
     {"pipeline"},
     {"evaluate"},
+    {"verdict"},
     {"notebook", "plots", "export", "report", "acquisition", "panel", "drivers", "emulators"},  # see APART
     {"__main__"},
 ]

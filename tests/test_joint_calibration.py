@@ -95,6 +95,9 @@ def test_it_is_handed_over_with_its_platform_and_sensor(found):
     np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
     assert set(record["cameras"]) == set(found.joint.observations.cameras)
     assert record["sensor"]["range_offset"]["sigma"] > 0
+    assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
+    edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
+    assert min(edges) <= evaluate.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
     assert "sensor" not in calibration_record(found, "line")
 
 

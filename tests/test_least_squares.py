@@ -1,6 +1,7 @@
 """The least-squares core: convergence, batches, losses, covariances, what is unobservable."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,6 +186,27 @@ def test_placement_covariance_sees_common_errors():
 def test_no_placement_covariance_from_too_few_placements(data, groups):
     found = fit(line_problem(*data), np.zeros(2), groups=groups)
     assert found.covariance_placements is None and found.sigma_placements is None
+
+
+NOISE = np.array([[4.0, 1.8], [1.8, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("noise", "scatter", "sigma"),
+    [
+        (NOISE, None, [2, 1]),
+        (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # larger one by one: neither matrix as a whole
+        (NOISE, np.diag([16.0, 0.25]), [4, 1]),
+        (np.diag([np.inf, 1.0]), np.diag([1.0, 9.0]), [np.inf, 3]),
+        (np.diag([0.0, 1.0]), np.diag([0.0, np.nan]), [0, 1]),
+    ],
+)
+def test_the_larger_of_noise_and_scatter_is_trusted(data, noise, scatter, sigma):
+    found = replace(fit(line_problem(*data), np.zeros(2)), covariance=noise, covariance_placements=scatter)
+    np.testing.assert_allclose(found.trusted_sigma, sigma)
+    if np.isfinite(noise).all() and noise[0, 0]:  # correlations are those of the noise
+        correlation = found.trusted / np.outer(found.trusted_sigma, found.trusted_sigma)
+        np.testing.assert_allclose(correlation[0, 1], NOISE[0, 1] / 2)
 
 
 def test_null_space_names_the_lost_direction():

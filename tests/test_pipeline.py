@@ -1,5 +1,6 @@
 """Combining axes, naming sides, pitch noise: the parts of the chain that need no recording."""
 
+from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from lrfcal_lib.geometry import axis_difference, axis_of
 from lrfcal_lib.prepared import PitchNoise, Prepared
 from lrfcal_lib.solvers.platform import chart_parameters
 from lrfcal_lib.solvers.pose import pose_array
+from lrfcal_lib.solvers.solution import Solution
 
 SIGMA = (np.radians(0.5), 0.010)
 STATED = pipeline.stated_covariance(SIGMA)
@@ -21,9 +23,10 @@ def head(rng, angle=0.05):
     return RigidTransform.from_components(rng.normal(size=3) * 0.1, Rotation.from_rotvec(rng.normal(size=3) * angle))
 
 
-def estimate(T_head_lrf, covariance):
-    inner = SimpleNamespace(parameters=chart_parameters(pose_array(T_head_lrf)))
-    return SimpleNamespace(T_head_lrf=T_head_lrf, solution=inner, covariance=covariance, covariance_placements=None)
+def estimate(T_head_lrf, covariance, scatter=None):
+    inner = dict.fromkeys(field.name for field in fields(Solution))
+    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance}
+    return SimpleNamespace(T_head_lrf=T_head_lrf, solution=Solution(**inner | {"covariance_placements": scatter}))
 
 
 def test_the_chart_of_the_axis_is_undone():
@@ -40,6 +43,13 @@ def test_the_better_known_axis_wins(scale, wins):
     winner = {"data": data, "stated": stated}[wins]
     assert max(axis_difference(axis_of(found), axis_of(winner))) < 1e-6
     assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
+
+
+def test_placements_that_agree_by_chance_do_not_outweigh_the_stated_axis():
+    rng = np.random.default_rng(4)
+    stated, data = head(rng), head(rng)
+    found, _ = pipeline.combine(estimate(data, 1e8 * STATED, 1e-8 * STATED), stated, SIGMA)
+    assert max(axis_difference(axis_of(found), axis_of(stated))) < 1e-6
 
 
 def test_combining_keeps_what_no_data_can_show():

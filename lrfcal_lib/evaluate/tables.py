@@ -214,13 +214,15 @@ def best_method(comparison, among=("line", "zhang_pless")):
     Raises
     ------
     ValueError
-        If none of them was judged on left-out placements.
+        If none of them was judged on left-out placements, or there is none.
 
     Notes
     -----
     A rule of thumb, made after the two sessions it was first used on had been seen. It picks one winner by a margin
     that may be within the noise (48.9 against 53.9 px mm on the LMS400 recording).
     """
+    if comparison.empty:
+        raise ValueError("no camera was calibrated by any method")
     mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
     score = mean.reindex(list(among)).prod(axis=1, skipna=False).dropna()
     if score.empty:
@@ -267,7 +269,7 @@ def camera_calibration_table(solutions):
     """
     rows = []
     for (camera, method), solution in solutions.items():
-        sigma = trusted_sigma(solution)
+        sigma = solution.trusted_sigma
         for name, value, spread in zip(solution.names, solution.parameters, sigma, strict=True):
             unit, factor = unit_of(name)
             rows.append((camera, method, name, unit, factor * value, factor * spread))
@@ -451,12 +453,6 @@ def axis_knowledge_table(platform):
     return pd.DataFrame(rows, columns=["parameter", "unit", "sigma_data", "sigma_rough", "better"])
 
 
-def trusted_sigma(solution):
-    """Standard deviations to trust: the larger of propagated noise and spread over placements, shape (k,)."""
-    spread = solution.sigma_placements
-    return solution.sigma if spread is None else np.fmax(solution.sigma, spread)
-
-
 def unit_of(parameter):
     """Unit and factor in which a parameter is shown."""
     if parameter[0] == "r":
@@ -552,13 +548,13 @@ def _placement_lengths(prepared, placement, variant, measure):
         length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):
-            ends = _ends(prepared.board.edges, name, across)
+            ends = ends_of(prepared.board.edges, name, across)
         if _seen_in_image(prepared, placement, name):
             rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
     return rows
 
 
-def _ends(edges, name, across):
+def ends_of(edges, name, across):
     """What decides the ends of an edge: its neighbours in the image, beams, or the recorded pitch."""
     if across is None:
         return "image"

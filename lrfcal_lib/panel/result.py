@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.evaluate import handed_over, trusted_sigma
+from lrfcal_lib.evaluate import handed_over
 from lrfcal_lib.export import calibration_record, write_calibration
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.joint_calibration import calibrate_jointly
 from lrfcal_lib.pipeline import calibrate, prepare
 from lrfcal_lib.session import open_session
-from lrfcal_lib.verdict import YES, verdict
+from lrfcal_lib.verdict import YES, judge, sight_of, verdict
 
 METHOD = "line"  # the paper's, beside the joint estimate
 
@@ -63,23 +63,13 @@ def calibrate_recording(path):
     """
     path = Path(path)
     found = calibrate(open_session(path), [METHOD])
-    answer, sentences = _judged(found)
-    try:
-        method = handed_over(found)
-    except ValueError as error:
-        return Result("no", (*sentences, f"Nothing is written: {error}."), "", {}, None, found)
+    judged = judge(found)
+    if not judged.errors:
+        return Result(judged.answer, (*judged.sentences(), "Nothing is written."), "", {}, None, found)
+    method = handed_over(found)
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
-    write_calibration(file, calibration_record(found, method))
-    return Result(answer, sentences, method, poses(found, method), file, found)
-
-
-def _judged(found):
-    """Answer and sentences; without a joint estimate why there is none."""
-    if found.joint is None:
-        why = [f"{' '.join(key)}: {text}" for key, text in found.problems.items()] or ["no image shows the board"]
-        return "no", ("This calibration cannot be trusted: " + "; ".join(why) + ".",)
-    judged = verdict(found.joint.solution, found.prepared.models, **_limits(found.prepared))
-    return judged.answer, tuple(judged.sentences())
+    write_calibration(file, calibration_record(found, method, judged))
+    return Result(judged.answer, tuple(judged.sentences()), method, poses(found, method), file, found)
 
 
 def poses(found, method):
@@ -87,7 +77,7 @@ def poses(found, method):
     out = {}
     for (camera, name), solution in found.solutions.items():
         if name == method:
-            sigma, scale = trusted_sigma(solution)[:6], np.repeat([np.degrees(1), 1000.0], 3)
+            sigma, scale = solution.trusted_sigma[:6], np.repeat([np.degrees(1), 1000.0], 3)
             values = scale * np.concatenate([solution.transform.rotation.as_rotvec(), solution.transform.translation])
             out[camera] = (values[:3], values[3:], *np.split(scale * sigma, 2))
     return out
@@ -109,14 +99,7 @@ def advise(session):
         solution = calibrate_jointly(prepared).solution
     except DegenerateGeometry as error:
         return f"not determined yet: {error}"
-    judged = verdict(solution, prepared.models, **_limits(prepared))
+    judged = verdict(solution, prepared.models, **sight_of(prepared))
     if judged.answer == YES:
         return ""
     return f"put the {judged.suggestion.words()}" if judged.suggestion else judged.no_suggestion
-
-
-def _limits(prepared):
-    """What the rig can see, for suggestions."""
-    pattern = prepared.board.pattern
-    features = None if pattern is None else pattern.points()
-    return {"field_of_view": prepared.session.lrf.field_of_view, "features": features}

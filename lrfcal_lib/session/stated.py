@@ -17,6 +17,12 @@ SCHEMA = "lrfcal-session/1"
 MOUNTS = ("head", "platform")
 LONGEST_BOARD = 20.0  # metres
 LONGEST_LEVER = 10.0  # metres between the parts of a rig
+# metres, by part of the model's name: systematic error of a range according to the maker's data sheet
+SYSTEMATIC_ERROR = {
+    "LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS291": 0.035, "LMS400": 0.004, "LMS5": 0.035,
+    "TiM5": 0.060,
+}  # fmt: skip
+ASSUMED_SYSTEMATIC_ERROR = 0.050  # metres; where nobody stated it, and of an LMS2xx that counts centimetres
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
 
@@ -42,6 +48,8 @@ class LrfInfo:
     spot : tuple of float, or None
         Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet;
         None where unknown.
+    systematic_error : float or None
+        Largest offset of all ranges that the maker admits, metres; None where not stated: then the one of the model.
     """
 
     model: str
@@ -52,6 +60,15 @@ class LrfInfo:
     range_resolution: float = 0.001
     max_range: float = math.inf
     spot: tuple[float, float] | None = None
+    systematic_error: float | None = None
+
+    @property
+    def admitted_offset(self):
+        """The largest range offset that the maker admits, metres: stated, or known of the model, or assumed."""
+        known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
+        if self.systematic_error is not None or not known or self.range_resolution > 0.005:
+            return self.systematic_error or ASSUMED_SYSTEMATIC_ERROR
+        return known[0]
 
     def spot_radius(self, distance):
         """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not stated."""
@@ -217,6 +234,7 @@ def lrf_to_json(lrf):
         "sigma_bearing_deg": round(math.degrees(lrf.sigma_bearing), 9),
         "range_resolution_m": lrf.range_resolution,
         "max_range_m": lrf.max_range if math.isfinite(lrf.max_range) else None,
+        **({} if lrf.systematic_error is None else {"systematic_error_m": lrf.systematic_error}),
         **({} if lrf.spot is None else {"spot_exit_m": lrf.spot[0], "spot_divergence_rad": lrf.spot[1]}),
     }
 
@@ -229,7 +247,7 @@ def lrf_from_json(data):
     sigma = _positive(data["sigma_range_m"], "sigma_range_m")
     if sigma > 1:
         raise ValueError(f"sigma_range_m is {sigma:g}: millimetres? Divide by 1000")
-    longest = data.get("max_range_m")
+    longest, admitted = data.get("max_range_m"), data.get("systematic_error_m")
     return LrfInfo(
         model=str(data["model"]),
         field_of_view=(float(first), float(last)),
@@ -239,6 +257,7 @@ def lrf_from_json(data):
         range_resolution=float(numbers(data.get("range_resolution_m", 0.001), (), "range_resolution_m")),
         max_range=math.inf if longest is None else _positive(longest, "max_range_m"),
         spot=_spot(data),
+        systematic_error=None if admitted is None else _positive(admitted, "systematic_error_m"),
     )
 
 

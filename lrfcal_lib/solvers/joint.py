@@ -130,12 +130,10 @@ class JointSolution:
         """Indices of the shared unknowns whose names begin so."""
         return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
 
-    def covariance(self, prefix, clustered=False):
-        """Covariance of a group of shared unknowns, e.g. 'left_' or 'axis'; `clustered` by placement where known."""
-        found = self.solution.covariance_placements if clustered else None
-        found = self.solution.covariance if found is None else found
-        index = self.columns(prefix)
-        return found[np.ix_(index, index)]
+    def covariance(self, *prefixes):
+        """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'; see `Solution.trusted`."""
+        index = sum(map(self.columns, prefixes), [])
+        return self.solution.trusted[np.ix_(index, index)]
 
     def correct(self, placement, p_lrf, pitch):
         """Measured points and recorded pitch as they should have been.
@@ -170,10 +168,8 @@ class JointSolution:
         """The pose of one camera as a `Solution` like those of the other methods."""
         index, whole = self.columns(f"{name}_"), self.solution
         pose = pose_array(self.transforms[name])
-        spread = {
-            "covariance": self.covariance(f"{name}_"),
-            "covariance_placements": None if whole.covariance_placements is None else self.covariance(f"{name}_", True),
-        }
+        both = {key: getattr(whole, key) for key in ("covariance", "covariance_placements")}
+        spread = {key: None if value is None else value[np.ix_(index, index)] for key, value in both.items()}
         return replace(
             whole, transform=self.transforms[name], parameters=pose_parameters(pose), names=POSE_NAMES,
             jacobian=whole.jacobian[..., index], unobservable=self.unobservable, state=pose, **spread,

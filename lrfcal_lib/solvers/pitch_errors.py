@@ -7,7 +7,7 @@ independent numbers are placements, not points: neighbouring points err together
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -104,7 +104,8 @@ class PitchErrors:
     direction : ndarray of int, shape (p,)
     direction_offset, direction_sigma : float
         Radians to add to the recorded pitch of sweeps with direction +1 (and to subtract for -1), with its standard
-        deviation from the scatter over the placements. nan where the sweeps all go one way.
+        deviation, the larger of noise (at the level of the residuals) and scatter over the placements. nan where the
+        sweeps all go one way.
     models : dict of str to PitchModel
     wanted : str
         The model that the data ask for: each larger one must beat the last one wanted with p < 0.01.
@@ -160,7 +161,7 @@ def estimate_pitch_errors(
     for name in names:
         found, state = _solve_model(name, data, state, sigmas, required)
         if name == "direction":
-            direction = float(state[1]), _direction_sigma(found, len(data.cameras))
+            direction = float(state[1]), float(found.trusted_sigma[6 * len(data.cameras)])
         previous = models.get(names[names.index(name) - 1]) if models else None
         models[name] = _model(name, data, state, found, previous, sigma)
     return PitchErrors(data.placements, data.direction, *direction, models, wanted_model(models))
@@ -191,13 +192,9 @@ def _solve_model(name, data, state, sigmas, required):
         limit=10.0,
         freedom=data.n_numbers - 6,
     )
-    return found, found.state
-
-
-def _direction_sigma(found, cameras):
-    clustered = found.covariance_placements
-    chosen = found.covariance if clustered is None else clustered
-    return float(np.sqrt(chosen[6 * cameras, 6 * cameras]))
+    # the stated sigmas only weigh faces against edges: the level of the noise comes from the residuals
+    level = misfit(data, found.state)[0] / max(data.n_numbers - 6, 1) / sigmas[0] ** 2 / found.inflation
+    return replace(found, covariance=level * found.covariance), found.state
 
 
 def _model(name, data, state, found, previous, sigma):
@@ -256,7 +253,7 @@ def _own_sigmas(name, found, p, cameras, level):
     if name == "none":
         return np.zeros(p), np.zeros(p)
     if name == "direction":
-        return np.full(p, _direction_sigma(found, cameras)), np.zeros(p)
+        return np.full(p, found.trusted_sigma[6 * cameras]), np.zeros(p)
     own = found.jacobian[..., 6 * cameras :]
     inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own) * level
     sigma = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))

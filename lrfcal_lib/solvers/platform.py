@@ -136,12 +136,12 @@ class PlatformSolution:
     @property
     def sigma_direction(self):
         """Standard deviation of the direction, radians (root of the trace of its two angles)."""
-        return float(np.sqrt(np.trace(self.covariance[:2, :2])))
+        return float(np.sqrt(np.trace(self.solution.trusted[:2, :2])))
 
     @property
     def sigma_offset(self):
         """Standard deviation of the offset, metres (root of the trace of its two components)."""
-        return float(np.sqrt(np.trace(self.covariance[2:, 2:])))
+        return float(np.sqrt(np.trace(self.solution.trusted[2:, 2:])))
 
     @property
     def converged(self):

@@ -246,12 +246,12 @@ def prior_terms(head, prior):
 
 
 def _prior_block(head, prior, p):
-    """The prior counts once: with the first placement."""
+    """The prior counts once: every placement holds a part, so that leaving one out (the scatter) keeps the rest."""
     r, J = prior_terms(head, prior)
-    residuals, jacobian, weights = np.zeros((p, 4)), np.zeros((p, 4, 12)), np.zeros((p, 4))
-    residuals[0], jacobian[0, :, :4] = r, J
-    weights[0] = np.repeat([1 / prior.sigma_direction, 1 / prior.sigma_offset], 2)
-    return Block(residuals, jacobian, weights)
+    jacobian = np.zeros((p, 4, 12))
+    jacobian[..., :4] = J
+    weights = np.repeat([1 / prior.sigma_direction, 1 / prior.sigma_offset], 2) / np.sqrt(p)
+    return Block(np.tile(r, (p, 1)), jacobian, np.tile(weights, (p, 1)))
 
 
 def move_head(head, step):

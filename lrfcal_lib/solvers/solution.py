@@ -84,6 +84,26 @@ class Solution:
         found = self.covariance_placements
         return None if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
 
+    @property
+    def trusted(self):
+        """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
+
+        Of every parameter the larger standard deviation of propagated noise and scatter over placements, with the
+        correlations of the noise: the scatter of a few placements says little about correlations.
+        """
+        if self.covariance_placements is None:
+            return self.covariance
+        ratio = np.ones_like(self.sigma)
+        known = (self.sigma > 0) & np.isfinite(self.sigma)
+        np.divide(self.sigma_placements, self.sigma, out=ratio, where=known)
+        grow = np.fmax(ratio, 1.0)
+        return grow[..., :, None] * self.covariance * grow[..., None, :]
+
+    @property
+    def trusted_sigma(self):
+        """Standard deviations from `trusted`, shape (..., k)."""
+        return np.sqrt(np.diagonal(self.trusted, axis1=-2, axis2=-1))
+
     def __repr__(self):
         state = "converged" if np.all(self.converged) else "NOT converged"
         return (

@@ -1,0 +1,95 @@
+"""The verdict on what is handed over: wrong sizes are named, thin sessions fail, commands and files say the same."""
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lrfcal_lib import __main__, verdict
+from lrfcal_lib.export import UNTRUSTED, calibrate_session
+from lrfcal_lib.session import LrfInfo, open_session
+from lrfcal_lib.session.stated import ASSUMED_SYSTEMATIC_ERROR, lrf_from_json, lrf_to_json
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+
+
+def lrf(model="SICK LMS400", **options):
+    return LrfInfo(model, (0.9, 2.2), 0.002, 0.005, **options)
+
+
+def joint_of(offset_mm, sigma_mm, **options):
+    """As much of a joint calibration as tells the range offset."""
+    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma_mm / 1000]))
+    solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset_mm / 1000})
+    board = SimpleNamespace(lengths=lambda: {"ab": 0.8, "bc": 0.8})
+    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(**options)), board=board)
+    return SimpleNamespace(solution=solution, prepared=prepared)
+
+
+@pytest.mark.parametrize(
+    ("stated", "admitted"),
+    [
+        ({}, 0.004),
+        ({"model": "LMS221-30206 (simulated)"}, 0.035),
+        ({"model": "LMS221-30206", "range_resolution": 0.01}, ASSUMED_SYSTEMATIC_ERROR),
+        ({"model": "home-made"}, ASSUMED_SYSTEMATIC_ERROR),
+        ({"model": "SICK LMS400", "systematic_error": 0.012}, 0.012),
+    ],
+)
+def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted):
+    assert lrf(**stated).admitted_offset == admitted
+    assert lrf_from_json(json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted
+
+
+@pytest.mark.parametrize(
+    ("offset", "sigma", "answers"),
+    [(-5.2, 2.2, []), (9, 2, []), (11, 2, ["with care"]), (-87, 3.9, ["no"]), (68, 14, ["no"]), (30, 14, [])],
+)
+def test_a_range_offset_that_no_maker_admits(offset, sigma, answers):
+    found = list(verdict._range_offset(joint_of(offset, sigma)))
+    assert [reason.answer for reason in found] == answers
+    assert all("board" in r.words and "squares" in r.words and f"{offset} mm" in r.words for r in found)
+
+
+@pytest.mark.parametrize(
+    ("error", "sigma", "answers"),
+    [(0.004, 0.002, []), (-0.007, 0.002, ["with care"]), (-0.048, 0.003, ["no"]), (np.nan, np.nan, [])],
+)
+def test_edges_that_contradict_the_stated_ones(monkeypatch, error, sigma, answers):
+    monkeypatch.setattr(verdict, "size_error", lambda joint: (error, sigma))
+    found = list(verdict._size(joint_of(0, 1)))
+    assert [reason.answer for reason in found] == answers
+    assert all("shorter in the cloud than stated" in reason.words for reason in found)
+
+
+@pytest.fixture(scope="module")
+def thin(tmp_path_factory):
+    """Two of the four placements of the quick session."""
+    folder = tmp_path_factory.mktemp("thin") / "thin"
+    shutil.copytree(DATA / "sim_quick", folder)
+    stated = json.loads((folder / "session.json").read_text())
+    stated["placements"] = stated["placements"][:2]
+    (folder / "session.json").write_text(json.dumps(stated))
+    for table in (folder / "images.csv", folder / "lrf" / "index.csv"):
+        head, *rows = table.read_text().splitlines()
+        column, known = head.split(",").index("placement"), {"", "-1", *map(str, stated["placements"])}
+        kept = [row for row in rows if row.split(",")[column] in known]
+        table.write_text("\n".join([head, *kept]) + "\n")
+    return folder
+
+
+def test_a_thin_session_fails_and_says_so(thin, tmp_path, capsys):
+    status, said = calibrate_session(thin, tmp_path), capsys.readouterr().out
+    assert status == UNTRUSTED == 3
+    assert "This calibration cannot be trusted: nothing can be handed over" in said
+    assert not (tmp_path / "calibration.json").exists()
+
+
+@pytest.mark.parametrize(("session", "warned"), [("sim_quick", True), ("sim_lms221", False)])
+def test_check_warns_of_few_placements(session, warned, capsys):
+    assert __main__.main(["check", str(DATA / session)]) == 0
+    count = len(open_session(DATA / session).board_placements)
+    assert (f"warning: {count} placements" in capsys.readouterr().out) == warned
