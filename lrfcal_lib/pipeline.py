@@ -358,7 +358,9 @@ def with_joint(calibration):
     cameras = joint.observations.cameras
     seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
-    platform = replace(calibration.platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
+    platform = calibration.platform
+    if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
+        platform = replace(platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
     found = {"observations": calibration.observations | seen, "solutions": calibration.solutions | solved}
     return replace(calibration, platform=platform, joint=joint, **found)
 

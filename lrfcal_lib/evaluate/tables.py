@@ -548,7 +548,8 @@ def _placement_lengths(prepared, placement, variant, measure):
     except DegenerateGeometry:
         measured, across = None, frozenset()
     rows = []
-    for name, true in prepared.board.lengths().items():
+    known = {} if prepared.board.corners is None else prepared.board.lengths()
+    for name, true in known.items():
         length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):

@@ -286,23 +286,28 @@ def _agrees(edges, picks, model, within=10.0):
     return all(o < within for o in off)
 
 
-def best_order(image, board, model, pixels):
-    """The order of a pattern's corners for which the known outline of the board fits the image best.
+def order_scores(image, board, model, pixels):
+    """How well the known outline of the board fits one image, for every order of the pattern's corners.
 
-    Notes
-    -----
-    A few coarse profiles across the outline decide; orders that they cannot tell apart are compared by the edges
-    that the full search finds.
+    Returns
+    -------
+    orders : list of ndarray, shape (k, 2)
+        First the corners as they are, then the same turned by half a turn; see :func:`alike`.
+    scores : ndarray
+        Of a few coarse profiles across the outline; orders that they cannot tell apart are compared by the edges that
+        the full search finds.
     """
     lines = board.lines()
     orders = _orders(pixels, board, lines)
     scores = np.array([_coarse_support(image, board, model, lines, p) for p in orders])
-    likely = [p for p, score in zip(orders, scores, strict=True) if score >= CLEAR_SHARE * scores.max()]
-    if len(likely) == 1:
-        return likely[0]
-    empty = BoardView("", "", -1, np.nan)
-    views = [_view_pattern(empty, image, board, model, lines, {}, p, None) for p in likely]
-    return likely[int(np.argmax([_support(v, board, model, lines) for v in views]))]
+    likely = np.flatnonzero(scores >= CLEAR_SHARE * scores.max())
+    if len(likely) > 1:
+        empty, coarse = BoardView("", "", -1, np.nan), scores.max()
+        views = [_view_pattern(empty, image, board, model, lines, {}, orders[i], None) for i in likely]
+        support = np.array([_support(v, board, model, lines) for v in views])
+        scores = np.zeros(len(orders))
+        scores[likely] = coarse * support / max(support.max(), 1e-9)
+    return orders, scores
 
 
 def _coarse_support(image, board, model, lines, pixels):
