@@ -45,7 +45,7 @@ def calibration_record(calibration, method):
         for (camera, name), solution in calibration.solutions.items()
         if name == method
     }
-    axis = "joint" if method == "joint" else "combined"
+    axis = "joint" if method == "joint" and calibration.platform.joint else "combined"
     record = {
         "schema": SCHEMA,
         "lrfcal": __version__,

@@ -34,8 +34,8 @@ def all_views(prepared):
     known = sum(len(found) for found in prepared.views.values())
     if len(records) <= known or prepared.board.pattern is None:
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
-    seen = image.survey(records, session.read_image, prepared.board, prepared.models, session.picks)
-    return seen.views
+    options = {"picks": session.picks, "settled": prepared.views}  # sides of scans bear the names of that turn
+    return image.survey(records, session.read_image, prepared.board, prepared.models, **options).views
 
 
 def observe_joint(prepared, views=None, *, face_points=FACE_POINTS, cells=CELLS_PER_EDGE):

@@ -200,8 +200,8 @@ class PlatformCalibration:
         return found
 
     def transform(self, method):
-        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
-        special = {"stated": self.stated, "combined": self.T_head_lrf}
+        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint', which without an axis is 'combined')."""
+        special = {"stated": self.stated, "combined": self.T_head_lrf, "joint": self.T_head_lrf}
         if self.joint is not None:
             special["joint"] = self.joint[0]
         return special[method] if method in special else self.solutions[method].T_head_lrf

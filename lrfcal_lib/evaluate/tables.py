@@ -222,8 +222,9 @@ def best_method(comparison, among=("line", "zhang_pless")):
     that may be within the noise (48.9 against 53.9 px mm on the LMS400 recording).
     """
     mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
-    score = mean.reindex(list(among)).prod(axis=1, skipna=False).dropna()
-    if score.empty:
+    mean = mean.reindex(list(among)).dropna(axis=1, how="all")  # where no edge was seen, planes judge alone
+    score = mean.prod(axis=1, skipna=False).dropna()
+    if mean.empty or score.empty:
         raise ValueError(f"none of {', '.join(among)} was judged on left-out placements; it takes more of them")
     return score.idxmin()
 

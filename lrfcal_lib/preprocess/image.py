@@ -32,7 +32,7 @@ from lrfcal_lib.preprocess.pattern import (
 )
 from lrfcal_lib.preprocess.silhouette import OutlineNotFound
 from lrfcal_lib.preprocess.turns import alike, decide
-from lrfcal_lib.preprocess.view import BoardView, order_scores, view_board
+from lrfcal_lib.preprocess.view import BoardView, order_scores, pattern_orders, view_board
 from lrfcal_lib.preprocess.wide import OutlineNotSeen, common_lines, edge_votes, resolve_turns
 
 __all__ = [
@@ -57,6 +57,7 @@ __all__ = [
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
 REMEMBERED_IMAGES = 128
+SETTLED = 100.0  # weight of a turn that was decided before against the edges of an image, of which a board has a few
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Survey:
     unseen: str = ""
 
 
-def survey(records, read, board, models, picks=(), *, one_per_placement=False):
+def survey(records, read, board, models, picks=(), *, one_per_placement=False, settled=None):
     """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
 
     Parameters
@@ -102,6 +103,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     one_per_placement : bool
         Use one image of each camera and placement: of those that show the pattern the one whose pitch is nearest to
         the middle of the placement's images. Images of no placement are all used.
+    settled : dict of str to dict of int to BoardView, optional
+        By camera and placement: views of an earlier survey. Which way round the board is remains as it was there.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     cameras, found = _find_all(choices, read, PatternFinder(board.pattern))
     flat = {c: m or _intrinsics(c, found[c], board, cameras[c], read) for c, m in models.items()}
     if board.corners is not None:
-        ordered, lines, unseen = _ordered_by_outline(cameras, read, board, flat, found), None, ""
+        ordered, lines, unseen = _ordered_by_outline(cameras, read, board, flat, found, settled or {}), None, ""
     else:
         ordered, lines, unseen = _ordered_by_votes(cameras, read, board, flat, found)
     models, relief = _with_relief(ordered, cameras, board, models, flat)
@@ -236,15 +239,21 @@ def _intrinsics(camera, found, board, group, read):
         raise ValueError(f"camera '{camera}': {error}") from error
 
 
-def _ordered_by_outline(cameras, read, board, models, found):
+def _ordered_by_outline(cameras, read, board, models, found, settled):
     """Corners of every image in the order that the known outline asks for, the same at all images of a placement."""
-    at = _with_pattern(cameras, found)
-    tried = [order_scores(read(r), board, models[c], found[c][i]) for c, i, r in at]
-    belong = _alike(at, [orders for orders, _ in tried], board, models)
-    ordered = {c: list(f) for c, f in found.items()}
-    if at:
-        for (c, i, _), (orders, _), k in zip(at, tried, decide([s for _, s in tried], *belong), strict=True):
-            ordered[c][i] = orders[k]
+    at, ordered = _with_pattern(cameras, found), {c: list(f) for c, f in found.items()}
+    orders = [pattern_orders(found[c][i], board, board.lines()) for c, i, _ in at]
+    rotations, scores = _rotations(at, orders, board, models), []
+    for (c, _, r), own, seen in zip(at, orders, rotations, strict=True):
+        view = settled.get(c, {}).get(r.placement)
+        if view is None or view.T_camera_board is None:
+            scores.append(order_scores(read(r), board, models[c], own))
+        else:
+            off = (seen * view.T_camera_board.rotation.inv()).magnitude()
+            scores.append(SETTLED * (off == off.min()))
+    chosen = decide(scores, *_alike(at, rotations)) if at else ()
+    for (c, i, _), own, k in zip(at, orders, chosen, strict=True):
+        ordered[c][i] = own[k]
     return ordered
 
 
@@ -254,13 +263,17 @@ def _with_pattern(cameras, found):
     return [(c, i, r) for c, i, r, p in pairs if not _is_reason(p)]
 
 
-def _alike(at, orders, board, models):
-    """Which orders of the corners belong together in the images of a placement, see :func:`.turns.alike`."""
+def _rotations(at, orders, board, models):
+    """From the board to the camera for every order of the corners, a stack of Rotation for each image."""
     points = board.pattern.points()
-    rotations = [
+    return [
         Rotation.concatenate([first_pose(points, pixels, models[c]).rotation for pixels in own])
         for (c, _, _), own in zip(at, orders, strict=True)
     ]
+
+
+def _alike(at, rotations):
+    """Which orders of the corners belong together in the images of a placement, see :func:`.turns.alike`."""
     placements = [-1 if r.purpose == "intrinsics" else r.placement for _, _, r in at]
     return alike(rotations, placements, [c for c, _, _ in at])
 
@@ -279,7 +292,7 @@ def _ordered_by_votes(cameras, read, board, models, found):
     votes = [edge_votes(read(r), board, models[c], pose) for (c, _, r), pose in zip(at, poses, strict=True)]
     up = [pose.rotation.as_matrix()[1, 1] for pose in poses]
     orders = [(found[c][i], turn_pattern(found[c][i])) for c, i, _ in at]
-    turned = resolve_turns(votes, up, *_alike(at, orders, board, models))
+    turned = resolve_turns(votes, up, *_alike(at, _rotations(at, orders, board, models)))
     ordered = {c: list(f) for c, f in found.items()}
     for (c, i, _), own, turn in zip(at, orders, turned, strict=True):
         ordered[c][i] = own[int(turn)]
