@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from lrfcal_lib.board import corners_of_lines
 from lrfcal_lib.pairing import cells_of, thin
 from lrfcal_lib.preprocess import image
 from lrfcal_lib.preprocess.board_scan import face_points
+from lrfcal_lib.preprocess.wide import side_lines
 from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_observations import JointObservations
 
@@ -32,8 +34,8 @@ def all_views(prepared):
     known = sum(len(found) for found in prepared.views.values())
     if len(records) <= known or prepared.board.pattern is None:
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
-    seen = image.survey(records, session.read_image, prepared.board, prepared.models, session.picks)
-    return seen.views
+    options = {"picks": session.picks, "settled": prepared.views}  # sides of scans bear the names of that turn
+    return image.survey(records, session.read_image, prepared.board, prepared.models, **options).views
 
 
 def observe_joint(prepared, views=None, *, face_points=FACE_POINTS, cells=CELLS_PER_EDGE):
@@ -64,13 +66,20 @@ def observe_joint(prepared, views=None, *, face_points=FACE_POINTS, cells=CELLS_
         direction=np.array([session.sweep_direction(p) for p in placements], int),
         middle=np.array([float(np.mean(prepared.scans[p].sweep.pitch)) for p in placements]),
         edges=tuple(prepared.board.edges),
-        corners=prepared.board.known_corners(),
+        corners=_extent(prepared.board),
         cameras=tuple(views),
         mounts=tuple(session.cameras[c].mount for c in views),
         T_head_lrf=session.T_head_lrf,
         lens_covariance=np.stack([_lens(prepared.models[c]) for c in views]) if views else None,
         **found,
     )
+
+
+def _extent(board):
+    """Corners of the board, of its printed squares where nobody knows them: no beam is named after those."""
+    if board.corners is not None or board.pattern is None:
+        return board.known_corners()
+    return corners_of_lines(side_lines(board.pattern, np.full(4, board.pattern.square)))
 
 
 def _faces(prepared, index, count):

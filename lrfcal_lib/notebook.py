@@ -250,6 +250,21 @@ def verdict(title, sentences):
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
+def asked(possible, why):
+    """Whether a question can be put to a session; prints why not.
+
+    Parameters
+    ----------
+    possible : object
+        False where it cannot.
+    why : str
+        The rest of a sentence: what the session does not have.
+    """
+    if not possible:
+        print(f"not asked: {why}")
+    return bool(possible)
+
+
 def _shell():
     """The running IPython shell, None in plain Python."""
     try:

@@ -241,10 +241,13 @@ def name_sides(prepared, variant="half_step"):
     Returns
     -------
     dict of int to dict of int to str
-        Edge name by placement and side number. Sides farther than 8 cm from every edge stay unnamed.
+        Edge name by placement and side number. Sides farther than 8 cm from every edge stay unnamed; all do where
+        nobody knows the outline of the board.
     """
     rough = rough_poses(prepared, variant)
     names = {}
+    if prepared.board.corners is None:
+        return names
     for placement, along in prepared.edges[variant].items():
         to_board = _to_board(prepared, placement, rough)
         if to_board is None:

@@ -204,8 +204,8 @@ class PlatformCalibration:
         return "joint" if method == "joint" else "combined"
 
     def transform(self, method):
-        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
-        special = {"stated": self.stated, "combined": self.T_head_lrf}
+        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint', which without an axis is 'combined')."""
+        special = {"stated": self.stated, "combined": self.T_head_lrf, "joint": self.T_head_lrf}
         if self.joint is not None:
             special["joint"] = self.joint[0]
         return special[method] if method in special else self.solutions[method].T_head_lrf
@@ -357,7 +357,9 @@ def with_joint(calibration):
     cameras = joint.observations.cameras
     seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
-    platform = replace(calibration.platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
+    platform = calibration.platform
+    if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
+        platform = replace(platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
     found = {"observations": calibration.observations | seen, "solutions": calibration.solutions | solved}
     return replace(calibration, platform=platform, joint=joint, **found)
 

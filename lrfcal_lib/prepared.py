@@ -44,7 +44,7 @@ class Prepared:
     ----------
     session : Session
     board : Board
-        With its outline, measured from the images where the session does not state it.
+        With its outline, measured from the images where the session does not state it and they show it.
     scans : dict of int to BoardScan
         By placement.
     edges : dict of str to dict of int to ScanEdges
@@ -77,6 +77,23 @@ class Prepared:
     names: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
     problems: dict = field(default_factory=dict)
+
+    def seen(self, camera, placement):
+        """The board in an image of a placement, and the very image that it was found in: there may be several.
+
+        Parameters
+        ----------
+        camera : str
+        placement : int
+
+        Returns
+        -------
+        view : BoardView
+        image : ndarray of uint8, shape (h, w, 3)
+        """
+        view = self.views[camera][placement]
+        records = self.session.images(camera, placement=placement)
+        return view, self.session.read_image(next(r for r in records if r.file.name == view.file))
 
 
 @cached
@@ -120,9 +137,9 @@ def prepare_images(prepared):
     """
     seen = image.views_of(prepared.session, one_per_placement=True)
     views = {camera: _main_views(found) for camera, found in seen.views.items()}
-    return replace(
-        prepared, board=seen.board, models=seen.models, views=views, outline=seen.outline, relief=seen.relief
-    )
+    problems = prepared.problems | ({"outline": f"faces of the board only: {seen.unseen}"} if seen.unseen else {})
+    found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
+    return replace(prepared, models=seen.models, views=views, **found)
 
 
 def _main_views(views):

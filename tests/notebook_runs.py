@@ -1,11 +1,14 @@
 """The notebooks, and how tests run them under nbval."""
 
+import contextlib
+import io
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import nbformat
+import pytest
 from shared import stages
 
 from lrfcal_lib import cache
@@ -45,6 +48,17 @@ def run_nbval(path, session=None):
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
     environment |= {} if session is None else {"LRFCAL_SESSION": str(session)}
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+
+
+def run_plainly(path, session, folder):
+    """Run the cells of a notebook on a session in this process, without a kernel; what it printed."""
+    told, names = io.StringIO(), {"display": lambda shown: None}
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told):
+        patch.setenv("LRFCAL_SESSION", str(session))
+        patch.setenv(cache.VARIABLE, str(folder))
+        for number, cell in enumerate(code_cells(read(path))):
+            exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
+    return told.getvalue()
 
 
 def check(done):

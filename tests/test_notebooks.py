@@ -1,6 +1,7 @@
 """Notebooks are stored as run from top to bottom, kept readable, and still run."""
 
 import ast
+import re
 
 import nbformat
 import pytest
@@ -55,6 +56,15 @@ def test_cells_are_short_and_plain(path):
 def test_text_stands_before_code(path):
     kinds = [cell.cell_type for cell in read(path).cells]
     assert kinds.count("markdown") * 2.5 >= kinds.count("code")
+
+
+@each_notebook
+def test_formulas_are_formulas(path):
+    """A doubled backslash within dollars shows as text."""
+    for cell in read(path).cells:
+        if cell.cell_type == "markdown":
+            formulas = re.findall(r"\$[^$\n]+\$", cell.source)
+            assert not [f for f in formulas if re.search(r"\\\\[A-Za-z]", f)]
 
 
 @each_notebook

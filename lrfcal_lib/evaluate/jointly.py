@@ -219,11 +219,14 @@ def joint_errors(joint, truth):
     Returns
     -------
     DataFrame
-        what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm.
+        what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm; no axis where it was
+        not estimated.
     """
-    solution, sigma = joint.solution, np.sqrt(np.diag(joint.axis_parameters()[1]))
-    turn, shift = axis_difference(solution.axis, axis_of(truth.T_head_lrf))
-    rows = [("tilt axis", turn, np.linalg.norm(sigma[:2]), shift, np.linalg.norm(sigma[2:]))]
+    solution, rows = joint.solution, []
+    if joint.settings["axis"]:
+        sigma = np.sqrt(np.diag(joint.axis_parameters()[1]))
+        turn, shift = axis_difference(solution.axis, axis_of(truth.T_head_lrf))
+        rows = [("tilt axis", turn, np.linalg.norm(sigma[:2]), shift, np.linalg.norm(sigma[2:]))]
     for camera, found in solution.transforms.items():
         turn, shift = transform_difference(found, truth.cameras[camera])
         spread = solution.camera(camera).trusted_sigma

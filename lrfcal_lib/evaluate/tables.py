@@ -224,8 +224,9 @@ def best_method(comparison, among=("line", "zhang_pless")):
     if comparison.empty:
         raise ValueError("no camera was calibrated by any method")
     mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
-    score = mean.reindex(list(among)).prod(axis=1, skipna=False).dropna()
-    if score.empty:
+    mean = mean.reindex(list(among)).dropna(axis=1, how="all")  # where no edge was seen, planes judge alone
+    score = mean.prod(axis=1, skipna=False).dropna()
+    if mean.empty or score.empty:
         raise ValueError(f"none of {', '.join(among)} was judged on left-out placements; it takes more of them")
     return score.idxmin()
 
@@ -544,7 +545,8 @@ def _placement_lengths(prepared, placement, variant, measure):
     except DegenerateGeometry:
         measured, across = None, frozenset()
     rows = []
-    for name, true in prepared.board.lengths().items():
+    known = {} if prepared.board.corners is None else prepared.board.lengths()
+    for name, true in known.items():
         length = np.nan if measured is None else measured.lengths.get(name, np.nan)
         ends = "not measured"
         if np.isfinite(length):

@@ -2,7 +2,15 @@
 
 from lrfcal_lib.plots.colors import AXES_RGB, COLORS, SERIES, color_of
 from lrfcal_lib.plots.diagnosis import background_motion, board_bend
-from lrfcal_lib.plots.images import board_view, edge_detail, outline, picture, projected_points, stretch_in_image
+from lrfcal_lib.plots.images import (
+    board_view,
+    edge_detail,
+    outline,
+    picture,
+    projected_points,
+    seen_points,
+    stretch_in_image,
+)
 from lrfcal_lib.plots.results import (
     cost_history,
     edge_errors,
@@ -28,6 +36,6 @@ __all__ = [
     "crossings", "cylinder", "edge_detail", "edge_errors", "edge_of_line", "frames", "look_at", "method_bars",
     "misfit_bars", "observability_bars", "outline", "parameter_comparison", "picture", "pitch_offsets", "point_map",
     "point_parts", "polygon", "projected_points", "projection", "projection_map", "range_image", "rays", "render",
-    "residual_strips", "residuals_by_range", "residuals_by_region", "scan_line", "sides", "slab", "space", "sphere",
-    "stretch_in_image",
+    "residual_strips", "residuals_by_range", "residuals_by_region", "scan_line", "seen_points", "sides", "slab",
+    "space", "sphere", "stretch_in_image",
 ]  # fmt: skip

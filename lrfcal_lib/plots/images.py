@@ -102,6 +102,23 @@ def projected_points(ax, image, points, lines=None, margin=60):
     _cut(ax, [*points.values(), *(lines or ())], image, margin)
 
 
+def seen_points(ax, view, image, model, points):
+    """LRF edge points beside the edges of the board in the image of a view: :func:`projected_points`, figure 7.
+
+    Parameters
+    ----------
+    ax : Axes
+    view : BoardView
+    image : ndarray of uint8, shape (h, w, 3)
+        In which the view was found, see :meth:`lrfcal_lib.prepared.Prepared.seen`.
+    model : CameraModel
+    points : dict of str to ndarray, shape (n, 2)
+        Recorded pixels by method.
+    """
+    projected_points(ax, image, points, [stretch_in_image(edge, model) for edge in view.edges])
+    ax.set_title(f"{view.camera}, placement {view.placement}")
+
+
 def stretch_in_image(edge, model, count=61):
     """An image edge as recorded: its stretch of undistorted pixels seen through the lens, shape (count, 2)."""
     ends = np.asarray(edge.ends, float)

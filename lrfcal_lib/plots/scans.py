@@ -27,7 +27,9 @@ def range_image(ax, sweep, mask=None):
     bearing = np.degrees(sweep.bearings)
     drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], shading="nearest", rasterized=True)
     ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
-    if mask is not None and mask.any():
+    if mask is not None and mask.any() and len(mask) == 1:
+        ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
+    elif mask is not None and mask.any():
         ax.contour(bearing, height[order], mask[order].astype(float), levels=[0.5], colors="white", linewidths=1)
     seen = bearing[np.isfinite(sweep.ranges).any(axis=0)]
     step = np.ptp(bearing) / max(len(bearing) - 1, 1)

@@ -7,11 +7,12 @@ The stages have modules of their own and can be called from here: :mod:`.pattern
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import PurePath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.board import Board
 from lrfcal_lib.preprocess.adjustment import Adjustment
@@ -24,13 +25,15 @@ from lrfcal_lib.preprocess.pattern import (
     estimate_intrinsics,
     estimate_relief,
     find_pattern,
+    first_pose,
     spread_views,
     stereo_transform,
     turn_pattern,
 )
 from lrfcal_lib.preprocess.silhouette import OutlineNotFound
-from lrfcal_lib.preprocess.view import BoardView, best_order, view_board
-from lrfcal_lib.preprocess.wide import common_lines, edge_votes, resolve_turns
+from lrfcal_lib.preprocess.turns import alike, decide
+from lrfcal_lib.preprocess.view import BoardView, order_scores, pattern_orders, view_board
+from lrfcal_lib.preprocess.wide import OutlineNotSeen, common_lines, edge_votes, resolve_turns
 
 __all__ = [
     "Adjustment",
@@ -54,6 +57,7 @@ __all__ = [
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
 REMEMBERED_IMAGES = 128
+SETTLED = 100.0  # weight of a turn that was decided before against the edges of an image, of which a board has a few
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,11 @@ class Survey:
     outline : Outline or None
         None where the board is known and has no pattern.
     board : Board
-        With corners.
+        With corners, unless the images do not show them.
     relief : ndarray, shape (k,), or None
         Heights of the pattern's corners over the sheet's mean plane, metres (zero for a flat sheet).
+    unseen : str
+        Why the outline of the board is not known; its views have poses then and no edges.
     """
 
     views: dict
@@ -78,9 +84,10 @@ class Survey:
     outline: Outline | None
     board: Board
     relief: np.ndarray | None = field(default=None, repr=False)
+    unseen: str = ""
 
 
-def survey(records, read, board, models, picks=(), *, one_per_placement=False):
+def survey(records, read, board, models, picks=(), *, one_per_placement=False, settled=None):
     """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
 
     Parameters
@@ -96,6 +103,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     one_per_placement : bool
         Use one image of each camera and placement: of those that show the pattern the one whose pitch is nearest to
         the middle of the placement's images. Images of no placement are all used.
+    settled : dict of str to dict of int to BoardView, optional
+        By camera and placement: views of an earlier survey. Which way round the board is remains as it was there.
 
     Returns
     -------
@@ -113,15 +122,18 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     cameras, found = _find_all(choices, read, PatternFinder(board.pattern))
     flat = {c: m or _intrinsics(c, found[c], board, cameras[c], read) for c, m in models.items()}
     if board.corners is not None:
-        lines, ordered = None, _ordered_by_outline(cameras, read, board, flat, found)
+        ordered, lines, unseen = _ordered_by_outline(cameras, read, board, flat, found, settled or {}), None, ""
     else:
-        lines, ordered = _ordered_by_votes(cameras, read, board, flat, found)
+        ordered, lines, unseen = _ordered_by_votes(cameras, read, board, flat, found)
     models, relief = _with_relief(ordered, cameras, board, models, flat)
     outline = None if lines is None else rough_outline(lines, board)
     for _ in range(1 if lines is None else 2):
         views = _view_all(cameras, read, board, models, outline, picks, ordered, relief)
         outline = measure_outline(views, board, models) if lines is not None else None
-    return Survey(views, models, outline, board if outline is None else outline.board, relief)
+    if unseen:
+        gone = tuple((name, "the outline of the board is not known") for name in board.edges)
+        views = {c: [replace(v, edges=(), rejected=gone) for v in group] for c, group in views.items()}
+    return Survey(views, models, outline, board if outline is None else outline.board, relief, unseen)
 
 
 def _choices(group, one_per_placement):
@@ -227,42 +239,69 @@ def _intrinsics(camera, found, board, group, read):
         raise ValueError(f"camera '{camera}': {error}") from error
 
 
-def _ordered_by_outline(cameras, read, board, models, found):
-    """Corners of every image in the order that the known outline asks for."""
-    out = {}
-    for camera, group in cameras.items():
-        out[camera] = [
-            p if isinstance(p, str) else best_order(read(r), board, models[camera], p)
-            for r, p in zip(group, found[camera], strict=True)
-        ]
-    return out
+def _ordered_by_outline(cameras, read, board, models, found, settled):
+    """Corners of every image in the order that the known outline asks for, the same at all images of a placement."""
+    at, ordered = _with_pattern(cameras, found), {c: list(f) for c, f in found.items()}
+    orders = [pattern_orders(found[c][i], board, board.lines()) for c, i, _ in at]
+    rotations, scores = _rotations(at, orders, board, models), []
+    for (c, _, r), own, seen in zip(at, orders, rotations, strict=True):
+        view = settled.get(c, {}).get(r.placement)
+        if view is None or view.T_camera_board is None:
+            scores.append(order_scores(read(r), board, models[c], own))
+        else:
+            off = (seen * view.T_camera_board.rotation.inv()).magnitude()
+            scores.append(SETTLED * (off == off.min()))
+    chosen = decide(scores, *_alike(at, rotations)) if at else ()
+    for (c, i, _), own, k in zip(at, orders, chosen, strict=True):
+        ordered[c][i] = own[k]
+    return ordered
+
+
+def _with_pattern(cameras, found):
+    """Camera, number and record of every image in which the pattern was found."""
+    pairs = ((c, i, r, p) for c, group in cameras.items() for i, (r, p) in enumerate(zip(group, found[c], strict=True)))
+    return [(c, i, r) for c, i, r, p in pairs if not _is_reason(p)]
+
+
+def _rotations(at, orders, board, models):
+    """From the board to the camera for every order of the corners, a stack of Rotation for each image."""
+    points = board.pattern.points()
+    return [
+        Rotation.concatenate([first_pose(points, pixels, models[c]).rotation for pixels in own])
+        for (c, _, _), own in zip(at, orders, strict=True)
+    ]
+
+
+def _alike(at, rotations):
+    """Which orders of the corners belong together in the images of a placement, see :func:`.turns.alike`."""
+    placements = [-1 if r.purpose == "intrinsics" else r.placement for _, _, r in at]
+    return alike(rotations, placements, [c for c, _, _ in at])
 
 
 def _ordered_by_votes(cameras, read, board, models, found):
-    """Rough lines of the outline, and the corners of every image turned alike."""
+    """The corners of every image turned alike, and rough lines of the outline, or None and why they are not seen."""
     if len(board.edges) != 4:
         raise ValueError(
             f"board '{board.name}' has {len(board.edges)} edges and no known corners: only four edges around a pattern "
             "can be measured from images, give the corners"
         )
-    votes, up, at = [], [], []
-    for camera, group in cameras.items():
-        for i, (record, pixels) in enumerate(zip(group, found[camera], strict=True)):
-            if not isinstance(pixels, str):
-                pose = board_pose(pixels, board.pattern, models[camera])[0]
-                votes.append(edge_votes(read(record), board, models[camera], pose))
-                up.append(pose.rotation.as_matrix()[1, 1])
-                at.append((camera, i))
-    if not votes:
+    at = _with_pattern(cameras, found)
+    if not at:
         raise ValueError(f"none of {sum(map(len, cameras.values()))} images shows the pattern of board '{board.name}'")
-    turned = resolve_turns(votes, up)
+    poses = [board_pose(found[c][i], board.pattern, models[c])[0] for c, i, _ in at]
+    votes = [edge_votes(read(r), board, models[c], pose) for (c, _, r), pose in zip(at, poses, strict=True)]
+    up = [pose.rotation.as_matrix()[1, 1] for pose in poses]
+    orders = [(found[c][i], turn_pattern(found[c][i])) for c, i, _ in at]
+    turned = resolve_turns(votes, up, *_alike(at, _rotations(at, orders, board, models)))
     ordered = {c: list(f) for c, f in found.items()}
-    for (camera, i), turn in zip(at, turned, strict=True):
-        if turn:
-            ordered[camera][i] = turn_pattern(ordered[camera][i])
+    for (c, i, _), own, turn in zip(at, orders, turned, strict=True):
+        ordered[c][i] = own[int(turn)]
     votes = np.stack(votes)
     votes[turned] = votes[turned][:, [2, 3, 0, 1]]
-    return common_lines(votes, board), ordered
+    try:
+        return ordered, common_lines(votes, board), ""
+    except OutlineNotSeen as error:
+        return ordered, None, str(error)
 
 
 def _with_relief(ordered, cameras, board, models, flat):

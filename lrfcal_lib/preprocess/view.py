@@ -146,7 +146,7 @@ def view_board(
         lines = _known_lines(board, outline)
         if pixels is not None:
             return _joined(_view_pattern(view, image, board, model, lines, picks, pixels, relief), board, model, relief)
-        orders = _orders(find_pattern(image, board.pattern), board, lines)
+        orders = pattern_orders(find_pattern(image, board.pattern), board, lines)
         views = [_view_pattern(view, image, board, model, lines, picks, p, relief) for p in orders]
         best = views[0] if lines is None else max(views, key=lambda v: _support(v, board, model, lines))
         return _joined(best, board, model, relief)
@@ -169,8 +169,8 @@ def _known_lines(board, outline):
     return None if board.corners is None else board.lines()
 
 
-def _orders(pixels, board, lines):
-    """Orders of the corners that a chessboard allows; the outline tells which is right."""
+def pattern_orders(pixels, board, lines):
+    """Orders of the corners that a chessboard allows, those of a mirrored board frame in the second half."""
     if lines is None:
         return [pixels]
     orders = [pixels, turn_pattern(pixels)]
@@ -286,23 +286,34 @@ def _agrees(edges, picks, model, within=10.0):
     return all(o < within for o in off)
 
 
-def best_order(image, board, model, pixels):
-    """The order of a pattern's corners for which the known outline of the board fits the image best.
+def order_scores(image, board, model, orders):
+    """How well the known outline of the board fits one image, for every order of the pattern's corners.
 
-    Notes
-    -----
-    A few coarse profiles across the outline decide; orders that they cannot tell apart are compared by the edges
-    that the full search finds.
+    Parameters
+    ----------
+    image : ndarray of uint8
+    board : Board
+        With corners.
+    model : CameraModel
+    orders : sequence of ndarray, shape (k, 2)
+        Of :func:`pattern_orders`.
+
+    Returns
+    -------
+    ndarray
+        Of a few coarse profiles across the outline; orders that they cannot tell apart are compared by the edges that
+        the full search finds.
     """
     lines = board.lines()
-    orders = _orders(pixels, board, lines)
     scores = np.array([_coarse_support(image, board, model, lines, p) for p in orders])
-    likely = [p for p, score in zip(orders, scores, strict=True) if score >= CLEAR_SHARE * scores.max()]
-    if len(likely) == 1:
-        return likely[0]
-    empty = BoardView("", "", -1, np.nan)
-    views = [_view_pattern(empty, image, board, model, lines, {}, p, None) for p in likely]
-    return likely[int(np.argmax([_support(v, board, model, lines) for v in views]))]
+    likely = np.flatnonzero(scores >= CLEAR_SHARE * scores.max())
+    if len(likely) > 1:
+        empty, coarse = BoardView("", "", -1, np.nan), scores.max()
+        views = [_view_pattern(empty, image, board, model, lines, {}, orders[i], None) for i in likely]
+        support = np.array([_support(v, board, model, lines) for v in views])
+        scores = np.zeros(len(orders))
+        scores[likely] = coarse * support / max(support.max(), 1e-9)
+    return scores
 
 
 def _coarse_support(image, board, model, lines, pixels):

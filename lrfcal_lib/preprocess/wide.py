@@ -14,6 +14,10 @@ SIDES = ("top", "right", "bottom", "left")
 SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
 
 
+class OutlineNotSeen(ValueError):
+    """The images do not show where a board ends (a sheet on a wall, a background as bright as the board)."""
+
+
 def wide_distances(pattern):
     """Distances outside the outermost inner corners at which edges are looked for, metres."""
     return np.arange(NEAREST, FARTHEST, STEP) * pattern.square
@@ -120,7 +124,7 @@ def side_lines(pattern, distances):
     return np.column_stack([SIDE_NORMALS, offset])
 
 
-def resolve_turns(votes, up):
+def resolve_turns(votes, up, first=None, partner=None):
     """Which views see the pattern turned by 180 deg against the others.
 
     Parameters
@@ -129,26 +133,31 @@ def resolve_turns(votes, up):
         Of :func:`edge_votes`, one row a view.
     up : ndarray, shape (v,)
         Component of the board's y axis down the image: most views keep y down.
+    first, partner : ndarray, shape (v,) and (v, 2), optional
+        Views that are decided together, see :func:`lrfcal_lib.preprocess.turns.alike`.
 
     Returns
     -------
     ndarray of bool, shape (v,)
     """
-    votes = np.nan_to_num(np.asarray(votes, float))
+    first = np.arange(len(votes)) if first is None else first
+    against = np.zeros(len(votes), bool) if partner is None else partner[:, 0] == 1
+    up = np.where(against, -np.asarray(up), up)
     # edges move by a few millimetres from view to view: widen the peaks before comparing
-    wide = uniform_filter1d(votes, 9, axis=-1)
+    wide = uniform_filter1d(np.nan_to_num(np.asarray(votes, float)), 9, axis=-1)
+    wide[against] = wide[against][:, [2, 3, 0, 1]]
     both = np.stack([wide, wide[:, [2, 3, 0, 1]]])
-    turned = np.asarray(up) < 0
+    turned = np.bincount(first, up)[first] < 0
     rows = np.arange(len(votes))
     for _ in range(50):
         mean = both[turned.astype(int), rows].mean(axis=0)
         score = np.sum(both * mean, axis=(2, 3))
-        new = score[1] > score[0]
+        new = np.bincount(first, score[1] - score[0])[first] > 0
         if np.array_equal(new, turned):
             break
         turned = new
-    kept_down = np.where(turned, -np.asarray(up), up)
-    return turned if np.mean(kept_down > 0) >= 0.5 else ~turned
+    kept_down = np.where(turned, -up, up)
+    return (turned if np.mean(kept_down > 0) >= 0.5 else ~turned) ^ against
 
 
 def common_lines(votes, board):
@@ -166,7 +175,7 @@ def common_lines(votes, board):
 
     Raises
     ------
-    ValueError
+    OutlineNotSeen
         If the views do not agree on a side.
     """
     distances = wide_distances(board.pattern)
@@ -181,7 +190,7 @@ def common_lines(votes, board):
         smooth = gaussian_filter1d(np.nan_to_num(mean), 1.0)
         places.append(outer_peak(smooth, least=0.5, quiet=0.2, width=6))
         if places[-1] < 0:
-            raise ValueError(
+            raise OutlineNotSeen(
                 f"the images do not agree on the {SIDES[side]} edge of board '{board.name}': give the corners of the "
                 "board or pick edges by hand"
             )

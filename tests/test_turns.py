@@ -1,0 +1,84 @@
+"""Boards that look the same when turned: one turn for all images of a placement."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_sessions import record, rectangle
+
+from lrfcal_lib.preprocess import image
+from lrfcal_lib.preprocess.turns import alike, decide
+from lrfcal_lib.session import open_session, transform_from_json
+
+HALF, MIRROR = Rotation.from_rotvec([0, 0, np.pi]), Rotation.from_rotvec([np.pi, 0, 0])
+RECTANGLE = Rotation.concatenate([Rotation.identity(), HALF, MIRROR, MIRROR * HALF])
+QUARTER = Rotation.from_rotvec([0, 0, np.pi / 2])
+SQUARE = Rotation.concatenate([Rotation.identity(), HALF, QUARTER, QUARTER * HALF, MIRROR, MIRROR * HALF,
+                               MIRROR * QUARTER, MIRROR * QUARTER * HALF])  # fmt: skip
+
+
+def images(symmetry, between, rng, placements=6, pitches=(-0.2, 0.0, 0.2)):
+    """Rotations, placements and cameras of images, and the order that is true in each (by index)."""
+    out = []
+    for placement in range(placements):
+        board = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]) * Rotation.from_rotvec([*rng.uniform(-0.6, 0.6, 2), 0])
+        for camera, turn in between.items():
+            for pitch in pitches:
+                seen = turn * Rotation.from_rotvec([pitch, 0, 0]) * board
+                first = symmetry[rng.integers(len(symmetry) // 2)]  # the detector begins anywhere, and counts clockwise
+                orders = Rotation.concatenate([seen * first * s for s in symmetry])
+                true = np.argmin([(o * seen.inv()).magnitude() for o in orders])
+                out.append((orders, placement, camera, true))
+    return [list(column) for column in zip(*out, strict=True)]
+
+
+@pytest.mark.parametrize("symmetry", [RECTANGLE, SQUARE], ids=["rectangle", "square"])
+@pytest.mark.parametrize("turned", [[0, 0.05, 0], [0, 0, 3.0], [0.4, 0.9, 1.2]], ids=["beside", "overhead", "askew"])
+def test_orders_of_a_placement_belong_together_however_the_cameras_are_mounted(symmetry, turned):
+    rng = np.random.default_rng(4)
+    rotations, placements, cameras, true = images(
+        symmetry, {"left": Rotation.identity(), "right": Rotation.from_rotvec(turned)}, rng
+    )
+    first, partner = alike(rotations, placements, cameras)
+    assert [placements[i] for i in first] == placements
+    np.testing.assert_array_equal(partner[np.arange(len(true)), np.take(true, first)], true)
+
+
+def test_the_evidence_of_all_images_decides():
+    rng = np.random.default_rng(5)
+    rotations, placements, cameras, true = images(RECTANGLE, {"left": Rotation.identity()}, rng)
+    scores = rng.uniform(0, 1, (len(true), 4))  # no image tells on its own
+    scores[np.arange(len(true)), true] += 0.45
+    assert np.mean(np.argmax(scores, axis=1) == true) < 0.95
+    np.testing.assert_array_equal(decide(scores, *alike(rotations, placements, cameras)), true)
+
+
+def test_an_image_of_no_placement_stands_alone():
+    first, partner = alike([RECTANGLE] * 3, [-1, -1, 2], ["left"] * 3)
+    np.testing.assert_array_equal(first, [0, 1, 2])
+    np.testing.assert_array_equal(partner, np.tile(np.arange(4), (3, 1)))
+
+
+@pytest.fixture(scope="module")
+def centred(tmp_path_factory):
+    return open_session(
+        record(tmp_path_factory.mktemp("turns") / "centred", rectangle(), 3, placements=3, image_pitch_deg=(-4.0, -1.0))
+    )
+
+
+@pytest.mark.parametrize("stated", [True, False], ids=["outline stated", "outline measured"])
+def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centred, stated):
+    board = centred.board if stated else replace(centred.board, corners=None)
+    models = {name: camera.model for name, camera in centred.cameras.items()}
+    found = image.survey(centred.images(), centred.read_image, board, models)
+    truth, turns = json.loads((centred.path / "truth.json").read_text())["images"], {}
+    for view in (v for views in found.views.values() for v in views if not v.reason):
+        true = transform_from_json(truth[f"images/{view.camera}/{view.file}"]["T_camera_board"])
+        turns.setdefault(view.placement, []).append(true.rotation.inv() * view.T_camera_board.rotation)
+    for number, own in turns.items():
+        assert len(own) >= 3
+        assert max((own[0].inv() * turn).magnitude() for turn in own) < 0.1, f"placement {number}"
+        # the frame is the board's, as it is or turned by half a turn, never seen from behind
+        assert min(own[0].magnitude(), (own[0] * HALF).magnitude()) < 0.1
