@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_rig import SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
+from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.head_settings import HEAD, HeadSettings
 from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, Configuration, parse_configuration
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
 from lrfcal_lib.drivers.serial_port import open_port
 from lrfcal_lib.drivers.video_sources import find_source
@@ -305,6 +305,36 @@ def test_a_head_without_feedback_says_so():
     assert all(e.measured for e in events_of(make_rig()) if isinstance(e, Moved))
 
 
+def scans(moving, noise, step=0.0):
+    """Ranges of 40 scans of a wall, 361 beams, while a head moves by 20 deg or not; a person walks by."""
+    rng, pitch = np.random.default_rng(5), np.linspace(-10, 10, 40) * moving
+    ranges = np.repeat(2.5 / np.cos(np.radians(pitch))[:, None], 361, axis=1)
+    ranges[10:25, 30:38] = 1.5
+    ranges[:, 150:300] = 2  # a wall beside, which is seen the same at any pitch
+    ranges = ranges + noise * rng.standard_normal(ranges.shape)
+    ranges[:, 300:] = np.where(rng.random((40, 61)) < 0.5, np.nan, 3)
+    return np.round(ranges / step) * step if step else ranges
+
+
+@pytest.mark.parametrize(("noise", "step"), [(0.005, 0), (0.01, 0.01), (0.002, 0.01), (0, 0), (0.02, 0)])
+def test_scans_that_differ_by_noise_alone_are_told_from_those_of_a_head_that_moves(noise, step):
+    assert unchanged(scans(False, noise, step)) and not unchanged(scans(True, noise, step))
+    assert not unchanged(np.full((9, 5), np.nan))
+
+
+@pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
+def test_a_head_that_tells_nothing_and_does_not_move_ends_the_sweep(mode):
+    """As with a wrong address or rate: the driver reckons that it moved, the scans say that it did not."""
+    rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]), feedback=False)
+    scan = rig.lrf._scan
+    rig.lrf._scan = lambda instant: replace(scan(instant), ranges=np.full(BEAMS, 2.0))
+    with pytest.raises(NoReply, match="the head did not move: .*address 1 and 2400 Bd at /dev/fake_head"):
+        events_of(rig)
+    assert rig.head.stops and len(rig.lrf.readings) > 8
+    rig.lrf._scan = scan
+    assert events_of(rig)
+
+
 class Boom(Exception):
     pass
 
@@ -463,6 +493,9 @@ def test_what_the_device_says_about_itself_counts():
     info = rig.lrf_info
     np.testing.assert_allclose(np.degrees(info.field_of_view), [0, 180])
     assert math.degrees(info.bearing_step) == pytest.approx(0.5) and info.range_resolution == 0.01
+    for mode, unit, longest in ((0, "cm", 81.82), (0, "mm", 8.182), (4, "mm", 16.374), (6, "mm", 32.758)):
+        rig.lrf.configuration = Configuration().changed(unit=unit, measuring_mode=mode)
+        assert rig.lrf_info.max_range == pytest.approx(longest)
     rig.stated.lrf_device["interlaced"] = True
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
 
