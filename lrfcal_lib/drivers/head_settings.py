@@ -32,7 +32,8 @@ class HeadSettings:
     baudrate : int
         2400, the most common default; 9600 is the next.
     feedback : "auto" or bool
-        Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer.
+        Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not
+        state it means true: a silent head may as well be one with another address or rate.
     absolute : "auto" or bool
         Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
     echo : "auto" or bool
