@@ -156,7 +156,7 @@ class Lrf(Device):
             self.head.note()
             time.sleep(0.01)  # a batch of a sweep ends by the real time
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
-        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0), BEARINGS, instant, times)
+        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times)
         self.readings.append(reading)
         return reading
 

@@ -405,6 +405,82 @@ def test_the_rate_changes_after_the_reply(lms):
     assert parse_telegram(slow.send(RATE[500000])[1:]).data == b"\x02" and slow.device.baudrate == 9600
 
 
+@pytest.mark.parametrize("request_", [STATUS, STOP, SCAN, CONFIG, STATUS[:-2] + "00"])
+@pytest.mark.parametrize("command", ["rate", "reset"])
+def test_a_request_interrupts_a_reply_and_never_undoes_the_command(lms, command, request_):
+    """At any time until the reply is out; the one with a wrong checksum as well."""
+    for wait in np.arange(0, 0.09, 0.01 if command == "rate" else 0.002):
+        bench = lms(boot_s=0.5, baudrate=19200, permanent_baud=True)
+        bench.send(RATE[38400] if command == "rate" else "02 00 01 00 10 34 12", wait)
+        bench.send(request_, wait=2.0)
+        if command == "rate":
+            assert bench.device.baudrate == 38400, wait
+            assert telegrams(bench.send(TYPE))[0][4] == 0xBA
+        else:
+            assert telegrams(bench.heard)[-1][4] == 0x90, wait
+
+
+class Carmen:
+    """A host whose rate counts, with the order of commands of CARMEN's client: it gives each byte 250 ms."""
+
+    def __init__(self, bench):
+        self.bench, self.rate, self.heard = bench, 9600, bytearray()
+        bench.device.line._put = lambda data: self.heard.extend(resample(data, bench.device.baudrate, self.rate))
+
+    def send(self, raw):
+        raw = bytes.fromhex(raw)
+        self.bench.run(len(raw) * 10 / self.rate)
+        self.bench.device.receive(resample(raw, self.rate, self.bench.device.baudrate), self.bench.now)
+
+    def reply(self):
+        """The next telegram, whatever it answers; None after a silence, or for a damaged one."""
+        silent, count = 0, len(self.heard)
+        while not (found := telegrams(self.heard)) and silent < 250:
+            self.bench.run(0.001)
+            silent, count = (0 if len(self.heard) > count else silent + 1), len(self.heard)
+        self.heard.clear()
+        return found[0] if found else None
+
+    def find(self):
+        """The rate at which two stops in a row are answered."""
+        for self.rate in (9600, 19200, 38400, 500000):
+            for _ in range(8):
+                self.send(STOP)
+                if self.reply() is None:
+                    continue
+                self.bench.run(0.01)
+                self.send(STOP)
+                if self.reply() is not None:
+                    return self.rate
+        return None
+
+    def connect(self, rate):
+        """Ask for the rate and, at once, for the status: any answer will do, then the device is looked for again."""
+        for _ in range(2):
+            if self.find() in (rate, None):
+                return self.rate == rate
+            self.send(RATE[rate])
+            answered = False
+            for _ in range(5):
+                self.send(STATUS)
+                answered = answered or self.reply() is not None
+                if answered:
+                    break
+            if not answered:
+                return False
+        return False
+
+
+@pytest.mark.parametrize("wanted", [9600, 19200, 38400, 500000])
+@pytest.mark.parametrize("found", [9600, 19200, 38400])
+def test_carmen_connects_in_its_own_order_of_commands(lms, found, wanted):
+    bench = lms(baudrate=found)
+    client = Carmen(bench)
+    assert client.connect(wanted)
+    client.send(STATUS)
+    assert parse_status(client.reply()).baud == wanted == bench.device.baudrate
+
+
 # ------------------------------------------------------------------------------------------------ the line
 
 

@@ -85,6 +85,7 @@ class EmulatedLms:
         self.scanner = Scanner(source or SyntheticSource(), self.memory, self.clock, now - powered_s)
         self.scans = self.scanner.records
         self._buffer, self._stream, self._booting, self.left_out = b"", None, powered_s < boot_s, 0
+        self._after = None  # what the last command still does once a reply is out
         if self._booting:
             self.line.at(now + boot_s - powered_s, self._ready, "boot")
 
@@ -150,7 +151,7 @@ class EmulatedLms:
         return None
 
     def _hear(self, raw, at):
-        """Acknowledge a telegram and do what it says; it interrupts whatever is being sent."""
+        """Acknowledge a telegram and do what it says; it interrupts whatever is being sent, and undoes nothing."""
         if raw[1] not in (0, self.memory.address) or self._booting:
             return
         self.line.cancel("reply")
@@ -158,8 +159,7 @@ class EmulatedLms:
         self.line.abort()
         sound = crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
         if not sound or self.faults.hit("nak"):
-            self.line.write(bytes([NAK]), at + ACK_S)
-            return self._resume(at + ACK_S)
+            return self.line.write(bytes([NAK]), at + ACK_S, self._finish)
         if not self.faults.hit("no_ack"):
             self.line.write(bytes([ACK]), at + ACK_S)
         self.requests.append((time.time(), raw))
@@ -182,12 +182,20 @@ class EmulatedLms:
     # ------------------------------------------------------------------------------------------- replies
 
     def _answer(self, at, code, data=b"", then=None, delay=REPLY_S):
-        """Send a reply after a delay; streaming goes on after it unless `then` says otherwise."""
+        """Send a reply after a delay, then do what `then` says; streaming goes on after it."""
+        self._after = then or self._after  # of the command before, where this one interrupted its reply
 
         def send(instant):
-            self.line.reply(code, self.memory.reply(code, data), instant, then or self._resume)
+            self.line.reply(code, self.memory.reply(code, data), instant, self._finish)
 
         self.line.at(at + delay, send, "reply")
+
+    def _finish(self, at):
+        """A reply is out: do what is left of the command, and go on streaming."""
+        after, self._after = self._after, None
+        if after is not None:
+            after(at)
+        self._resume(at)
 
     def _refuse(self, at):
         self._answer(at, 0x92)
@@ -214,7 +222,7 @@ class EmulatedLms:
     def _restart(self, at):
         self.line.cancel("reply")
         self.line.cancel("stream")
-        self._booting, self._stream = True, None
+        self._booting, self._stream, self._after = True, None, None
         self.line.at(at, self._off, "boot")
         self.line.at(at + self.boot_s, self._ready, "boot")
 
@@ -292,11 +300,7 @@ class EmulatedLms:
         if rate not in self.baudrates:
             return self._result(FAULT, at)
 
-        def switch(end):
-            self.memory.baudrate = rate
-            self._resume(end)
-
-        self._result(DONE, at, switch)
+        self._result(DONE, at, lambda _: setattr(self.memory, "baudrate", rate))
 
     def _set_mode(self, mode, data, at):
         delay = REPLY_S + self.rng.uniform(0, 0.02)
@@ -335,7 +339,7 @@ class EmulatedLms:
         turns = turns or self.memory.turns
         first = self.scanner.turn_at(at + ACK_S + 2 * self.line.byte_s, turns)
         end = self.scanner.turn_time(first + turns * count)
-        self._when_complete(end, lambda: measure(first), lambda scan, t: self._emit(scan, t, self._resume), "reply")
+        self._when_complete(end, lambda: measure(first), lambda scan, t: self._emit(scan, t, self._finish), "reply")
 
     def _when_complete(self, end, measure, send, tag):
         """Send a scan at its end; it is measured a little ahead, which may take the processor a while."""

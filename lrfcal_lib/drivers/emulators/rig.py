@@ -193,7 +193,7 @@ class EmulatedRig:
             "lrf": {"port": self.lrf_port, "baudrate": 500000, "variant": [beam.field_of_view, beam.resolution / 100],
                     "unit": "mm" if beam.unit < 0.005 else "cm", "interlaced": False},
             "head": {"port": self.head_port, "address": self.pan_tilt.address, "baudrate": self.pan_tilt.baudrate,
-                     "pitch_limits_deg": low_high.round(6).tolist()},
+                     "feedback": self.pan_tilt.reply_kind != "none", "pitch_limits_deg": low_high.round(6).tolist()},
             "cameras": {name: {"source": url, "size": size[name], "silence_s": SILENCE_S}
                         for name, url in self.camera_urls.items()},
             "control": self.control,

@@ -39,7 +39,7 @@ def parser():
 
 
 def main(argv=None):
-    """Emulate a rig until Ctrl-C or SIGTERM.
+    """Emulate a rig until Ctrl-C, SIGTERM or SIGHUP.
 
     Parameters
     ----------
@@ -57,8 +57,9 @@ def main(argv=None):
     """
     args = parser().parse_args(argv)
     quit_ = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: quit_.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
+            signal.signal(number, lambda *_: quit_.set())
     with _rig(args) as rig:
         file = None if args.rig_file is None else Path(args.rig_file)
         try:
