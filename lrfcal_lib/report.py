@@ -303,11 +303,16 @@ def _take_place(new, out):
             shutil.copytree(path, new / path.name, symlinks=True)
         else:
             shutil.copy2(path, new / path.name, follow_symlinks=False)
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE: os.rename replaces nothing but empty folders
-    if ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange):
-        old = out.rename(out.with_name(out.name + ".old"))  # disks that cannot exchange, such as NFS
+    if not _exchange(new, out):  # some disks cannot, such as NFS
+        old = out.rename(out.with_name(out.name + ".old"))
         new.rename(out)
         shutil.rmtree(old)
+
+
+def _exchange(new, out):
+    """Two folders take each other's name in one step; whether they did. os.rename replaces empty folders only."""
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange) == 0
 
 
 def _remove_abandoned(folder):

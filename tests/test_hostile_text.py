@@ -151,7 +151,7 @@ def test_nothing_runs_in_the_panel(page):
     said = [words.title(HOSTILE), words.soft(HOSTILE), words.state("busy", HOSTILE), words.error(HOSTILE, HOSTILE)]
     said += [words.notes([HOSTILE]), words.lights(HOSTILE, [light]), words.task(task, True, (1,)), words.result(result)]
     page.set_content("".join(f"<div>{part}</div>" for part in said))
-    assert seen(page).count(HOSTILE) == 16
+    assert seen(page).count(HOSTILE) == 15
 
 
 def test_no_formula_is_left_for_a_page_to_draw():
