@@ -30,14 +30,12 @@ def _one_thread():
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}  # kernels and workers inherit them
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
-    if "numpy" in sys.modules and os.path.exists("/proc/self/maps"):
+    if os.path.exists("/proc/self/maps"):
         with open("/proc/self/maps", encoding="utf-8", errors="surrogateescape") as maps:
             files = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
         for library in map(ctypes.CDLL, files):
             for name in ("scipy_openblas{}64_", "scipy_openblas{}", "openblas{}"):  # NumPy's, SciPy's, OpenCV's
-                set_threads = getattr(library, name.format("_set_num_threads"), None)
-                if set_threads:
-                    set_threads(1)
+                getattr(library, name.format("_set_num_threads"), int)(1)
 
 
 _one_thread()

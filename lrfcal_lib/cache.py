@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
-import stat
 from functools import lru_cache, wraps
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -58,14 +57,10 @@ def cached(stage):
 
 def _check_private(folder):
     """Whoever may write to the folder could have what they put there run."""
-    if not folder.exists():
-        return
-    found = folder.stat()
-    if found.st_uid not in (os.geteuid(), 0) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise ValueError(
-            f"{VARIABLE}: others may write to '{folder}' (owner {found.st_uid}, mode {stat.S_IMODE(found.st_mode):o}), "
-            "and what lies there is run; name a folder of your own, closed with chmod go-w"
-        )
+    found = folder.stat() if folder.exists() else None
+    if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
+        may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
+        raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
 
 
 def _key(stage, session, args, options):

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
@@ -221,8 +221,8 @@ def main(argv=None):
     parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
     parser.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     options = parser.parse_args(argv)
-    heard = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]  # nohup ignores SIGHUP
-    before = {number: signal.signal(number, _stop) for number in heard}
+    # nohup ignores SIGHUP
+    before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
         sessions = [Path(path) for path in options.session] or [default_session()]
         return max(_store_all(session) if options.store else _report(session, options) for session in sessions)
@@ -230,13 +230,12 @@ def main(argv=None):
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stopped:
-        number = signal.Signals(*(stopped.args or (signal.SIGINT,)))
-        done = "notebooks stored until now stay so" if options.store else "an earlier report stays as it was"
-        print(f"\nlrfcal: stopped by {number.name}; {done}", file=sys.stderr)
+        number = signal.Signals((*stopped.args, signal.SIGINT)[0])
+        print(f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was", file=sys.stderr)
         return 128 + number
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for pair in before:
+            signal.signal(*pair)
 
 
 def _stop(number, frame):
@@ -277,14 +276,16 @@ def _beside(out):
     """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(out.parent)
+        for left in out.parent.glob(PART + "*"):
+            with suppress(OSError), open(left / "lock", "a") as lock:  # its owner lives, or it is somebody else's
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left)
         box = Path(mkdtemp(prefix=".lrfcal-", dir=out.parent))
         try:
             with open(box / "lock", "w") as lock:  # it ends with this process, however that ends
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 box = box.rename(box.with_name(PART + box.name))  # named as others expect only once it is locked
-                for name in ("figures", "tables", "parts"):
-                    (box / "report" / name).mkdir(parents=True)
+                (box / "report" / "parts").mkdir(parents=True)
                 yield box / "report"
                 _take_place(box / "report", out)
         finally:
@@ -295,32 +296,18 @@ def _beside(out):
 
 def _take_place(new, out):
     """Exchange two folders in one step; files in the old one that are no report's come along."""
+
+    def ours(folder, names):
+        pages = (name for name in names if re.fullmatch("[0-9]{2}_.*[.]html", name))
+        return {*OWN_FILES, *pages} if folder == str(out) else ()
+
     out.mkdir(exist_ok=True)
-    for path in out.iterdir():
-        if path.name in OWN_FILES or re.fullmatch("[0-9]{2}_.*[.]html", path.name):
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.copytree(path, new / path.name, symlinks=True)
-        else:
-            shutil.copy2(path, new / path.name, follow_symlinks=False)
-    if not _exchange(new, out):  # some disks cannot, such as NFS
-        old = out.rename(out.with_name(out.name + ".old"))
+    shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE: os.rename replaces nothing but empty folders
+    if ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange):
+        old = out.rename(out.with_name(out.name + ".old"))  # disks that cannot exchange, such as NFS
         new.rename(out)
         shutil.rmtree(old)
-
-
-def _exchange(new, out):
-    """Two folders take each other's name in one step; whether they did. os.rename replaces empty folders only."""
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    return ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange) == 0
-
-
-def _remove_abandoned(folder):
-    """Remove what reports that were killed have left."""
-    for box in folder.glob(PART + "*"):
-        with suppress(OSError), open(box / "lock", "a") as lock:  # its owner lives, or it is somebody else's
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(box)
 
 
 def _execute_all(paths, environment, out, jobs):
@@ -330,28 +317,23 @@ def _execute_all(paths, environment, out, jobs):
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
-        with _ended_early(futures), tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+        with ExitStack() as stack, tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+            stack.callback(_end, futures)
             for future in as_completed(futures):
                 bar.set_postfix_str(futures[future].stem)
                 bar.update()
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-@contextmanager
-def _ended_early(futures):
-    """Whatever ends the waiting for notebooks ends the notebooks as well."""
-    try:
-        yield
-    except BaseException:
-        for future in futures:
-            future.cancel()
-        while not all(future.done() for future in futures):  # a kernel may just be starting
-            for manager in [client.km for client in _CLIENTS if client.km is not None]:
-                process = getattr(manager.provisioner, "process", None)
-                if process is not None:
-                    process.kill()
-            time.sleep(0.05)
-        raise
+def _end(futures):
+    """End the notebooks that are being executed and leave out the others."""
+    for future in futures:
+        future.cancel()
+    while not all(future.done() for future in futures):
+        for client in list(_CLIENTS):
+            with suppress(AttributeError):  # its kernel is just starting
+                client.km.provisioner.process.kill()
+        time.sleep(0.05)
 
 
 def _run(path, environment, out):

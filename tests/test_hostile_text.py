@@ -150,6 +150,7 @@ def test_nothing_runs_in_the_panel(page):
     result = SimpleNamespace(answer="no", sentences=(f"a: {HOSTILE}", HOSTILE), file=HOSTILE, poses={HOSTILE: vector})
     said = [words.title(HOSTILE), words.soft(HOSTILE), words.state("busy", HOSTILE), words.error(HOSTILE, HOSTILE)]
     said += [words.notes([HOSTILE]), words.lights(HOSTILE, [light]), words.task(task, True, (1,)), words.result(result)]
+    page.goto("about:blank")
     page.set_content("".join(f"<div>{part}</div>" for part in said))
     assert seen(page).count(HOSTILE) == 15
 

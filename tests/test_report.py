@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import nbformat
 import numpy as np
@@ -154,12 +155,14 @@ def test_two_reports_at_once_lose_nothing(session, tmp_path, line):
     assert [run.error for run in report.make_report(session, out, notebooks=[other])] == [""]
     assert [found["key"] for found in json.loads((out / "findings.json").read_text())] == ["other"]
     (out / "mine.txt").write_text("kept")
+    (out / "mine" / "figures").mkdir(parents=True)
     os.write(line[1], b".")
     slow.join()
     assert [run.error for run in runs] == ["", ""]
     assert [found["key"] for found in json.loads((out / "findings.json").read_text())] == ["late", "early"]
     assert sorted(path.name for path in out.glob("*.*")) == [
         "00_late.html", "01_early.html", "findings.json", "index.html", "mine.txt"]  # fmt: skip
+    assert (out / "mine" / "figures").is_dir()
     assert parts(tmp_path) == []
 
 
@@ -193,7 +196,7 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
 def test_disks_that_cannot_exchange_folders_rename_twice(session, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").symlink_to("nowhere")
-    monkeypatch.setattr(report, "_exchange", lambda new, out: False)
+    monkeypatch.setattr(report.ctypes, "CDLL", lambda name: SimpleNamespace(renameat2=lambda *names: -1))
     report.make_report(session, tmp_path / "out", notebooks=[])
     assert (tmp_path / "out" / "mine").is_symlink() and (tmp_path / "out" / "index.html").is_file()
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
