@@ -1,5 +1,6 @@
 # Every target does its own set-up (.ci/setup). Two commands matter: make report [SESSION=path] and make test.
 SESSION ?=
+export SESSION
 PYTHON ?= python3
 RUN := .venv/bin/python
 # Open3D brings dash, whose extension makes JupyterLab ask whether to rebuild itself
@@ -7,9 +8,8 @@ NO_BUILD_QUESTION := --ServerApp.tornado_settings="{'page_config_data': {'buildC
 # JupyterLab refuses root, who often is the only user of a container or a board computer
 AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
 SIMULATED := sim_lms221 sim_quick
-# one thread a process: two notebooks run side by side, and sums come out the same on every machine
+# one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
-export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: help setup report test notebooks lab data bench clean
 
@@ -26,7 +26,7 @@ setup:
 	@PYTHON="$(PYTHON)" .ci/setup
 
 report: setup
-	@$(RUN) -m lrfcal_lib.report $(if $(SESSION),"$(SESSION)")
+	@$(RUN) -m lrfcal_lib.report $${SESSION:+"$$SESSION"}
 
 test: export TESTS := 1
 test: setup
@@ -34,9 +34,8 @@ test: setup
 	$(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 notebooks: setup
-	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")
+	@$(RUN) -m lrfcal_lib.report --store $${SESSION:+"$$SESSION"}
 
-lab: export SESSION := $(SESSION)
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \
 	[ -z "$$SESSION" ] || export LRFCAL_SESSION="$$(realpath -- "$$SESSION")"; \
@@ -57,5 +56,5 @@ data: setup
 	$(RUN) -c "from lrfcal_lib.simulate.card import write_card; write_card('data', '$(SIMULATED)'.split())"
 
 clean:
-	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions
+	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*
 	find . -name __pycache__ -o -name .ipynb_checkpoints | xargs rm -rf

@@ -18,4 +18,24 @@ A small change of a transform is the vector ``[w, v]``: ``R <- exp(w) R``, ``t <
 destination frame); covariances of transforms are 6 x 6 in this order.
 """
 
+import ctypes
+import os
+import sys
+
 __version__ = "0.1.0"
+
+
+def _one_thread():
+    """Sums in one order, whatever the machine does besides: OpenBLAS and OpenCV, loaded already or later."""
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}  # kernels and workers inherit them
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if os.path.exists("/proc/self/maps"):
+        with open("/proc/self/maps", encoding="utf-8", errors="surrogateescape") as maps:
+            files = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
+        for library in map(ctypes.CDLL, files):
+            for name in ("scipy_openblas{}64_", "scipy_openblas{}", "openblas{}"):  # NumPy's, SciPy's, OpenCV's
+                getattr(library, name.format("_set_num_threads"), int)(1)
+
+
+_one_thread()

@@ -3,7 +3,8 @@
 Every notebook runs alone, from the recording on, so most of them begin with the same work. Where the environment
 variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there, and whoever asks for the same
 again reads it. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs; without the
-variable nothing is kept. Results are pickles: name only folders that nobody else writes to.
+variable nothing is kept. Results are pickles, which can run code when they are read: a folder that others may write to
+is refused.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def cached(stage):
     -------
     callable
         Looks in the folder first. The same session are the same statements, scans and images; results of another
-        version of this library or of numpy, scipy or OpenCV do not count.
+        version of this library or of numpy, scipy or OpenCV do not count. It raises ValueError for a folder that others
+        may write to.
     """
 
     @wraps(stage)
@@ -42,6 +44,7 @@ def cached(stage):
         folder = os.environ.get(VARIABLE)
         if not folder:
             return stage(session, *args, **options)
+        _check_private(Path(folder))
         file = Path(folder) / f"{stage.__name__}-{_key(stage, session, args, options)}.pickle"
         if file.is_file():
             return pickle.loads(file.read_bytes())
@@ -50,6 +53,14 @@ def cached(stage):
         return result
 
     return look_first
+
+
+def _check_private(folder):
+    """Whoever may write to the folder could have what they put there run."""
+    found = folder.stat() if folder.exists() else None
+    if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
+        may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
+        raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
 
 
 def _key(stage, session, args, options):
@@ -72,7 +83,7 @@ def _library():
 
 def _write(file, data):
     """Whole or not at all: other notebooks read at the same time."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with NamedTemporaryFile(dir=file.parent, delete=False) as part:
         part.write(data)
     os.replace(part.name, file)

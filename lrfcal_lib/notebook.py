@@ -17,6 +17,7 @@ import json
 import math
 import os
 import re
+from numbers import Number
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,6 +125,23 @@ def report_file(name):
     return path
 
 
+def escape(text):
+    """Anything as HTML that shows it as text; all that becomes HTML comes through here, see also the report's template.
+
+    Parameters
+    ----------
+    text : object
+        Names and remarks of a session may be somebody else's.
+
+    Returns
+    -------
+    str
+        Without tags and entities, and without formulas: MathJax, which searches pages for them, finds no pair of
+        signs in one piece of text.
+    """
+    return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
+
+
 def save(fig, name, caption, *, main=True):
     """Show a figure with its caption, and keep it as ``figures/<name>.png`` in a report run.
 
@@ -156,7 +174,7 @@ def save(fig, name, caption, *, main=True):
         if _shell() is not None:
             display(fig)
     if _shell() is not None:
-        display(HTML(f'<p style="color:#555;max-width:48em">{html.escape(caption)}</p>'))
+        display(HTML(f'<p style="color:#555;max-width:48em">{escape(caption)}</p>'))
     plt.close(fig)
 
 
@@ -191,9 +209,12 @@ def table(df, name, digits=3, caption=""):
         df.to_csv(path, index=False, float_format="%.9g")
     shapes = formats(df, digits)
     _record("tables", {"name": name, "caption": caption, "formats": shapes})
-    styler = df.reset_index(drop=True).style.format(shapes, na_rep="–").hide(axis="index").set_uuid(name)
+    shown = df.reset_index(drop=True)
+    for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
+        shown[column] = shown[column].map(lambda v: v if v is None or isinstance(v, Number) else escape(v))
+    styler = shown.style.format(shapes, na_rep="–").format_index(escape, axis=1).hide(axis="index").set_uuid(name)
     if caption:
-        styler = styler.set_caption(caption)
+        styler = styler.set_caption(escape(caption))
     return HTML(styler.to_html())
 
 

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import argparse
 import base64
+import ctypes
+import fcntl
 import hashlib
 import json
 import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 
 from lrfcal_lib.cache import VARIABLE as CACHE
 from lrfcal_lib.notebook import ROOT, SCRATCH, SHIPPED
@@ -27,7 +31,10 @@ from lrfcal_lib.session import SessionError, open_session
 NOTEBOOKS = ROOT / "notebooks"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
 OWN_FILES = ("figures", "tables", "parts", "findings.json", "calibration.json", "cloud.ply", "index.html")
+PART = ".report-"  # begins the names of folders in which a report is being written
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
+_CLIENTS = set()  # of the notebooks that are being executed
 THUMBNAIL_WIDTH = 900  # pixels
 SOURCE_OF_SESSIONS = (
     "there is no session to report on. Either name one, `make report SESSION=path`, or get the public recording that "
@@ -66,8 +73,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session_path : path
         Folder of a session.
     out : path, optional
-        Folder of the report; ``reports/<name of the session's folder>`` unless given. What an earlier report left in
-        it is removed, other files are kept.
+        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and
+        takes its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that
+        are no report's are kept.
     jobs : int
         Notebooks executed at the same time.
     notebooks : sequence of path, optional
@@ -81,19 +89,18 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     Raises
     ------
     SessionError
-        If the session is not sound.
+        If the session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
     session_path = Path(session_path).resolve()
     session = open_session(session_path)
     out = Path(out or ROOT / "reports" / session_path.name).resolve()
-    _clear(out)
     paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb") if notebooks is None else map(Path, notebooks))
-    with TemporaryDirectory(prefix="lrfcal-") as cache:  # a fresh one: a report stands for what it was made from
-        environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(out), CACHE: cache}
-        runs = _execute_all(paths, environment, out, jobs)
-    found = _collect(out, [run.name for run in runs])
-    _write_index(out, session, runs, found, time.monotonic() - begin)
+    with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
+        environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
+        runs = _execute_all(paths, environment, new, jobs)
+        found = _collect(new, [run.name for run in runs])
+        _write_index(new, session, runs, found, time.monotonic() - begin)
     return runs
 
 
@@ -123,10 +130,13 @@ def execute(path, environment, folder=None):
     place = {"metadata": {"path": str(folder or Path(path).parent)}}
     options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
+    _CLIENTS.add(client)
     try:
         client.execute(env={**os.environ, **environment})
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
         return _without_widgets(notebook), _plain(str(problem)) or type(problem).__name__
+    finally:
+        _CLIENTS.discard(client)
     return _without_widgets(notebook), ""
 
 
@@ -204,19 +214,35 @@ def default_session():
 
 
 def main(argv=None):
-    """Command line; returns 0, 1 if a notebook failed, 2 without a sound session."""
+    """Command line; returns 0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it."""
     parser = argparse.ArgumentParser(prog="python -m lrfcal_lib report", description=__doc__)
     parser.add_argument("session", nargs="*", help="folders of sessions (default: the one at hand)")
     parser.add_argument("--out", help="folder of the report (default reports/<session>)")
     parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
     parser.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     options = parser.parse_args(argv)
+    # nohup ignores SIGHUP
+    before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
         sessions = [Path(path) for path in options.session] or [default_session()]
         return max(_store_all(session) if options.store else _report(session, options) for session in sessions)
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt as stopped:
+        number = signal.Signals((*stopped.args, signal.SIGINT)[0])
+        print(f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was", file=sys.stderr)
+        return 128 + number
+    finally:
+        for pair in before:
+            signal.signal(*pair)
+
+
+def _stop(number, frame):
+    """End in order; from here on there is only cleaning up, which nothing should interrupt."""
+    for other in ENDING:
+        signal.signal(other, signal.SIG_IGN)
+    raise KeyboardInterrupt(number)
 
 
 def _report(session, options):
@@ -245,16 +271,43 @@ def _asks_for_session(notebook):
     return any("notebook.start(" in cell.source for cell in notebook.cells if cell.cell_type == "code")
 
 
-def _clear(out):
-    """Remove what an earlier report wrote, nothing else."""
-    out.mkdir(parents=True, exist_ok=True)
-    for path in [out / name for name in OWN_FILES] + list(out.glob("[0-9][0-9]_*.html")):
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.exists():
-            path.unlink()
-    for name in ("figures", "tables", "parts"):
-        (out / name).mkdir()
+@contextmanager
+def _beside(out):
+    """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        for left in out.parent.glob(PART + "*"):
+            with suppress(OSError), open(left / "lock", "a") as lock:  # its owner lives, or it is somebody else's
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left)
+        box = Path(mkdtemp(prefix=".lrfcal-", dir=out.parent))
+        try:
+            with open(box / "lock", "w") as lock:  # it ends with this process, however that ends
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                box = box.rename(box.with_name(PART + box.name))  # named as others expect only once it is locked
+                (box / "report" / "parts").mkdir(parents=True)
+                yield box / "report"
+                _take_place(box / "report", out)
+        finally:
+            shutil.rmtree(box, ignore_errors=True)
+    except OSError as error:
+        raise SessionError(f"{out}: cannot write the report ({error}); --out names another folder") from error
+
+
+def _take_place(new, out):
+    """Exchange two folders in one step; files in the old one that are no report's come along."""
+
+    def ours(folder, names):
+        pages = (name for name in names if re.fullmatch("[0-9]{2}_.*[.]html", name))
+        return {*OWN_FILES, *pages} if folder == str(out) else ()
+
+    out.mkdir(exist_ok=True)
+    shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE: os.rename replaces nothing but empty folders
+    if ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange):
+        old = out.rename(out.with_name(out.name + ".old"))  # disks that cannot exchange, such as NFS
+        new.rename(out)
+        shutil.rmtree(old)
 
 
 def _execute_all(paths, environment, out, jobs):
@@ -263,21 +316,30 @@ def _execute_all(paths, environment, out, jobs):
 
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
-        futures = {pool.submit(_run, path, environment, out, jobs): path for path in reversed(paths)}
-        with tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+        futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
+        with ExitStack() as stack, tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+            stack.callback(_end, futures)
             for future in as_completed(futures):
                 bar.set_postfix_str(futures[future].stem)
                 bar.update()
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _run(path, environment, out, jobs):
+def _end(futures):
+    """End the notebooks that are being executed and leave out the others."""
+    for future in futures:
+        future.cancel()
+    while not all(future.done() for future in futures):
+        for client in list(_CLIENTS):
+            with suppress(AttributeError):  # its kernel is just starting
+                client.km.provisioner.process.kill()
+        time.sleep(0.05)
+
+
+def _run(path, environment, out):
     """Execute one notebook and write its HTML."""
     begin = time.monotonic()
-    environment = environment | {"LRFCAL_NOTEBOOK": path.stem}
-    if jobs > 1:  # side by side, more threads only get in each other's way
-        environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    notebook, error = execute(path, environment)
+    notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
     title, thesis = _headline(notebook, path.stem)
     (out / f"{path.stem}.html").write_text(_to_html(notebook, title), encoding="utf-8")
     return Run(path.stem, title, thesis, time.monotonic() - begin, error)

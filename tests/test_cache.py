@@ -1,5 +1,6 @@
 """Stages are worked out once, and again as soon as anything that they depend on is different."""
 
+import os
 import pickle
 import shutil
 from dataclasses import replace
@@ -97,6 +98,37 @@ def test_what_is_different_is_worked_out_again(folder, session, stage, calls, mo
     stage(session, 1)
     other(session, stage, monkeypatch)
     assert len(calls) == 2
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o775, 0o702])
+def test_a_folder_that_others_may_write_to_is_refused(folder, session, stage, calls, mode):
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(ValueError, match=f"others may write to '{folder}' .*mode {mode:o}.*chmod go-w"):
+        stage(session)
+    folder.chmod(0o755)
+    stage(session)
+    assert len(calls) == 1
+
+
+def test_a_folder_of_somebody_else_is_refused(folder, session, stage, monkeypatch):
+    folder.mkdir()
+    found = folder.stat()
+    monkeypatch.setattr(cache.os, "geteuid", lambda: found.st_uid + 1)
+    if found.st_uid == 0:  # who may write anywhere
+        os.chown(folder, 1, -1)
+        monkeypatch.setattr(cache.os, "geteuid", lambda: 0)
+    with pytest.raises(ValueError, match="others may write"):
+        stage(session)
+
+
+def test_the_folder_is_made_for_oneself(folder, session, stage):
+    before = os.umask(0)
+    try:
+        stage(session)
+    finally:
+        os.umask(before)
+    assert folder.stat().st_mode & 0o777 == 0o700
 
 
 def test_a_stage_that_fails_leaves_nothing(folder, session):

@@ -1,7 +1,14 @@
 """The report: notebooks run, what they found arrives, what fails is said and spoils nothing else."""
 
 import json
+import os
 import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+from types import SimpleNamespace
 
 import nbformat
 import numpy as np
@@ -109,6 +116,103 @@ def test_only_what_a_report_wrote_is_removed(finished):
     assert not (out / "figures" / "stale.png").exists()
     assert (out / "figures" / "ranges.png").is_file()
     assert (out / "notes.txt").read_text() == "mine"
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Two pipes to a notebook: it says that it is there, and waits until it is told to go on."""
+    ends = []
+    for name in ("here", "go"):
+        os.mkfifo(tmp_path / name)
+        ends.append(os.open(tmp_path / name, os.O_RDWR))  # so that opening never waits
+    yield ends
+    os.write(ends[1], b".")  # whatever happened, nobody waits any longer
+    for end in ends:
+        os.close(end)
+
+
+def waiting(path, tmp_path):
+    cell = f"open({str(tmp_path / 'here')!r}, 'w').write('.'); open({str(tmp_path / 'go')!r}).read(1)"
+    return write_notebook(path, GOOD, cell, 'notebook.finding("late", 2, "Found late")')
+
+
+def wait_until_there(line):
+    assert select.select([line[0]], [], [], 120)[0], "the notebook does not run"
+
+
+def parts(folder):
+    return list(folder.glob(".report-*")) + list(folder.glob(".lrfcal-*"))
+
+
+def test_two_reports_at_once_lose_nothing(session, tmp_path, line):
+    out = tmp_path / "out"
+    other = write_notebook(tmp_path / "05_other.ipynb", GOOD, 'notebook.finding("other", 1, "Other")')
+    early = write_notebook(tmp_path / "01_early.ipynb", GOOD, 'notebook.finding("early", 1, "Found early")')
+    both, runs = [waiting(tmp_path / "00_late.ipynb", tmp_path), early], []
+    slow = threading.Thread(target=lambda: runs.extend(report.make_report(session, out, jobs=1, notebooks=both)))
+    slow.start()  # the last notebook is the first to be executed
+    wait_until_there(line)
+    assert [run.error for run in report.make_report(session, out, notebooks=[other])] == [""]
+    assert [found["key"] for found in json.loads((out / "findings.json").read_text())] == ["other"]
+    (out / "mine.txt").write_text("kept")
+    (out / "mine" / "figures").mkdir(parents=True)
+    os.write(line[1], b".")
+    slow.join()
+    assert [run.error for run in runs] == ["", ""]
+    assert [found["key"] for found in json.loads((out / "findings.json").read_text())] == ["late", "early"]
+    assert sorted(path.name for path in out.glob("*.*")) == [
+        "00_late.html", "01_early.html", "findings.json", "index.html", "mine.txt"]  # fmt: skip
+    assert (out / "mine" / "figures").is_dir()
+    assert parts(tmp_path) == []
+
+
+RUN = "import sys; from pathlib import Path; from lrfcal_lib import report; report.NOTEBOOKS = Path(sys.argv[1])\n"
+ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129, signal.SIGKILL: -9}
+
+
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
+    out = tmp_path / "reports" / "wall"
+    report.make_report(session, out, notebooks=[])
+    before = {file.name: file.read_bytes() for file in out.glob("*.*")}
+    waiting(tmp_path / "00_late.ipynb", tmp_path)
+    command = [sys.executable, "-c", RUN + "sys.exit(report.main(sys.argv[2:]))"]
+    command += [str(tmp_path), str(session), "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        wait_until_there(line)
+        report.make_report(session, out.with_name("other"), notebooks=[])
+        unfinished = parts(out.parent)
+        process.send_signal(number)
+        said = process.communicate(timeout=120)[1]
+    assert len(unfinished) == 1, "what another report is writing is left alone"
+    assert process.returncode == ENDS[number] and "Traceback" not in said
+    assert number == signal.SIGKILL or f"stopped by {number.name}; an earlier report stays as it was" in said
+    assert {file.name: file.read_bytes() for file in out.glob("*.*")} == before
+    assert len(parts(out.parent)) == (number == signal.SIGKILL)
+    report.make_report(session, out, notebooks=[])
+    assert parts(out.parent) == []
+
+
+def test_disks_that_cannot_exchange_folders_rename_twice(session, tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").symlink_to("nowhere")
+    monkeypatch.setattr(report.ctypes, "CDLL", lambda name: SimpleNamespace(renameat2=lambda *names: -1))
+    report.make_report(session, tmp_path / "out", notebooks=[])
+    assert (tmp_path / "out" / "mine").is_symlink() and (tmp_path / "out" / "index.html").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_cannot_be_written_is_named(session, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert report.main([str(session), "--out", str(tmp_path / "file" / "out")]) == 2
+    assert re.search(r"file/out: cannot write the report .*--out names another folder", capsys.readouterr().err)
+
+
+def test_make_takes_a_session_with_a_space():
+    shown = subprocess.run(
+        ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'", 'SESSION=a "b c'],
+        cwd=report.ROOT, capture_output=True, text=True, check=True)  # fmt: skip
+    assert shown.stdout == '<-m><lrfcal_lib.report><a "b c>'
 
 
 def test_pages_of_notebooks_hide_code_and_hold_their_pictures(finished):

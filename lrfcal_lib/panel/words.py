@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import numpy as np
+
+from lrfcal_lib.notebook import escape
 
 GOOD, WARN, BAD, IDLE = "#1a7f37", "#9a6700", "#cf222e", "#57606a"
 LIGHTS = {"ok": (GOOD, "✓", "good"), "warn": (WARN, "!", "check"), "bad": (BAD, "✕", "bad")}

@@ -200,6 +200,9 @@ def board_from_json(data):
     features = tuple(str(f) for f in data["features"])
     if len(edges) < 3 or len(set(edges)) != len(edges):
         raise ValueError(f"a board needs three or more edges with different names, got {short(edges)}")
+    odd = [repr(e) for e in edges if "$" in e or not e.isprintable()]
+    if odd:
+        raise ValueError(f"names of edges stand in figures: no line ends, no '$' (a formula), got {short(odd)}")
     if len(features) != 2 or not set(features) <= set(edges):
         raise ValueError(f"features are two of the edges {short(edges)}, got {short(features)}")
     corners = data["corners_m"]

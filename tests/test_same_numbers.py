@@ -1,0 +1,42 @@
+"""The same session gives the same bytes, whatever the number of threads, the order of sets and the load."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
+CALIBRATE = """
+import sys
+if sys.argv[2] == "before":  # libraries that are there already have counted the threads that they are to use
+    import cv2, numpy, scipy.linalg
+from lrfcal_lib import evaluate, export, notebook, pipeline
+found = pipeline.calibrate(export.open_session(sys.argv[1]))
+method = evaluate.handed_over(found)
+export.write_calibration("calibration.json", export.calibration_record(found, method))
+export.write_ply("cloud.ply", pipeline.color_cloud(found, method))
+notebook.table(evaluate.intrinsics_table(found.prepared.models), "intrinsics")
+notebook.table(evaluate.platform_calibration_table(found.platform), "platform")
+notebook.table(evaluate.camera_calibration_table(found.solutions), "cameras")
+notebook.table(evaluate.edge_lengths(found.prepared), "edges")
+"""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+
+
+def test_two_runs_side_by_side_give_the_same_bytes(tmp_path):
+    base = {key: value for key, value in os.environ.items() if key not in THREADS}
+    runs = {
+        "before": base | {"PYTHONHASHSEED": "1"},
+        "after": base | {"PYTHONHASHSEED": "2"} | dict.fromkeys(THREADS, "3"),
+    }
+    processes = []
+    for name, environment in runs.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        command = [sys.executable, "-c", CALIBRATE, str(QUICK), name]
+        environment |= {"LRFCAL_REPORT": str(folder)}
+        processes.append(subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL))
+    assert [process.wait() for process in processes] == [0, 0]
+    written = [{file.name: file.read_bytes() for file in (tmp_path / name).rglob("*.*")} for name in runs]
+    assert {"calibration.json", "cloud.ply", "edges.csv"} <= set(written[0])
+    assert [name for name in written[0] if written[0][name] != written[1][name]] == []
