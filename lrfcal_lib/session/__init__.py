@@ -17,8 +17,8 @@ where nothing came back or nothing was recorded.
 
 from __future__ import annotations
 
-from lrfcal_lib.session.common import SessionError
 from lrfcal_lib.session.files import EDGE_COLUMNS, IMAGE_COLUMNS, PURPOSES, EdgePick, ImageRecord, image_size
+from lrfcal_lib.session.opened import SessionError
 from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.recording import Session, Sweep, open_session, validate
 from lrfcal_lib.session.stated import (

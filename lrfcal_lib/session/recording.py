@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.board import Board
-from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, short
+from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, read_table, reading, short
 from lrfcal_lib.session.files import (
+    EDGE_COLUMNS,
+    IMAGE_COLUMNS,
+    PLATFORM_COLUMNS,
     EdgePick,
     ImageRecord,
     check_image_size,
@@ -19,10 +24,19 @@ from lrfcal_lib.session.files import (
     read_edges,
     read_images,
     read_scans,
+    size_in_header,
     unfinished_of,
 )
 from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
-from lrfcal_lib.session.telegrams import TelegramLog, other_than_stated
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated
+
+# tables of a session: columns, column whose every value has a time of its own, what stands there once
+ORDERED = {
+    "lrf/index.csv": (INDEX_COLUMNS, None, ("offset",)),
+    "images.csv": (IMAGE_COLUMNS, "camera", ("file",)),
+    "platform.csv": (PLATFORM_COLUMNS, None, ()),
+    "edges.csv": (EDGE_COLUMNS, None, ("camera", "file", "edge")),
+}
 
 
 @dataclass(frozen=True)
@@ -157,11 +171,12 @@ class Session:
         SessionError
             If the file cannot be decoded or has another size than the camera.
         """
-        data = np.frombuffer(read_bytes(record.file), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-        if image is None:
-            raise SessionError(f"{record.file}: cannot be decoded; remove its row from images.csv or restore the file")
-        check_image_size(record.file, image.shape[1::-1], self.cameras[record.camera])
+        camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
+        check_image_size(record.file, size_in_header(record.file, data), camera)
+        with reading(record.file, "cannot be decoded ({}); remove its row from images.csv or restore the file"):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            shape = image.shape
+        check_image_size(record.file, shape[1::-1], camera)
         return image
 
     @property
@@ -226,7 +241,7 @@ def open_session(path):
         away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
-    data = read_json(path / "session.json")
+    data = read_json(path / "session.json", path)
     if data.get("schema") != SCHEMA:
         raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
     with naming(path / "session.json"):
@@ -257,10 +272,28 @@ def validate(path):
         session = open_session(path)
     except SessionError as error:
         return [str(error)]
-    found = list(session.problems)
+    found = [*session.problems, *_disorder(session)]
     for record in session.image_records:
         try:
             session.read_image(record)
         except SessionError as error:
             found.append(str(error))
     return found
+
+
+def _disorder(session):
+    """What two writers, or hands, do to tables: time that runs back, rows that stand there twice."""
+    for name, (columns, group, once) in ORDERED.items():
+        file, last, seen = session.path / name, {}, {}
+        try:
+            rows = read_table(file, columns, session.path)[0] if os.path.lexists(file) else ()
+            for line, row in enumerate(rows, start=2):
+                what, mine = tuple(row[key] for key in once), row.get(group)
+                if what and seen.setdefault(what, line) != line:
+                    yield f"{file} line {line}: {', '.join(what)} stands in line {seen[what]} already; remove one"
+                time = float(row.get("t_s") or "nan")
+                if time < last.get(mine, -math.inf):
+                    yield f"{file} line {line}: t_s runs back from {last[mine]:g} to {time:g}; two recordings at once?"
+                last[mine] = last.get(mine, time) if math.isnan(time) else time
+        except ValueError as error:
+            yield str(error) if isinstance(error, SessionError) else f"{file} line {line}: {error}"
