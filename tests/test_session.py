@@ -325,7 +325,7 @@ def test_damaged_scans(path):
 
 def test_pickles_are_not_read(path):
     edit_scans(path, pitch=np.array([{}] * 6))
-    with pytest.raises(SessionError, match="cannot be read.*allow_pickle"):
+    with pytest.raises(SessionError, match="cannot be read.*without pickles"):
         open_session(path)
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from lrfcal_lib.session.opened import SPLIT, SessionError, opened
 
-MOST_VALUES = 20_000_000  # of all scan lines, so that reading them takes less than 500 MB
+MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
 LARGEST_TEXT, DEEPEST_JSON, MOST_ROWS = 8_000_000, 30, 200_000  # bytes of a JSON or CSV file, levels
 
 

@@ -16,7 +16,6 @@ from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_jso
 from lrfcal_lib.session.files import (
     EDGE_COLUMNS,
     IMAGE_COLUMNS,
-    PLATFORM_COLUMNS,
     EdgePick,
     ImageRecord,
     check_image_size,
@@ -30,12 +29,11 @@ from lrfcal_lib.session.files import (
 from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated
 
-# tables of a session: columns, column whose every value has a time of its own, what stands there once
+# tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
 ORDERED = {
-    "lrf/index.csv": (INDEX_COLUMNS, None, ("offset",)),
-    "images.csv": (IMAGE_COLUMNS, "camera", ("file",)),
-    "platform.csv": (PLATFORM_COLUMNS, None, ()),
-    "edges.csv": (EDGE_COLUMNS, None, ("camera", "file", "edge")),
+    "lrf/index.csv": (INDEX_COLUMNS, ("placement",), ("offset",)),
+    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose"), ("file",)),
+    "edges.csv": (EDGE_COLUMNS, (), ("camera", "file", "edge")),
 }
 
 
@@ -282,18 +280,18 @@ def validate(path):
 
 
 def _disorder(session):
-    """What two writers, or hands, do to tables: time that runs back, rows that stand there twice."""
+    """What two writers, or hands, do to tables: time that runs back within a placement, rows that stand there twice."""
     for name, (columns, group, once) in ORDERED.items():
         file, last, seen = session.path / name, {}, {}
-        try:
-            rows = read_table(file, columns, session.path)[0] if os.path.lexists(file) else ()
-            for line, row in enumerate(rows, start=2):
-                what, mine = tuple(row[key] for key in once), row.get(group)
-                if what and seen.setdefault(what, line) != line:
-                    yield f"{file} line {line}: {', '.join(what)} stands in line {seen[what]} already; remove one"
-                time = float(row.get("t_s") or "nan")
-                if time < last.get(mine, -math.inf):
-                    yield f"{file} line {line}: t_s runs back from {last[mine]:g} to {time:g}; two recordings at once?"
-                last[mine] = last.get(mine, time) if math.isnan(time) else time
-        except ValueError as error:
-            yield str(error) if isinstance(error, SessionError) else f"{file} line {line}: {error}"
+        rows = read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
+        for line, row in enumerate(rows, start=2):
+            where, what = f"{file} line {line}", tuple(row[key] for key in once)
+            if what in seen:
+                yield f"{where}: {', '.join(what)} stands in line {seen[what]} already; remove one of them"
+            seen.setdefault(what, line)
+            key = tuple(row[key] for key in group)
+            if row.get("t_s") and row["placement"]:
+                time = float(row["t_s"])
+                if time < last.get(key, -math.inf):
+                    yield f"{where}: t_s runs back from {last[key]:.9g} to {time:.9g}: two recordings at once? Record again"
+                last[key] = time

@@ -101,6 +101,7 @@ def read_telegrams(file, within):
     index, problems = _read_index(path, within)
     with naming(path):
         outcome = _check_index(index, len(data), file)
+        check_amount(len(data) // 2)
     whole = np.flatnonzero(outcome != TRUNCATED)
     good = _sound(data, index["offset"][whole], index["length"][whole])
     outcome[whole] = np.where(good, OTHER, WRONG)
