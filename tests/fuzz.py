@@ -1,9 +1,9 @@
 """Damaged and hostile sessions and rig files, one after the other: ``python tests/fuzz.py`` (or ``make fuzz``).
 
-A case is a number: it seeds what is damaged and what is done with it, so ``--case N`` repeats it. Cases run in processes
-that may take 500 MB and, for each case, 20 s. Whatever comes out has to be an error of ours; nothing outside of the
-session's folder is to be opened, which the kernel (inotify, for a folder that links and names lead to) and Python's audit
-events (for all absolute paths) tell.
+A case is a number: it seeds what is damaged and what is done with it, so ``--case N`` repeats it. Cases run in
+processes that may take 500 MB and, for each case, 20 s. Whatever comes out has to be an error of ours; nothing outside
+of the session's folder is to be opened, which the kernel (inotify, for a folder that links and names lead to) and
+Python's audit events (for all absolute paths) tell.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from fake_rig import rig_data
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.board import Board, Chessboard, triangle_board
 from lrfcal_lib.camera import CameraModel
@@ -46,7 +47,6 @@ from lrfcal_lib.session import (
     transform_to_json,
     validate,
 )
-from scipy.spatial.transform import RigidTransform, Rotation
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
@@ -58,15 +58,16 @@ HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec(
 PATTERN = Chessboard(5, 4, 0.05, (0.05, 0.05))
 SQUARE = Board("square", ("ab", "bc", "cd", "da"), [[0, 0], [0.3, 0], [0.3, 0.25], [0, 0.25]], PATTERN, ("ab", "da"))
 NASTY = [
-    "", "0", "-1", "1e999", "-1e308", "nan", "NaN", "Infinity", "null", "true", '""', "[]", "{}", "0.5", "65536", "1e-300",
-    str(2**31), str(2**63 - 1), str(2**63), str(-(2**63)), str(2**64), "9" * 5000, "1" + "0" * 400, "[" * 100_000, "[" * 200,
-    '{"a":' * 5000, "\x00", "\ud800".encode("utf-8", "surrogatepass").decode("latin-1"), "\u2028", '"', ",", "\r", "x" * 200_000,
-    '"../outside/secret"', "../outside/secret", "../outside/secret.png", "outside/secret.png", "/etc/passwd", "/dev/zero",
-    "session.json", "lrf/scans.npz", "..", ".", "~", "file:///etc/passwd", "images/left/0001.png/x", "images", "30000", "1000000",
+    "", "0", "-1", "1e999", "-1e308", "nan", "NaN", "Infinity", "null", "true", '""', "[]", "{}", "0.5", "65536",
+    "1e-300", str(2**31), str(2**63 - 1), str(2**63), str(-(2**63)), str(2**64), "9" * 5000, "1" + "0" * 400,
+    "[" * 100_000, "[" * 200,
+    '{"a":' * 5000, "\x00", "\xed\xa0\x80", "\u2028", '"', ",", "\r", "x" * 200_000,
+    '"../outside/secret"', "../outside/secret", "../outside/secret.png", "outside/secret.png", "/etc/passwd",
+    "/dev/zero", "session.json", "lrf/scans.npz", "..", ".", "~", "file:///etc/passwd", "images", "30000",
 ]  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------------- sound sessions to begin with
+# ------------------------------------------------------------------------------------ sound sessions to begin with
 
 
 def picture(seed):
@@ -120,12 +121,12 @@ def record(writer, placement):
     """What a placement adds to it."""
     ranges = np.full(181, 2.0)
     telegrams = [encode_scan(ranges), encode_scan(ranges[:100], partial=0), encode_scan(ranges)]
-    writer.add_telegrams(placement, telegrams[:: 2], [0.0, 0.1], [placement, placement + 0.5])
+    writer.add_telegrams(placement, telegrams[::2], [0.0, 0.1], [placement, placement + 0.5])
     writer.add_image("left", picture(placement), placement, pitch=0.1, time_s=placement)
     writer.add_platform([(placement, 0.1, np.nan)])
 
 
-# ------------------------------------------------------------------------------------------------------------- damage
+# ------------------------------------------------------------------------------------------------------ damage
 
 
 def damage(rng, path):
@@ -171,18 +172,20 @@ def text(rng, file):
     """Another word in place of a number or a text."""
     words = file.read_text()
     ends = [i for i, c in enumerate(words) if c in ",:[]{}\n "]
-    first, last = sorted(rng.choice(len(ends), 2, replace=False)) if rng.random() < 0.2 else [rng.integers(len(ends) - 1)] * 2
-    last = last + 1 if last == first else last
+    first = int(rng.integers(len(ends) - 1))
+    last = int(rng.integers(first + 1, len(ends))) if rng.random() < 0.2 else first + 1
     nasty = NASTY[rng.integers(len(NASTY))]
     file.write_bytes((words[: ends[first] + 1] + nasty + words[ends[last] :]).encode("utf-8", "replace"))
 
 
 def members(rng, file):
     """A value of JSON that is gone, of another kind, or a value of elsewhere."""
-    data, nasty = json.loads(file.read_text()), [None, [], {}, "", "x", 0, -1, 1e308, 2**70, True, [[]], [1e308] * 3, [[0] * 9] * 9, 0.5]
+    data = json.loads(file.read_text())
+    nasty = [None, [], {}, "", "x", 0, -1, 1e308, 2**70, True, [[]], [1e308] * 3, [[0] * 9] * 9, 0.5]
     holders = [data]
     for holder in holders:
-        holders += [v for v in (holder.values() if isinstance(holder, dict) else holder) if isinstance(v, dict | list) and v]
+        values = holder.values() if isinstance(holder, dict) else holder
+        holders += [value for value in values if isinstance(value, dict | list) and value]
     holder = holders[rng.integers(len(holders))]
     keys = list(holder) if isinstance(holder, dict) else list(range(len(holder)))
     key = keys[rng.integers(len(keys))]
@@ -221,12 +224,13 @@ def arrays(rng, file):
     name = sorted(members)[rng.integers(len(members))]
     how = rng.integers(4)
     if how == 0:  # a header that states what does not follow
-        shape = ["(100000, 100000)", "(-1, 61)", "()", "(6,)", "(2**40,)", "(6, 61", "6", "(6, 61, 1)", "(True, 61)"][rng.integers(9)]
-        kind = ["<f8", "<f4", "|O", "<U9", "|b1", "<c16", "|V1000000", "<i8", "<f16", "<M8[s]", ">f8", "x", "|S0"][rng.integers(13)]
+        shape = rng.choice("(100000, 100000);(-1, 61);();(6,);(2**40,);(6, 61;6;(6, 61, 1);(True, 61)".split(";"))
+        kind = rng.choice("<f8 <f4 |O <U9 |b1 <c16 |V1000000 <i8 <f16 <M8[s] >f8 x |S0".split())
         header = f"{{'descr': '{kind}', 'fortran_order': {rng.random() < 0.2}, 'shape': {shape}, }}\n".encode()
         if rng.random() < 0.2:
             header = rng.choice([b"(" * 9000, b"{'descr':", b"\xff" * 50, b"1 +\n", header * 40])
-        members[name] = b"\x93NUMPY" + bytes([rng.choice([1, 1, 1, 2, 3, 9]), 0]) + struct.pack("<H", len(header)) + header + bytes(1000)
+        version = bytes([rng.choice([1, 1, 1, 2, 3, 9]), 0])
+        members[name] = b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + bytes(1000)
     elif how == 1:
         values = rng.choice([0.0, np.nan, np.inf, -1.0, 1e300, 1e-300, 1000.0])
         shape = [(6, 61), (0, 61), (6, 0), (6,), (61,), (1, 1), (3, 3000), ()][rng.integers(8)]
@@ -260,11 +264,13 @@ def telegrams(rng, file):
 
 
 def pixels(rng, file):
-    """Other images: another kind or size, and headers that promise many pixels (which the session may state as well)."""
+    """Other images: another kind or size, and headers that promise many pixels, which the session may state too."""
     size = [(160, 120), (120, 160), (1, 1), (5000, 1), (30000, 30000), (5000, 4000)][rng.integers(6)]
-    data = cv2.imencode(str(rng.choice([".png", ".jpg"])), np.zeros((120, 160, int(rng.choice([1, 3, 4]))), np.uint8))[1].tobytes()
+    image, suffix = np.zeros((120, 160, int(rng.choice([1, 3, 4]))), np.uint8), str(rng.choice([".png", ".jpg"]))
+    data = cv2.imencode(suffix, image)[1].tobytes()
     if data[:4] == b"\x89PNG":
-        body = b"IHDR" + struct.pack(">II", *size) + bytes([int(rng.choice([8, 16])), int(rng.choice([0, 2, 3, 6])), 0, 0, int(rng.choice([0, 1]))])
+        kind = bytes([rng.choice([8, 16]), rng.choice([0, 2, 3, 6]), 0, 0, rng.choice([0, 1])])
+        body = b"IHDR" + struct.pack(">II", *size) + kind
         data = data[:12] + body + zipfile.crc32(body).to_bytes(4, "big") + data[33:]
     elif (at := data.find(b"\xff\xc0")) > 0:
         data = data[: at + 5] + struct.pack(">HH", size[1] % 65536, size[0] % 65536) + data[at + 9 :]
@@ -305,7 +311,7 @@ def other(rng, file):
     return None
 
 
-# ----------------------------------------------------------------------------------------------------- what is done with it
+# ---------------------------------------------------------------------------------------------- what is done with it
 
 
 def use(rng, path):
@@ -349,15 +355,15 @@ def _caught(work, *arguments):
             return None
         frames = traceback.extract_tb(error.__traceback__)
         ours = frames[-1].filename.startswith(LIBRARY)
-        if work is _read and type(error).__module__.startswith("lrfcal") or type(error) is ValueError and ours and work is _read:
-            return None  # of the preprocessing: what it raises is documented as ValueError
+        if work is _read and isinstance(error, ValueError) and ours:
+            return None  # what the preprocessing raises itself is documented as ValueError
         place = next(f for f in reversed(frames) if f.filename.startswith(LIBRARY) or f is frames[0])
         where = f"{Path(place.filename).name}:{place.lineno}"
         return "foreign", f"{type(error).__name__} at {where}: {str(error)[:200]}", traceback.format_exc()
     return None
 
 
-# --------------------------------------------------------------------------------------------------------- the machinery
+# -------------------------------------------------------------------------------------------------- the machinery
 
 
 class Watch:
@@ -436,7 +442,7 @@ def _batch(numbers, seed, sound, progress, out):
 def run(cases, *, first=0, seed=SEED, workers=1, tell=lambda done: None):
     """Run cases; the findings as lists [number, kind, text, traceback]."""
     base = Path(tempfile.mkdtemp(prefix="lrfcal-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
-    sound, log, running, todo = base / "sound", base / "findings", {}, first
+    sound, log, running = base / "sound", base / "findings", {}
     findings = []
     try:
         sound.mkdir()
@@ -454,7 +460,8 @@ def run(cases, *, first=0, seed=SEED, workers=1, tell=lambda done: None):
                         try:
                             _batch(numbers, seed, sound, progress, out)
                         except BaseException:
-                            out.write(json.dumps([numbers[0], "fuzzer", "it failed itself", traceback.format_exc()]) + "\n")
+                            failed = [numbers[0], "fuzzer", "it failed itself", traceback.format_exc()]
+                            out.write(json.dumps(failed) + "\n")
                             out.flush()
                     os._exit(0)
                 running[child] = numbers, progress
@@ -483,17 +490,19 @@ def main():
     for name, value in (("cases", 200_000), ("first", 0), ("seed", SEED), ("workers", os.cpu_count())):
         options.add_argument(f"--{name}", type=int, default=value)
     options.add_argument("--case", type=int, help="repeat one case, with its traceback")
-    options.add_argument("--out", default="fuzz.jsonl", help="file for the findings")
+    options.add_argument("--out", default="reports/fuzz/findings.jsonl", help="file for the findings, one a line")
     asked = options.parse_args()
     if asked.case is not None:
         asked.first, asked.cases, asked.workers = asked.case, 1, 1
     began = time.monotonic()
     found = run(asked.cases, first=asked.first, seed=asked.seed, workers=asked.workers)
+    Path(asked.out).parent.mkdir(parents=True, exist_ok=True)
     Path(asked.out).write_text("".join(json.dumps({"seed": asked.seed, "finding": f}) + "\n" for f in found))
-    kinds = collections.Counter((kind, text.split(":", 2)[0] + text.split(":", 2)[1][:4] if ":" in text else text) for _, kind, text, _ in found)
-    for (kind, what), count in kinds.most_common():
-        case = next(f[0] for f in found if f[1] == kind and f[2].startswith(what[:12]))
-        print(f"{count:6} {kind} {what}, for instance --seed {asked.seed} --case {case}")
+    groups = collections.defaultdict(list)
+    for number, kind, text, _ in found:
+        groups[kind, ":".join(text.split(":")[:2])[:100]].append(number)
+    for (kind, what), numbers in groups.items():
+        print(f"{len(numbers):6} {kind} {what}, for instance --seed {asked.seed} --case {numbers[0]}")
     if asked.case is not None:
         print("\n".join(f[3] for f in found))
     print(f"{asked.cases} cases in {time.monotonic() - began:.0f} s, {len(found)} findings (in {asked.out})")

@@ -83,7 +83,7 @@ def test_nothing_is_written_behind_a_link(folder, name):
     assert secret.read_bytes() == before
 
 
-# ----------------------------------------------------------------------------------------------------- promises, values
+# ------------------------------------------------------------------------------------------------- promises, values
 
 
 def lying(path, shape, descr="<f8"):
@@ -160,7 +160,7 @@ def test_mistakes_of_ours_are_not_taken_for_damage(folder, monkeypatch):
         open_session(folder / "scans")
 
 
-# --------------------------------------------------------------------------------------------------- one writer a session
+# ----------------------------------------------------------------------------------------------- one writer a session
 
 
 def test_a_second_writer_is_told_who_writes(folder):
@@ -194,10 +194,12 @@ def test_check_finds_what_two_writers_left(folder, monkeypatch):
     both[0].finish_placement()
     found = "\n".join(validate(path))
     assert re.search(r"images.csv line 5: images/left/0003.png stands in line 4 already; remove one", found)
-    assert re.search(r"index.csv line 8: t_s runs back from 5.5 to 5: two recordings at once\? Record again", found)
+    assert re.search(r"index.csv line 8: t_s runs back from 5.5 to 5: two writers at once\? Record the", found)
 
 
 def test_check_finds_an_edge_that_is_picked_twice(folder):
     with (folder / "scans" / "edges.csv").open("a") as table:
         table.write("left,images/left/0001.png,ab,1,2,20,9\n")
-    assert any("edges.csv line 4: left, images/left/0001.png, ab stands in line 2" in p for p in validate(folder / "scans"))
+    assert any(
+        "edges.csv line 4: left, images/left/0001.png, ab stands in line 2" in p for p in validate(folder / "scans")
+    )

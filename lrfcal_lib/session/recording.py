@@ -171,9 +171,9 @@ class Session:
         """
         camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
         check_image_size(record.file, size_in_header(record.file, data), camera)
-        with reading(record.file, "cannot be decoded ({}); remove its row from images.csv or restore the file"):
+        with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            shape = image.shape
+            shape = image.shape  # there is none of an image that is None
         check_image_size(record.file, shape[1::-1], camera)
         return image
 
@@ -293,5 +293,6 @@ def _disorder(session):
             if row.get("t_s") and row["placement"]:
                 time = float(row["t_s"])
                 if time < last.get(key, -math.inf):
-                    yield f"{where}: t_s runs back from {last[key]:.9g} to {time:.9g}: two recordings at once? Record again"
+                    back = f"t_s runs back from {last[key]:.9g} to {time:.9g}"
+                    yield f"{where}: {back}: two writers at once? Record the placement again"
                 last[key] = time
