@@ -13,8 +13,8 @@
 
 Everything is plain text or a NumPy archive without pickles, in plain files: links are refused, and so is what would
 take more than 500 MB of memory (more than 12 million ranges, images of more than 30 megapixels, longer tables than
-200 000 lines). session.json may name the LRF's file (rig.lrf.file), otherwise the one that exists is read. A row of scans.npz is one scan line in the order of acquisition; a range is NaN
-where nothing came back or nothing was recorded.
+200 000 lines). session.json may name the LRF's file (rig.lrf.file), otherwise the one that exists is read. A row of
+scans.npz is one scan line in the order of acquisition; a range is NaN where nothing came back or nothing was recorded.
 """
 
 from __future__ import annotations

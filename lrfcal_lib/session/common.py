@@ -6,7 +6,7 @@ import csv
 import json
 from contextlib import contextmanager
 
-from lrfcal_lib.session.opened import SPLIT, SessionError, opened
+from lrfcal_lib.session.opened import LARGEST_FILE, SPLIT, SessionError, opened
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
 LARGEST_TEXT, DEEPEST_JSON, MOST_ROWS = 8_000_000, 30, 200_000  # bytes of a JSON or CSV file, levels
@@ -39,25 +39,18 @@ def naming(file):
         raise SessionError(f"{file}: {error}") from error
 
 
-def read_bytes(file, within=None):
+def read_bytes(file, within=None, most=LARGEST_FILE):
     """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
     try:
-        with opened(file, within) as stream:
+        with opened(file, within, most=most) as stream:
             return stream.read()
     except OSError as error:
         raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
 
 
-def _read_text(file, within):
-    text = read_bytes(file, within)
-    if len(text) > LARGEST_TEXT:
-        raise SessionError(f"{file}: {len(text)} bytes, more than {LARGEST_TEXT}; {SPLIT}")
-    return text
-
-
 def read_json(file, within):
     """The object in a JSON file."""
-    text = _read_text(file, within)
+    text = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not JSON ({}); truncated, or edited by hand?"):
         data = json.loads(text.decode())
     if not isinstance(data, dict):
@@ -75,7 +68,7 @@ def read_table(file, columns, within, torn=False):
 
     With `torn`, a last row without its line end (cut off by a crash) is left out.
     """
-    data = _read_text(file, within)
+    data = read_bytes(file, within, LARGEST_TEXT)
     with reading(file, "not a CSV file in UTF-8 ({})"):
         text = data.decode()
         cut = torn and not text.endswith("\n")

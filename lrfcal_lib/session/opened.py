@@ -51,7 +51,7 @@ def listed(path, within):
         return sorted(os.listdir(handle))
 
 
-def opened(file, within=None, flags=os.O_RDONLY):
+def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     """Binary stream of a file in a session.
 
     Parameters
@@ -61,6 +61,8 @@ def opened(file, within=None, flags=os.O_RDONLY):
         The session's folder; without, the file is somebody else's, who may have links to it.
     flags : int
         Of ``os.open``; any but O_RDONLY writes.
+    most : int
+        Bytes that are read.
 
     Returns
     -------
@@ -83,9 +85,8 @@ def opened(file, within=None, flags=os.O_RDONLY):
     try:
         status = os.fstat(inner)
         _refuse_other(file, status, "-", "a file")
-        if flags == os.O_RDONLY and status.st_size > LARGEST_FILE:
-            size = f"{status.st_size / 1e6:.0f} MB, more than {LARGEST_FILE / 1e6:.0f} MB"
-            raise SessionError(f"{file}: {size}; {SPLIT}")
+        if flags == os.O_RDONLY and status.st_size > most:
+            raise SessionError(f"{file}: {status.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
     except BaseException:
         stream.close()
         raise
