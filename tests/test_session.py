@@ -190,6 +190,9 @@ def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
 def test_finish_needs_sweeps(path):
     with pytest.raises(SessionError, match="no sweep to finish"):
         finish(path)
+    (path / "images").mkdir(exist_ok=True)
+    with pytest.raises(SessionError, match="lrf is missing; is this the folder of a session"):
+        finish(path / "images")
 
 
 def test_an_existing_target_is_refused(path):

@@ -241,8 +241,11 @@ def finish(path):
     SessionError
         If there is no sweep, or one of them is damaged, or somebody records this session.
     """
-    with alone(path):
-        complete(Path(path))
+    try:
+        with alone(path):
+            complete(Path(path))
+    except FileNotFoundError as error:
+        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
 
 
 def complete(path):
