@@ -134,6 +134,8 @@ def record(rig, path, *, resume=False, count=None, advice=None, terminal=None):
     except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal, see `emergency`
         error.add_note(recording.safe(resume=True))
         raise
+    finally:
+        recording.close()
     return recording
 
 
