@@ -436,8 +436,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     if max(left_out_shares(obs, bad)) > LARGEST_SHARE:
         raise DegenerateGeometry(
             f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
-            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry the "
-            "right numbers"
+            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
+            "the right numbers"
         )
     return best
 
