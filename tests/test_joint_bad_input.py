@@ -210,6 +210,7 @@ def test_sigma_is_honest_where_beams_are_wider_apart_than_readings_flip(settings
 @MOUNTS
 def test_a_scale_of_the_pitch_that_nothing_shows_stays_within_what_is_usual(mount):
     obs, *_ = draw(rng(), mount=mount, see_span=np.radians(0.5), pitch_step=np.radians(0.25), see_images=1)
-    found = solve_joint(obs, sensor=("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale"), required=False)
+    sensor = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
+    found = solve_joint(obs, sensor=sensor, required=False)
     assert not any("scale of the pitch" in words for words in found.unobservable)
     assert abs(found.sensor["pitch_scale"]) < 0.15 and found.covariance("pitch_scale")[0, 0] ** 0.5 < 0.051

@@ -440,8 +440,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     if max(left_out_shares(obs, bad)) > LARGEST_SHARE:
         raise DegenerateGeometry(
             f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
-            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry the "
-            "right numbers"
+            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
+            "the right numbers"
         )
     return best
 
@@ -461,7 +461,7 @@ def agreeing_start(obs, state, data, unknowns, sweep_sigma):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = replace(gather(kept) if bad else data, sweep_sigma=sweep_sigma)
         found, cost = a_few_steps(fitting, cut, unknowns)
-        if not bad:
+        if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
         state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
     return kept, found, bad, cost / count_rows(cut)
