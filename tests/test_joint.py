@@ -201,7 +201,7 @@ def test_sharp_edges_tie_down_the_rest(mount):
     obs, truth, _ = draw(rng(), 8, mount=mount, see_noise=0.0)
     found = solve_joint(obs, required=False)
     error = np.abs(state_errors(found.state, truth, found.unknowns))
-    assert error[:4].max() < (1e-3 if mount == "head" else 8e-3)
+    assert error[:4].max() < (4e-3 if mount == "head" else 3e-2)  # the floor of the softness
 
 
 @MOUNTS

@@ -457,7 +457,7 @@ def agreeing_start(obs, state, data, unknowns, sweep_sigma):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = replace(gather(kept) if bad else data, sweep_sigma=sweep_sigma)
         found, cost = a_few_steps(fitting, cut, unknowns)
-        if not bad:
+        if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
         state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
     return kept, found, bad, cost / count_rows(cut)
