@@ -103,4 +103,6 @@ def test_the_method_handed_over_does_well_on_both_features():
     rows = [("line", 4.7, 42.0), ("zhang_pless", 6.0, 8.9), ("bauermann", 0.1, 0.1)]
     assert evaluate.best_method(pd.DataFrame(rows, columns=columns)) == "zhang_pless"
     with pytest.raises(ValueError, match="left-out placements"):
-        evaluate.best_method(pd.DataFrame([("line", np.nan, 1.0)], columns=columns))
+        evaluate.best_method(pd.DataFrame([("line", np.nan, np.nan)], columns=columns))
+    # a sheet on a wall shows no edges: planes judge alone
+    assert evaluate.best_method(pd.DataFrame([("zhang_pless", np.nan, 1.0)], columns=columns)) == "zhang_pless"

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 UPRIGHT = 0.05  # weight of the turn between two cameras where few placements tell: most look the same way, head up
-CLEARLY = 0.95  # a mirrored board frame is believed when the usual one explains less than this share
+CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 
 
 def alike(rotations, placements, cameras):
@@ -75,6 +75,6 @@ def decide(scores, first, partner):
     np.add.at(total, first, np.take_along_axis(np.asarray(scores, float), partner, axis=1))
     half = total.shape[1] // 2
     usual, mirrored = (part.max(axis=1).sum() for part in (total[:, :half], total[:, half:]))
-    side = slice(half, None) if usual < CLEARLY * mirrored else slice(0, half)
+    side = slice(0, half) if mirrored < CLEARLY * usual else slice(half, None)
     best = total[:, side].argmax(axis=1) + side.start
     return partner[np.arange(len(first)), best[first]]
