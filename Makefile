@@ -9,13 +9,14 @@ SIMULATED := sim_lms221 sim_quick
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup report test notebooks lab data bench clean
+.PHONY: help setup report test notebooks lab data bench fuzz clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
 	@echo "make test                    lint and run all tests, the notebooks included"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make bench                   compare speed with scipy and OpenCV"
+	@echo "make fuzz                    200 000 damaged sessions and rig files: only our own errors, within bounds"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
 	@echo "make clean                   remove the environment, reports and caches"
@@ -41,6 +42,9 @@ lab: setup
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py
 	@PYTHONPATH=tests $(RUN) tests/bench_joint.py
+
+fuzz: setup
+	@PYTHONPATH=tests $(RUN) tests/fuzz.py
 
 data: setup
 	rm -rf data/.new

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from lrfcal_lib.evaluate import handed_over, plane_residuals_of, rms, trusted_si
 from lrfcal_lib.pipeline import calibrate, color_cloud
 from lrfcal_lib.reconstruct import write_ply
 from lrfcal_lib.session import open_session
+from lrfcal_lib.session.opened import FILES, opened
 from lrfcal_lib.solvers.camera import edge_residuals_px
 
 SCHEMA = 1
@@ -50,7 +52,7 @@ def calibration_record(calibration, method):
         "schema": SCHEMA,
         "lrfcal": __version__,
         "session": session.name,
-        "inputs_sha256": file_hashes(session.path),
+        "inputs_sha256": file_hashes(session),
         "conventions": FRAMES,
         "method": method,
         "platform": _transform(calibration.platform.transform(axis))
@@ -104,10 +106,14 @@ def _intrinsics(model):
     return {"width": model.width, "height": model.height} | dict(zip(names, model.parameters.tolist(), strict=True))
 
 
-def file_hashes(folder):
-    """SHA-256 of every file of a session, by its path within it."""
-    files = sorted(p for p in Path(folder).rglob("*") if p.is_file())
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+def file_hashes(session):
+    """SHA-256 of every file that a session was read from, by its path within it; of no other that lies there."""
+    files = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
+    hashes = {}
+    for file in sorted(files | {record.file for record in session.image_records}):
+        with opened(file, session.path) as stream:
+            hashes[file.relative_to(session.path).as_posix()] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return hashes
 
 
 def write_calibration(path, record):

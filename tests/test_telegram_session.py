@@ -227,7 +227,7 @@ def set_cell(row, column, value):
 
 MISMATCHES = {
     r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore": set_cell(3, 1, "853"),
-    r"index\.csv: line 3, offset 42, length 6: telegrams of 7 or more bytes": set_cell(2, 2, "6"),
+    r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes": set_cell(2, 2, "6"),
     r"index\.csv: line 2, offset -1, length 42": set_cell(1, 1, ""),
     r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing": set_cell(2, 4, ""),
     r"index\.csv: .*invalid literal.*'x'": set_cell(2, 1, "x"),

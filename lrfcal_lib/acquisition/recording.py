@@ -40,7 +40,7 @@ class Recording:
     Raises
     ------
     SessionError
-        If `path` exists (without `resume`), or states another rig.
+        If `path` exists (without `resume`), states another rig, or is being recorded by somebody else.
     RecordingError
         If the session cannot be written.
 
@@ -58,14 +58,28 @@ class Recording:
 
     def __init__(self, rig, path, *, resume=False, count=None):
         self.rig, self.path, self.plan = rig, Path(path), rig.stated.plan.to_do(count)
-        stated, writer = rig.stated, None
+        stated = rig.stated
         about = {**stated.about, "source": stated.about["source"] or f"recorded with {stated.path.name}"}
         about |= {"reference": _reference(rig, self.plan), "platform_sigma": stated.platform_sigma}
         with self._safely():
             writer = SessionRecorder(self.path, stated.board, rig.lrf_info, stated.cameras.values(), stated.T_head_lrf,
                                      resume=resume, **about)  # fmt: skip
-            writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
+            try:
+                writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
+            except BaseException:
+                writer.close()
+                raise
         self.writer = writer
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+    def close(self):
+        """Record nothing any more: the session is free for others, who may go on with it."""
+        self.writer.close()
 
     @property
     def finished(self):

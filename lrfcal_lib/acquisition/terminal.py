@@ -131,6 +131,8 @@ def record(rig, path, *, resume=False, count=None, advice=None, terminal=None):
     except (DeviceError, KeyboardInterrupt) as error:
         error.add_note(f"{recording.safe()}; --resume goes on from there")
         raise
+    finally:
+        recording.close()
     return recording
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.board import Board
 from lrfcal_lib.geometry import axis_difference, axis_of, lrf_to_platform, transform_difference
 from lrfcal_lib.prepared import VARIANTS
-from lrfcal_lib.session import SessionError, board_from_json, transform_from_json
+from lrfcal_lib.session import board_from_json, transform_from_json
+from lrfcal_lib.session.common import naming, read_json
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,10 @@ def read_truth(session):
         If ``truth.json`` is damaged.
     """
     file = session.path / "truth.json"
-    if not file.is_file():
+    if not os.path.lexists(file):
         return None
-    try:
-        data = json.loads(file.read_text())
+    data = read_json(file, session.path)
+    with naming(f"{file} (simulate the session again)"):
         return Truth(
             transform_from_json(data["T_head_lrf"]),
             {name: _camera(entry) for name, entry in data["cameras"].items()},
@@ -66,8 +67,6 @@ def read_truth(session):
             {int(n): transform_from_json(entry["T_platform_board"]) for n, entry in data["boards"].items()},
             {int(n): np.asarray(entry["pitch_rad"], float) for n, entry in data["sweeps"].items()},
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise SessionError(f"{file}: {error!r}; simulate the session again") from error
 
 
 def _camera(entry):

@@ -119,7 +119,7 @@ class Collector:
         with self._own(), contextlib.ExitStack() as stack:
             stated, clock = _stated(rig, stack)
             opened = stack.enter_context(Rig.open(stated, clock=clock))
-            recording = Recording(opened, Path(session), resume=True)
+            recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig, self.recording, self._closing = opened, recording, stack.pop_all()
             self.view, self.lights, self._told = View(), {}, ""
 

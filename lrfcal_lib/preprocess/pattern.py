@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -272,10 +273,20 @@ def estimate_relief(pixels, pattern, model):
     return better(wavy, pixels, pattern, relief=False, intrinsics=False)
 
 
+@contextmanager
+def _opencv(what):
+    """OpenCV's refusal of what it was given is one of the values."""
+    try:
+        yield
+    except cv2.error as error:
+        raise ValueError(f"{what} (OpenCV: {error.err})") from error
+
+
 def _first_intrinsics(pixels, pattern, size):
     board = [pattern.points().astype(np.float32)] * len(pixels)
     views = [np.ascontiguousarray(p, np.float32) for p in pixels]
-    out = cv2.calibrateCamera(board, views, tuple(int(s) for s in size), None, None, flags=cv2.CALIB_FIX_K3)
+    with _opencv(f"{len(pixels)} views of the pattern do not determine the intrinsics"):
+        out = cv2.calibrateCamera(board, views, tuple(int(s) for s in size), None, None, flags=cv2.CALIB_FIX_K3)
     matrix, lens, turns, shifts = out[1:5]
     focal = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     model = CameraModel(int(size[0]), int(size[1]), *map(float, focal), lens.ravel()[:5])
@@ -360,9 +371,11 @@ def first_pose(points, pixels, model):
     """Pose by OpenCV's solver, good enough to start from; ValueError when there is none in front of the camera."""
     good = np.isfinite(pixels).all(axis=1)
     board, image = points[good].astype(float), np.ascontiguousarray(pixels[good], float)
-    found, rotvec, translation = cv2.solvePnP(board, image, model.matrix, model.distortion, flags=cv2.SOLVEPNP_SQPNP)
+    why, how = f"{good.sum()} corners do not determine a pose in front of the camera", cv2.SOLVEPNP_SQPNP
+    with _opencv(why):
+        found, rotvec, translation = cv2.solvePnP(board, image, model.matrix, model.distortion, flags=how)
     if not found or not np.isfinite(translation).all() or translation[2, 0] <= 0:
-        raise ValueError(f"{good.sum()} corners do not determine a pose in front of the camera")
+        raise ValueError(why)
     return _transform(rotvec, translation)
 
 

@@ -9,16 +9,18 @@
     edges.csv               optional edges picked by hand: camera, file, edge, u1, v1, u2, v2
     platform.csv            recordings only, never read here: t_s, commanded_deg, measured_deg
     truth.json              simulated sessions only; never read here
+    writer.lock             only while it is written: who does that; one at a time
 
-Everything is plain text or a NumPy archive without pickles. session.json may name the LRF's file (rig.lrf.file),
-otherwise the one that exists is read. A row of scans.npz is one scan line in the order of acquisition; a range is NaN
-where nothing came back or nothing was recorded.
+Everything is plain text or a NumPy archive without pickles, in plain files: links are refused, and so is what would
+take more than 500 MB of memory (more than 12 million ranges, images of more than 30 megapixels, longer tables than
+200 000 lines). session.json may name the LRF's file (rig.lrf.file), otherwise the one that exists is read. A row of
+scans.npz is one scan line in the order of acquisition; a range is NaN where nothing came back or nothing was recorded.
 """
 
 from __future__ import annotations
 
-from lrfcal_lib.session.common import SessionError
 from lrfcal_lib.session.files import EDGE_COLUMNS, IMAGE_COLUMNS, PURPOSES, EdgePick, ImageRecord, image_size
+from lrfcal_lib.session.opened import SessionError
 from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.recording import Session, Sweep, open_session, validate
 from lrfcal_lib.session.stated import (

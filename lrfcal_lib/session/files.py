@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
-from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_table, short
-from lrfcal_lib.session.stated import numbers
+from lrfcal_lib.session.common import SessionError, check_amount, naming, read_bytes, read_table, reading, short
+from lrfcal_lib.session.opened import listed, opened
+from lrfcal_lib.session.stated import numbers, whole
 from lrfcal_lib.session.telegrams import read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
@@ -19,6 +21,8 @@ EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
 PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
+PART = re.compile(r"part_\d+\.npz")  # a sweep, until the session is finished
+ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -72,34 +76,60 @@ class EdgePick:
 def read_scans(path, file=None):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     if file is None:
-        file = next((name for name in _READERS if (path / name).is_file()), "lrf/scans.npz")
+        file = next((name for name in _READERS if os.path.lexists(path / name)), "lrf/scans.npz")
     target = inside(path, file, "session.json: file of the LRF")
     if file not in _READERS:
         raise SessionError(f"{path}: the LRF's file is one of {short(_READERS)}, got '{file}'")
-    if not target.is_file() and sorted((path / "lrf").glob("part_*.npz")):
+    lexists, lrf = os.path.lexists, path / "lrf"
+    if not lexists(target) and lexists(lrf) and any(PART.fullmatch(name) for name in listed(lrf, path)):
         raise SessionError(f"{path}: the recording was interrupted; lrfcal_lib.session.finish('{path}') completes it")
-    return _READERS[file](target)
+    return _READERS[file](target, path)
 
 
-def read_npz(file):
-    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`."""
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            scans = {key: archive[key] for key in archive.files}
-    except FileNotFoundError as error:
-        raise SessionError(f"{file}: no such file; a session needs the scan lines") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise SessionError(f"{file}: cannot be read ({error}); truncated?") from error
+def read_npz(file, within):
+    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
+    if not os.path.lexists(file):
+        raise SessionError(f"{file}: no such file; a session needs the scan lines")
+    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
+        with zipfile.ZipFile(stream) as archive:
+            names = [key for key in ARRAYS if f"{key}.npy" in archive.namelist()]
+            headers = {key: _header(archive, key) for key in names}
+            with naming(file):
+                _check_headers(headers)
+            scans = {key: _unpacked(archive, key) for key in names}
     with naming(file):
         return check_scans(scans)
 
 
-def _without_log(file):
-    return read_npz(file), None
+def _header(archive, key):
+    """Shape and type of an array in an archive, before it is unpacked."""
+    with archive.open(f"{key}.npy") as member:
+        old = np.lib.format.read_magic(member) == (1, 0)
+        shape, _, kind = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(member)
+    return shape, kind
 
 
-def _from_telegrams(file):
-    scans, log = read_telegrams(file)
+def _unpacked(archive, key):
+    with archive.open(f"{key}.npy") as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _check_headers(headers):
+    """Refuse arrays of anything but numbers (pickles are never read), and more values than a session holds."""
+    for key, (shape, kind) in headers.items():
+        if kind.kind not in "fiub" or kind.itemsize > 8:
+            raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
+        if min(shape, default=0) < 0:
+            raise ValueError(f"{key} cannot be read: its shape is {shape}; truncated?")
+    check_amount(sum(math.prod(shape) for shape, _ in headers.values()))
+
+
+def _without_log(file, within):
+    return read_npz(file, within), None
+
+
+def _from_telegrams(file, within):
+    scans, log = read_telegrams(file, within)
     with naming(file):
         return check_scans(scans), log
 
@@ -165,7 +195,7 @@ def _check_angles(bearings, pitch):
 
 def unfinished_of(data):
     """Placements that session.json says are being recorded; None for a session that is not being recorded."""
-    return None if data.get("unfinished") is None else tuple(int(p) for p in data["unfinished"])
+    return None if data.get("unfinished") is None else tuple(whole(p, "a placement") for p in data["unfinished"])
 
 
 def missing_parts(placements, scans, records, cameras, unfinished=None):
@@ -182,10 +212,9 @@ def missing_parts(placements, scans, records, cameras, unfinished=None):
 
 
 def inside(path, name, where):
-    """The file a session names; it must lie inside the session's folder (no ``..``, absolute path or link out)."""
+    """The file a session names; it must lie inside the session's folder (no ``..`` or absolute path)."""
     windows, posix = PureWindowsPath(name), PurePosixPath(name)
-    odd = windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts
-    if odd or not (path / name).resolve().is_relative_to(path.resolve()):
+    if windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts:
         raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
     return path / name
 
@@ -196,16 +225,16 @@ def read_images(path, stated, unfinished=None):
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
     """
     file = path / "images.csv"
-    if not stated["cameras"] and not file.exists():
+    if not stated["cameras"] and not os.path.lexists(file):
         return ()
     out, skipped = [], {str(p) for p in unfinished or ()}
-    rows = read_table(file, IMAGE_COLUMNS, torn=True)[0] if unfinished is not None else read_table(file, IMAGE_COLUMNS)
+    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
         with naming(f"{file} line {number}"):
             out.append(_image_record(path, row, stated))
-            check_image_size(out[-1].file, image_size(out[-1].file), stated["cameras"][row["camera"]])
+            check_image_size(out[-1].file, image_size(out[-1].file, path), stated["cameras"][row["camera"]])
     return tuple(out)
 
 
@@ -225,11 +254,11 @@ def _image_record(path, row, stated):
 def read_edges(path, stated, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
     file = path / "edges.csv"
-    if not file.exists():
+    if not os.path.lexists(file):
         return ()
     known = {(r.camera, r.file): r for r in records}
     out = []
-    for number, row in enumerate(read_table(file, EDGE_COLUMNS), start=2):
+    for number, row in enumerate(read_table(file, EDGE_COLUMNS, path)[0], start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
             if (row["camera"], target) not in known:
@@ -243,12 +272,14 @@ def read_edges(path, stated, records):
     return tuple(out)
 
 
-def image_size(file):
+def image_size(file, within=None):
     """Width and height of a PNG or JPEG image from its header; also notices a cut-off end.
 
     Parameters
     ----------
     file : path-like
+    within : path-like, optional
+        The session's folder, where it is a file of a session.
 
     Returns
     -------
@@ -259,7 +290,11 @@ def image_size(file):
     SessionError
         For a missing, truncated or other file.
     """
-    data = read_bytes(file)
+    return size_in_header(file, read_bytes(file, within))
+
+
+def size_in_header(file, data):
+    """Width and height of an image of which the bytes are known, see :func:`image_size`."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         size, complete = (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), b"IEND" in data[-16:]
     elif data[:2] == b"\xff\xd8":
@@ -276,6 +311,8 @@ def _jpeg_size(data):
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker < 0xC0 or 0xD0 <= marker <= 0xD9 or marker == 0xFF:
+            return None  # no segment: a decoder would go on looking, and find another header than we do
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
         at += 2 + length

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 
-from lrfcal_lib.session.common import SessionError, naming, read_json, read_table, short
+from lrfcal_lib.session.common import naming, read_json, read_table, short
 from lrfcal_lib.session.files import DROPPED, IMAGE_COLUMNS, PLATFORM_COLUMNS, unfinished_of
+from lrfcal_lib.session.opened import LOCK, SessionError, listed
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
-from lrfcal_lib.session.writer import SessionWriter, append_file, cell, finish, mend_tables, write_file
+from lrfcal_lib.session.writer import SessionWriter, append_file, cell, complete, mend_tables
 
 
 class SessionRecorder(SessionWriter):
@@ -46,20 +48,19 @@ class SessionRecorder(SessionWriter):
 
     def _create(self):
         stated = self.path / "session.json"
-        if self._resume and stated.is_file():
-            self._go_on(read_json(stated))
+        if self._resume and os.path.lexists(stated):
+            self._go_on(read_json(stated, self.path))
         else:
             self._begin(stated)
         self._make_folders()
-        if not (self.path / "platform.csv").exists():
-            write_file(self.path / "platform.csv", ",".join(PLATFORM_COLUMNS) + "\n")
+        if not os.path.lexists(self.path / "platform.csv"):
+            self._write("platform.csv", ",".join(PLATFORM_COLUMNS) + "\n")
 
     def _begin(self, stated):
         """session.json comes first, so that a recording killed at once can go on."""
-        if self.path.exists() and (not self.path.is_dir() or {p.name for p in self.path.iterdir()} - {_draft(stated)}):
+        if set(os.listdir(self.path)) - {_draft(stated), LOCK}:
             hint = "choose another name" if self._resume else "record with --resume to go on with it, or choose another"
             raise SessionError(f"{self.path}: exists already; {hint}")
-        self.path.mkdir(parents=True, exist_ok=True)
         self.data["unfinished"] = []
         self._write_index()
 
@@ -67,13 +68,13 @@ class SessionRecorder(SessionWriter):
         """Take over what an earlier recording wrote, without the placement that it did not finish."""
         mine = json.loads(json.dumps(self.data))
         with naming(self.path / "session.json"):
-            parse_session(data)
+            placements = list(parse_session(data)["placements"])
             left = unfinished_of(data)
             for key in ("board", "rig"):
                 if data[key] != mine[key]:
                     where = _first_difference(data[key], mine[key], key)
                     raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
-        self.data = {**data, "unfinished": list(left or ())}
+        self.data = {**data, "placements": placements, "unfinished": list(left or ())}
         self._make_folders()
         mend_tables(self.path)
         for placement in left or ():
@@ -81,8 +82,9 @@ class SessionRecorder(SessionWriter):
         self.data["unfinished"] = []
         self._write_index()
         for camera in self.cameras:
-            names = [p.stem for p in (self.path / "images" / camera).iterdir() if p.suffix != ".draft"]
-            self.shots[camera] = max((int(name) for name in names if name.isdigit()), default=0)
+            there = listed(self.path / "images" / camera, self.path)
+            names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
+            self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
 
     def begin_placement(self, placement):
         """State that a placement is being recorded from now on.
@@ -137,7 +139,7 @@ class SessionRecorder(SessionWriter):
             Host time (s), commanded and measured pitch (rad); NaN where a head was not told, or does not tell.
         """
         lines = [[cell(t), *(cell(math.degrees(a)) for a in angles)] for t, *angles in rows]
-        append_file(self.path / "platform.csv", "".join(",".join(line) + "\n" for line in lines))
+        append_file(self.path / "platform.csv", "".join(",".join(line) + "\n" for line in lines), self.path)
 
     def finish(self):
         """Close the recording: nothing can be half done in it any more."""
@@ -145,14 +147,16 @@ class SessionRecorder(SessionWriter):
             self.drop_placement(placement)
         del self.data["unfinished"]
         self._write_index()
-        finish(self.path)
+        complete(self.path)
+        self.close()
 
     def __exit__(self, kind, error, trace):
-        """Nothing: a recording ends by :meth:`finish`, and goes on after anything else."""
+        """A recording ends by :meth:`finish`; after anything else it may go on."""
+        self.close()
 
     def shots_of(self, purpose):
         """Numbers of images of a purpose, a dict by camera."""
-        rows = read_table(self.path / "images.csv", IMAGE_COLUMNS) if self.cameras else []
+        rows = read_table(self.path / "images.csv", IMAGE_COLUMNS, self.path)[0] if self.cameras else []
         return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
 
     def _note_placement(self, placement):
@@ -162,16 +166,17 @@ class SessionRecorder(SessionWriter):
     def _mark_dropped(self, placement):
         number = str(placement)
         for file, columns, key, to in (
-            (self.telegrams.with_name("index.csv"), INDEX_COLUMNS, "placement", ""),
-            (self.path / "images.csv", IMAGE_COLUMNS, "purpose", DROPPED),
+            ("lrf/index.csv", INDEX_COLUMNS, "placement", ""),
+            ("images.csv", IMAGE_COLUMNS, "purpose", DROPPED),
         ):
-            rows = read_table(file, columns) if file.exists() else []
+            there = os.path.lexists(self.path / file)
+            rows = read_table(self.path / file, columns, self.path)[0] if there else []
             mine = [row for row in rows if row["placement"] == number]
             for row in mine:
                 row[key] = to
             if mine:
                 lines = [",".join(columns), *(",".join(row.values()) for row in rows)]
-                write_file(file, "\n".join(lines) + "\n")
+                self._write(file, "\n".join(lines) + "\n")
 
 
 def _draft(file):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,8 +12,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.board import Board
-from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, short
+from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, read_table, reading, short
 from lrfcal_lib.session.files import (
+    EDGE_COLUMNS,
+    IMAGE_COLUMNS,
     EdgePick,
     ImageRecord,
     check_image_size,
@@ -19,10 +23,18 @@ from lrfcal_lib.session.files import (
     read_edges,
     read_images,
     read_scans,
+    size_in_header,
     unfinished_of,
 )
 from lrfcal_lib.session.stated import SCHEMA, CameraInfo, LrfInfo, parse_session
-from lrfcal_lib.session.telegrams import TelegramLog, other_than_stated
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated
+
+# tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
+ORDERED = {
+    "lrf/index.csv": (INDEX_COLUMNS, ("placement",), ("offset",)),
+    "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose"), ("file",)),
+    "edges.csv": (EDGE_COLUMNS, (), ("camera", "file", "edge")),
+}
 
 
 @dataclass(frozen=True)
@@ -157,11 +169,12 @@ class Session:
         SessionError
             If the file cannot be decoded or has another size than the camera.
         """
-        data = np.frombuffer(read_bytes(record.file), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-        if image is None:
-            raise SessionError(f"{record.file}: cannot be decoded; remove its row from images.csv or restore the file")
-        check_image_size(record.file, image.shape[1::-1], self.cameras[record.camera])
+        camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
+        check_image_size(record.file, size_in_header(record.file, data), camera)
+        with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            shape = image.shape  # there is none of an image that is None
+        check_image_size(record.file, shape[1::-1], camera)
         return image
 
     @property
@@ -226,7 +239,7 @@ def open_session(path):
         away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
-    data = read_json(path / "session.json")
+    data = read_json(path / "session.json", path)
     if data.get("schema") != SCHEMA:
         raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
     with naming(path / "session.json"):
@@ -257,10 +270,29 @@ def validate(path):
         session = open_session(path)
     except SessionError as error:
         return [str(error)]
-    found = list(session.problems)
+    found = [*session.problems, *_disorder(session)]
     for record in session.image_records:
         try:
             session.read_image(record)
         except SessionError as error:
             found.append(str(error))
     return found
+
+
+def _disorder(session):
+    """What two writers, or hands, do to tables: time that runs back within a placement, rows that stand there twice."""
+    for name, (columns, group, once) in ORDERED.items():
+        file, last, seen = session.path / name, {}, {}
+        rows = read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
+        for line, row in enumerate(rows, start=2):
+            where, what = f"{file} line {line}", tuple(row[key] for key in once)
+            if what in seen:
+                yield f"{where}: {', '.join(what)} stands in line {seen[what]} already; remove one of them"
+            seen.setdefault(what, line)
+            key = tuple(row[key] for key in group)
+            if row.get("t_s") and row["placement"]:
+                time = float(row["t_s"])
+                if time < last.get(key, -math.inf):
+                    back = f"t_s runs back from {last[key]:.9g} to {time:.9g}"
+                    yield f"{where}: {back}: two writers at once? Record the placement again"
+                last[key] = time

@@ -15,6 +15,9 @@ from lrfcal_lib.session.common import short
 
 SCHEMA = "lrfcal-session/1"
 MOUNTS = ("head", "platform")
+LARGEST_WHOLE = 1_000_000  # placements and the like
+LARGEST_IMAGE = 30_000_000  # pixels
+MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
 LONGEST_LEVER = 10.0  # metres between the parts of a rig
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
@@ -87,7 +90,7 @@ class CameraInfo:
 def parse_session(data):
     """The statements of session.json as fields of a Session; KeyError, TypeError or ValueError for a wrong one."""
     rig = data["rig"]
-    placements = tuple(int(p) for p in data["placements"])
+    placements = tuple(whole(p, "a placement") for p in data["placements"])
     if len(set(placements)) != len(placements) or min(placements, default=0) < 0:
         raise ValueError(f"placements are different numbers from 0 on, got {short(placements)}")
     return {
@@ -137,6 +140,13 @@ def numbers(values, shape, what):
     return out
 
 
+def whole(value, what):
+    """A whole number, as an int."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST_WHOLE or value % 1:
+        raise ValueError(f"{what} is a whole number up to {LARGEST_WHOLE}, got {value!r}")
+    return int(value)
+
+
 def _positive(value, what):
     value = float(numbers(value, (), what))
     if value <= 0:
@@ -181,7 +191,7 @@ def board_from_json(data):
     """Inverse of :func:`board_to_json`; refuses a board larger than 20 m."""
     edges = tuple(str(e) for e in data["edges"])
     features = tuple(str(f) for f in data["features"])
-    if len(edges) < 3 or len(set(edges)) != len(edges):
+    if not 3 <= len(edges) <= MOST_CORNERS or len(set(edges)) != len(edges):
         raise ValueError(f"a board needs three or more edges with different names, got {short(edges)}")
     if len(features) != 2 or not set(features) <= set(edges):
         raise ValueError(f"features are two of the edges {short(edges)}, got {short(features)}")
@@ -201,9 +211,10 @@ def _pattern_from_json(data):
     square = _positive(data["square_m"], "square_m")
     if square > 1:
         raise ValueError(f"square_m is {square:g}: millimetres? Divide by 1000")
-    columns, rows = int(data["columns"]), int(data["rows"])
-    if min(columns, rows) < 3:
-        raise ValueError(f"a chessboard needs three or more inner corners each way, got {columns} x {rows}")
+    columns, rows = whole(data["columns"], "columns"), whole(data["rows"], "rows")
+    if min(columns, rows) < 3 or columns * rows > MOST_CORNERS:
+        corners = f"three or more inner corners each way, up to {MOST_CORNERS} in all"
+        raise ValueError(f"a chessboard needs {corners}, got {columns} x {rows}")
     return Chessboard(columns, rows, square, tuple(numbers(data.get("origin_m", (0, 0)), (2,), "origin_m").tolist()))
 
 
@@ -288,8 +299,9 @@ def camera_from_json(name, data):
     plain_name(name, "name of a camera")
     if data["mount"] not in MOUNTS:
         raise ValueError(f"camera '{name}': mount is one of {short(MOUNTS)}, got {data['mount']!r}")
-    width, height = int(data["width"]), int(data["height"])
-    if min(width, height) < 1:
-        raise ValueError(f"camera '{name}': width and height must be positive, got {width} x {height}")
+    width, height = whole(data["width"], "width"), whole(data["height"], "height")
+    if min(width, height) < 1 or width * height > LARGEST_IMAGE:
+        limit = f"at most {LARGEST_IMAGE} pixels in all"
+        raise ValueError(f"camera '{name}': width and height must be positive, {limit}, got {width} x {height}")
     model = model_from_json(data["intrinsics"], width, height)
     return CameraInfo(name, data["mount"], width, height, model, transform_from_json(data.get("guess")))

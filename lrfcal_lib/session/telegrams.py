@@ -10,11 +10,13 @@ import numpy as np
 
 from lrfcal_lib.drivers.lms2xx import OVERHEAD, REASONS, STX, TelegramError, check_crc, decode_scans, scan_quarters
 from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, CONFIGURED, STATUS, parse_configuration, parse_status
-from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_table, short
+from lrfcal_lib.session.common import SessionError, check_amount, naming, read_bytes, read_table, short
+from lrfcal_lib.session.opened import LARGEST_FILE
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
 SCANNED, OTHER, WRONG, TRUNCATED = range(len(OUTCOMES))
+LONGEST = OVERHEAD + 0xFFFF  # bytes of a telegram
 FACTORY_MODE = 0
 
 
@@ -67,13 +69,15 @@ class TelegramLog:
         }
 
 
-def read_telegrams(file):
+def read_telegrams(file, within):
     """Decode a recording.
 
     Parameters
     ----------
     file : Path
         telegrams.bin; index.csv lies beside it.
+    within : Path
+        The session's folder.
 
     Returns
     -------
@@ -93,10 +97,11 @@ def read_telegrams(file):
     in rising order at the same placement and the same pitch; a part that is missing stays NaN. What the device calls
     larger than its maximum is NaN here.
     """
-    data, path = np.frombuffer(read_bytes(file), np.uint8), file.with_name("index.csv")
-    index, problems = _read_index(path)
+    data, path = np.frombuffer(read_bytes(file, within), np.uint8), file.with_name("index.csv")
+    index, problems = _read_index(path, within)
     with naming(path):
         outcome = _check_index(index, len(data), file)
+        check_amount(len(data) // 2)
     whole = np.flatnonzero(outcome != TRUNCATED)
     good = _sound(data, index["offset"][whole], index["length"][whole])
     outcome[whole] = np.where(good, OTHER, WRONG)
@@ -114,9 +119,9 @@ def read_telegrams(file):
     return scans, TelegramLog(file, index["offset"], index["placement"], outcome, values, tuple(problems))
 
 
-def _read_index(path):
+def _read_index(path, within):
     """Columns of index.csv as arrays, and problems; a row cut off by a crash is left out."""
-    rows, cut = read_table(path, INDEX_COLUMNS, torn=True)
+    rows, cut = read_table(path, INDEX_COLUMNS, within, torn=True)
     index = {}
     with naming(path):
         for key in ("t_s", "pitch_deg"):
@@ -139,10 +144,10 @@ def _check_index(index, size, file):
     outcome = np.full(len(offset), OTHER, np.uint8)
     if len(offset) == 0:
         raise ValueError(f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded")
-    bad = np.flatnonzero((length < 7) | (offset < 0) | (np.diff(ends, prepend=0) < length))
+    bad = np.flatnonzero((length < 7) | (length > LONGEST) | (offset > LARGEST_FILE) | (offset < np.r_[0, ends[:-1]]))
     if len(bad):
         where = _place(index, bad[0])
-        raise ValueError(f"{where}: telegrams of 7 or more bytes lie one after the other; restore the file")
+        raise ValueError(f"{where}: telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file")
     if np.any(ends[:-1] > size):
         where = _place(index, np.argmax(ends > size))
         raise ValueError(f"{where}, but {file.name} has {size} bytes: restore it, or remove the rows from this one on")
@@ -208,6 +213,7 @@ def _lines(groups, index):
     line = np.full(len(partial), -1)
     line[rows] = np.cumsum(_begins(*(a[rows] for a in (partial, number, index["placement"], index["pitch_deg"])))) - 1
     quarters = _grid(groups, line)
+    check_amount((line.max() + 1) * len(quarters))
     ranges = np.full((line.max() + 1, len(quarters)), np.nan)
     for some, group in groups:
         used = line[some] >= 0

@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lrfcal_lib.session.common import SessionError, naming, short
-from lrfcal_lib.session.files import IMAGE_COLUMNS, PURPOSES, check_image_size, check_scans, image_size, read_npz
+from lrfcal_lib.session.common import naming, read_bytes, short
+from lrfcal_lib.session.files import IMAGE_COLUMNS, PART, PURPOSES, check_image_size, check_scans, image_size, read_npz
+from lrfcal_lib.session.opened import LOCK, SessionError, alone, folder, listed, opened
 from lrfcal_lib.session.stated import (
     SCHEMA,
     board_to_json,
@@ -74,30 +75,44 @@ class SessionWriter:
         self.data = {**data, "placements": [int(p) for p in placements], "reference": reference or {}}
         with naming(self.path):
             parse_session(json.loads(json.dumps(self.data)))
-        self._create()
+        if self.path.exists() and not self.path.is_dir():
+            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+        self.path.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(alone(self.path))
+            self._create()
+            self._held = stack.pop_all()
 
     def _create(self):
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+        if set(os.listdir(self.path)) - {LOCK}:
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self._make_folders()
         self._write_index()
 
     def _make_folders(self):
-        (self.path / "lrf").mkdir(parents=True, exist_ok=True)
-        for name in self.cameras:
-            (self.path / "images" / name).mkdir(parents=True, exist_ok=True)
-        if self.cameras and not (self.path / "images.csv").exists():
-            write_file(self.path / "images.csv", ",".join(IMAGE_COLUMNS) + "\n")
+        for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
+            with folder(self.path / name / "any", self.path, make=True):
+                pass
+        if self.cameras and not os.path.lexists(self.path / "images.csv"):
+            self._write("images.csv", ",".join(IMAGE_COLUMNS) + "\n")
 
     def __enter__(self):
         return self
 
     def __exit__(self, kind, error, trace):
-        if kind is None:
-            finish(self.path)
+        with contextlib.closing(self):
+            if kind is None:
+                complete(self.path)
+
+    def close(self):
+        """Write nothing any more: others may."""
+        self._held.close()
+
+    def _write(self, name, content):
+        write_file(self.path / name, content, self.path)
 
     def _write_index(self):
-        write_file(self.path / "session.json", json.dumps(self.data, indent=1) + "\n")
+        self._write("session.json", json.dumps(self.data, indent=1) + "\n")
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
@@ -136,7 +151,7 @@ class SessionWriter:
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
         self.bearings, self.parts = bearings, self.parts + 1
-        write_file(self.path / "lrf" / f"part_{self.parts:06d}.npz", scans)
+        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
@@ -167,15 +182,15 @@ class SessionWriter:
             if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
         index = self.telegrams.with_name("index.csv")
-        if not index.exists():
-            write_file(index, ",".join(INDEX_COLUMNS) + "\n")
+        if not os.path.lexists(index):
+            self._write("lrf/index.csv", ",".join(INDEX_COLUMNS) + "\n")
         self._note_placement(placement)
-        offset = append_file(self.telegrams, b"".join(telegrams))
+        offset = append_file(self.telegrams, b"".join(telegrams), self.path)
         rows = []
         for raw, angle, time in zip(telegrams, np.degrees(pitch), time_s, strict=True):
             rows.append([cell(time), offset, len(raw), "" if placement < 0 else placement, cell(angle)])
             offset += len(raw)
-        append_file(index, "".join(",".join(map(str, row)) + "\n" for row in rows))
+        append_file(index, "".join(",".join(map(str, row)) + "\n" for row in rows), self.path)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
         """Append an image.
@@ -206,10 +221,10 @@ class SessionWriter:
         self.shots[camera] += 1
         suffix = ".png" if pixels else Path(image).suffix.lower()
         name = f"images/{camera}/{self.shots[camera]:04d}{suffix}"
-        write_file(self.path / name, cv2.imencode(".png", image)[1].tobytes() if pixels else Path(image).read_bytes())
+        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else read_bytes(image))
         self._note_placement(placement)
         cells = [cell(time_s), camera, name, "" if placement < 0 else placement, cell(math.degrees(pitch)), purpose]
-        append_file(self.path / "images.csv", ",".join(map(str, cells)) + "\n")
+        append_file(self.path / "images.csv", ",".join(map(str, cells)) + "\n", self.path)
 
 
 def finish(path):
@@ -224,19 +239,27 @@ def finish(path):
     Raises
     ------
     SessionError
-        If there is no sweep, or one of them is damaged.
+        If there is no sweep, or one of them is damaged, or somebody records this session.
     """
-    path = Path(path)
+    try:
+        with alone(path):
+            complete(Path(path))
+    except FileNotFoundError as error:
+        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
+
+
+def complete(path):
+    """As :func:`finish`, for who writes the session already."""
     mend_tables(path)
-    if (path / "lrf" / "telegrams.bin").exists():
+    if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    parts = sorted((path / "lrf").glob("part_*.npz"))
+    parts = [path / "lrf" / name for name in listed(path / "lrf", path) if PART.fullmatch(name)]
     if not parts:
         raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
-    sweeps = [read_npz(part) for part in parts]
+    sweeps = [read_npz(part, path) for part in parts]
     shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
     scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
-    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, compress=True)
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, compress=True)
     for part in parts:
         part.unlink()
 
@@ -244,8 +267,8 @@ def finish(path):
 def mend_tables(path):
     """Remove rows that a crash cut off at the end of a session's tables."""
     for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
-        if table.exists() and not table.read_text().endswith("\n"):
-            write_file(table, table.read_text().rpartition("\n")[0] + "\n")
+        if os.path.lexists(table) and not (data := read_bytes(table, path)).endswith(b"\n"):
+            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
 
 
 def _checked_telegrams(telegrams):
@@ -263,39 +286,34 @@ def cell(value):
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
-def write_file(file, content, compress=False):
-    """Write a file so that it is either complete or not there: under another name, fsync, rename."""
+def write_file(file, content, within, compress=False):
+    """Write a file of a session so that it is complete or not there: under another name, fsync, rename."""
     draft = file.with_name(file.name + ".draft")
-    with draft.open("wb") as stream:
-        if isinstance(content, dict):
-            (np.savez_compressed if compress else np.savez)(stream, **content)
-        else:
-            stream.write(content.encode() if isinstance(content, str) else content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(draft, file)
-    sync_folder(file.parent)
-
-
-def append_file(file, content):
-    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
-    begin = file.stat().st_size if file.exists() else 0
-    try:
-        with file.open("ab") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
+    with folder(file, within) as inside:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(draft.name, dir_fd=inside)
+        with opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+            if isinstance(content, dict):
+                (np.savez_compressed if compress else np.savez)(stream, **content)
+            else:
+                stream.write(content.encode() if isinstance(content, str) else content)
             stream.flush()
             os.fsync(stream.fileno())
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.truncate(file, begin)  # half a row would spoil the next one
-        raise
+        os.replace(draft.name, file.name, src_dir_fd=inside, dst_dir_fd=inside)
+        os.fsync(inside)
+
+
+def append_file(file, content, within):
+    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
+    left = memoryview(content.encode() if isinstance(content, str) else content)
+    with opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+        handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
+        try:
+            while left:
+                left = left[os.write(handle, left) :]
+            os.fsync(handle)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(handle, begin)  # half a row would spoil the next one
+            raise
     return begin
-
-
-def sync_folder(folder):
-    """Bring the names of a folder's files to the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

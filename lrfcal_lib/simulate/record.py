@@ -27,6 +27,7 @@ from lrfcal_lib.session import (
     model_to_json,
     transform_to_json,
 )
+from lrfcal_lib.session.writer import write_file
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate import room
 from lrfcal_lib.simulate.placements import Placement, held_close, pairs
@@ -249,8 +250,8 @@ def _record(folder, name, setup, workers):
         for placement in everything:
             own = [s for s in shots if s.placement == placement.number]
             clock = _add_placement(writer, setup, placement, [(s, next(files)) for s in own], clock, log, truth)
-    _write_text(folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n")
-    _write_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
+    write_file(folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n", folder)
+    write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 
 def _photographs(setup, shots, workers) -> Iterator[list[bytes]]:
@@ -313,7 +314,7 @@ def _add_images(writer, setup, item, files, truth, stops=None, times=None):
     name = setup.rig.cameras[item.camera].name
     for i, data in enumerate(files):
         picture = writer.path / f"{name}.jpg"
-        _write_text(picture, data)
+        write_file(picture, data, writer.path)
         pitch = 0.0 if stops is None else float(stops.measured[i])
         time = math.nan if times is None else float(np.round(times[i], 4))
         writer.add_image(name, picture, item.placement, pitch=pitch, time_s=time, purpose=item.purpose)
@@ -345,10 +346,3 @@ def _truth(setup, placements):
         "sweeps": {},
         "images": {},
     }
-
-
-def _write_text(file, content):
-    with file.open("wb") as stream:
-        stream.write(content if isinstance(content, bytes) else content.encode())
-        stream.flush()
-        os.fsync(stream.fileno())
