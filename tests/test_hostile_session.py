@@ -174,6 +174,12 @@ def test_a_second_writer_is_told_who_writes(folder):
     assert open_session(path).placements == (1,)
 
 
+def test_placements_that_are_written_as_1_0_stay_whole_numbers(folder):
+    replaced("session.json", '"placements": [\n  1', '"placements": [\n  1.0')(folder / "telegrams")
+    with fuzz.recorder(folder / "telegrams") as writer:
+        assert repr(writer.finished) == "(1,)"
+
+
 def test_a_session_that_cannot_begin_is_not_kept_from_others(folder):
     with pytest.raises(SessionError, match="exists already"):
         SessionRecorder(folder / "outside", fuzz.SQUARE, fuzz.LRF)

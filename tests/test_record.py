@@ -295,6 +295,7 @@ def record_slowly(data, path, told):
     while recording is None:  # while somebody else records
         with contextlib.suppress(SessionError):
             recording = Recording(rig, path, resume=True)
+        rig.lrf.wait()
     for placement in recording.to_do():
         for _ in recording.run(placement):
             pass

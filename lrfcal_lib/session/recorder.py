@@ -68,13 +68,13 @@ class SessionRecorder(SessionWriter):
         """Take over what an earlier recording wrote, without the placement that it did not finish."""
         mine = json.loads(json.dumps(self.data))
         with naming(self.path / "session.json"):
-            parse_session(data)
+            placements = list(parse_session(data)["placements"])
             left = unfinished_of(data)
             for key in ("board", "rig"):
                 if data[key] != mine[key]:
                     where = _first_difference(data[key], mine[key], key)
                     raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
-        self.data = {**data, "unfinished": list(left or ())}
+        self.data = {**data, "placements": placements, "unfinished": list(left or ())}
         self._make_folders()
         mend_tables(self.path)
         for placement in left or ():
