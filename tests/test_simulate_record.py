@@ -16,10 +16,8 @@ from lrfcal_lib.__main__ import main
 from lrfcal_lib.board import triangle_board
 from lrfcal_lib.geometry import lrf_to_platform
 from lrfcal_lib.session import open_session, transform_from_json, validate
-from lrfcal_lib.simulate import card, record
-from lrfcal_lib.simulate.placements import check_size, held_close, pairs
-from lrfcal_lib.simulate.platform import Platform, step_angles
-from lrfcal_lib.simulate.setups import SETUPS, sim_lms221, sim_quick
+from lrfcal_lib.simulate import record
+from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 QUICK = DATA / "sim_quick"
@@ -75,10 +73,10 @@ def test_the_measured_pitch_of_a_moving_head_lags():
 
 
 def test_stops_are_multiples_of_the_step():
-    np.testing.assert_allclose(step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
-    np.testing.assert_allclose(step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
+    np.testing.assert_allclose(record.step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(record.step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
     with pytest.raises(ValueError, match="a pitch step must be positive, got 0.0"):
-        step_angles(0, 1, 0.0)
+        record.step_angles(0, 1, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -171,13 +169,13 @@ def test_a_sweep_and_an_image_are_rebuilt(setup, session):
 
 @pytest.mark.parametrize("name", SETUPS)
 def test_the_data_card_has_the_sums_of_all_files(name):
-    lines = [line for line in (DATA / card.SUMS).read_text().splitlines() if f"  {name}/" in line]
+    lines = [line for line in (DATA / record.SUMS).read_text().splitlines() if f"  {name}/" in line]
     files = [f for f in (DATA / name).rglob("*") if f.is_file()]
     assert len(lines) == len(files)
     for line in lines:
         value, file = line.split("  ")
         assert hashlib.sha256((DATA / file).read_bytes()).hexdigest() == value
-    assert hashlib.sha256((DATA / card.SUMS).read_bytes()).hexdigest() in (DATA / "README.md").read_text()
+    assert hashlib.sha256((DATA / record.SUMS).read_bytes()).hexdigest() in (DATA / "README.md").read_text()
 
 
 def test_sizes():
@@ -188,7 +186,7 @@ def test_sizes():
 def test_a_card_needs_its_marks(tmp_path):
     (tmp_path / "README.md").write_text("nothing")
     with pytest.raises(ValueError, match="marks"):
-        card.write_card(tmp_path, [])
+        record.write_card(tmp_path, [])
 
 
 def test_simulate_writes_a_session(tmp_path, tiny):
