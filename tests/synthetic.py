@@ -62,15 +62,31 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     `noise` scales errors that are drawn from the stated standard deviations (0: exact observations). Outline corners
     serve as scene points. With a sweep, crossings lie on all edges and face points all over the board.
     """
-    model, numbers, spread = rig.model, np.arange(1, len(poses) + 1), 1e-3 if source == "platform" else 0.0
+    model, numbers, flown = rig.model, np.arange(1, len(poses) + 1), 1e-3 if source == "platform" else 0.0
     boards = [rig.T_camera_lrf.inv() * pose for pose in poses]
     crossings, edges = zip(*(_crossings(rng, board, source) for board in boards), strict=True)
     faces = [_face(rng, board, c, source, face) for board, c in zip(boards, crossings, strict=True)]
-    groups = crossings, faces, [board.apply(flat(CORNERS)) for board in boards]
-    placement = [np.repeat(numbers, [len(x) for x in group]) for group in groups]
-    crossing, on_face, scene = (
-        measured(rng, np.concatenate(group), noise, s) for group, s in zip(groups, (spread, spread, 1e-3), strict=True)
-    )
+    outlines, given = [board.apply(flat(CORNERS)) for board in boards], {}
+    for name, group, spread in (("crossing", crossings, flown), ("plane", faces, flown), ("scene", outlines, 1e-3)):
+        points, covariance, half_step = measured(rng, np.concatenate(group), noise, spread)
+        given |= {f"{name}_points": points, f"{name}_covariance": covariance}
+        given[f"{name}_placement"] = np.repeat(numbers, [len(x) for x in group])
+        if name == "crossing":
+            spacing = half_step[:, :, None] * half_step[:, None, :] / 3
+            given |= {"crossing_half_step": half_step, "crossing_noise": covariance - spacing}
+    given |= _images(rng, poses, model, edges, noise, sigma_px, pattern)
+    off = noise * rng.normal(size=(len(poses), 6)) * SIGMA_BOARD
+    known = [
+        RigidTransform.from_components(pose.translation + d[3:], Rotation.from_rotvec(d[:3]) * pose.rotation)
+        for pose, d in zip(poses, off, strict=True)
+    ]
+    given |= {"placements": numbers, "board_poses": np.array([T.as_matrix() for T in known])}
+    covariance = np.repeat(np.diag(SIGMA_BOARD**2)[None], len(poses), axis=0)
+    return bare_observations(model, camera="left", source=source, board_covariance=covariance, **given)
+
+
+def _images(rng, poses, model, edges, noise, sigma_px, pattern):
+    """Image lines of the edges that were crossed, outline corners, and corners of the pattern."""
     lines = [
         outline_lines(CORNERS)[e] @ np.linalg.inv(model.matrix @ T.as_matrix()[:3, [0, 1, 3]])
         for T, e in zip(poses, edges, strict=True)
@@ -78,44 +94,17 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     lines, edges = np.concatenate(lines), np.concatenate(edges)
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     lines[:, 2] += noise * rng.normal(0, SIGMA_LINE, len(lines))
-    pixels = np.concatenate([pinhole(pose.apply(flat(CORNERS)), model) for pose in poses])
-    pixels += noise * rng.normal(0, SIGMA_LINE, pixels.shape)
+    corners = np.concatenate([pinhole(pose.apply(flat(CORNERS)), model) for pose in poses])
+    corners += noise * rng.normal(0, SIGMA_LINE, corners.shape)
     seen = np.array([project(pose.apply(PATTERN), model) for pose in poses])
     seen += noise * rng.normal(0, sigma_px, seen.shape)
-    off = noise * rng.normal(size=(len(poses), 6)) * SIGMA_BOARD
-    known = [
-        RigidTransform.from_components(pose.translation + d[3:], Rotation.from_rotvec(d[:3]) * pose.rotation)
-        for pose, d in zip(poses, off, strict=True)
-    ]
-    return bare_observations(
-        model,
-        camera="left",
-        source=source,
-        crossing_points=crossing[0],
-        crossing_covariance=crossing[1],
-        crossing_lines=lines,
-        crossing_line_sigma=np.full(len(lines), SIGMA_LINE),
-        crossing_placement=placement[0],
-        crossing_edge=EDGES[edges],
-        crossing_across=np.zeros(len(edges), bool),
-        crossing_half_step=crossing[2],
-        crossing_noise=crossing[1] - crossing[2][:, :, None] * crossing[2][:, None, :] / 3,
-        crossing_radius=np.full(len(edges), 0.02),
-        plane_points=on_face[0],
-        plane_covariance=on_face[1],
-        plane_placement=placement[1],
-        placements=numbers,
-        board_poses=np.array([T.as_matrix() for T in known]),
-        board_covariance=np.repeat(np.diag(SIGMA_BOARD**2)[None], len(poses), axis=0),
-        pattern_points=PATTERN if pattern else np.zeros((0, 3)),
-        pattern_pixels=seen if pattern else np.zeros((len(poses), 0, 2)),
-        pattern_sigma_px=sigma_px,
-        scene_points=scene[0],
-        scene_covariance=scene[1],
-        scene_pixels=pixels,
-        scene_sigma_px=np.full(len(pixels), SIGMA_LINE),
-        scene_placement=placement[2],
-    )
+    return {
+        "crossing_lines": lines, "crossing_line_sigma": np.full(len(lines), SIGMA_LINE),
+        "crossing_edge": EDGES[edges], "crossing_across": np.zeros(len(edges), bool),
+        "crossing_radius": np.full(len(edges), 0.02), "scene_pixels": corners,
+        "scene_sigma_px": np.full(len(corners), SIGMA_LINE), "pattern_points": PATTERN if pattern else PATTERN[:0],
+        "pattern_pixels": seen if pattern else seen[:, :0], "pattern_sigma_px": sigma_px,
+    }  # fmt: skip
 
 
 def _crossings(rng, T_source_board, source):

@@ -18,50 +18,28 @@ RAYS_AT_ONCE = 1 << 19
 
 @dataclass(frozen=True)
 class Beam:
-    """Settings of a laser range finder; ValueError for those that the device does not have.
-
-    Attributes
-    ----------
-    name : str
-    angles : tuple of int
-        Fields of view that the device can be set to, degrees (technical description, chapter 12).
-    spot_exit, divergence : float
-        Diameter of the spot at the window, metres, and its growth with distance, radians (technical description).
-    sigma_range : float
-        Statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200).
-    systematic : float
-        Constant error of this one device, metres.
-    systematic_bound : tuple of (float, float)
-        Largest systematic error that the maker admits, by unit, metres.
-    field_of_view, resolution : int
-        Variant in degrees and 1/100 degree, as telegram 0x3B sets them.
-    unit : float
-        Metres a count: 0.001 or 0.01.
-    pulse : float
-        Surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m).
-    least_energy : float
-        Weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there.
-    least_share : float
-        An echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the
-        strongest echo; the maker states nothing. It widens what stands before a brighter background.
-    rings : int
-        Of sub-rays over the spot, 1 + 3 rings (rings + 1) of them.
-    """
+    """Settings of a laser range finder; ValueError for those that the device does not have."""
 
     name: str
-    angles: tuple[int, ...]
+    angles: tuple[int, ...]  # fields of view that the device can be set to, degrees (technical description, chapter 12)
+    # diameter of the spot at the window, metres, and its growth with distance, radians (technical description)
     spot_exit: float
     divergence: float
-    sigma_range: float
-    systematic: float
-    systematic_bound: tuple[tuple[float, float], ...]
+    sigma_range: float  # statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200)
+    systematic: float  # constant error of this one device, metres
+    systematic_bound: tuple[tuple[float, float], ...]  # largest systematic error that the maker admits, by unit, metres
+    # variant in degrees and 1/100 degree, as telegram 0x3B sets them
     field_of_view: int
     resolution: int
-    unit: float = 0.001
+    unit: float = 0.001  # metres a count: 0.001 or 0.01
+    # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m)
     pulse: float = 1.0
+    # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there
     least_energy: float = 0.1 / 30.0**2
+    # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the strongest
+    # echo; the maker states nothing. It widens what stands before a brighter background.
     least_share: float = 0.25
-    rings: int = 4
+    rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
         if self.field_of_view not in self.angles or (self.field_of_view, self.resolution) not in WHOLE_SCANS:
@@ -214,21 +192,7 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
 
 
 def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines.
-
-    Parameters
-    ----------
-    beam : Beam
-    world : World
-    pitch : ndarray, shape (L, 1) or (L, B)
-        True pitch of the head in each line, or while each beam is measured, radians.
-    T_head_lrf : RigidTransform
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Scan
-    """
+    """Record scan lines, a Scan, at the true pitch of the head in each line (L, 1) or beam (L, B), radians."""
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
     flat, step = (bearings.ravel(), pitch.ravel()), max(1, RAYS_AT_ONCE // beam.rays)
     starts = range(0, bearings.size, step)

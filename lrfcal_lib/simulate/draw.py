@@ -26,35 +26,16 @@ MOST_ROUNDS = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Devices:
-    """What beam and camera are, and how noisy.
-
-    Attributes
-    ----------
-    model : CameraModel
-    board : Board
-        A board without a pattern is seen as one with 23 corners.
-    step : float
-        Between beams, radians.
-    spot : tuple of float
-        Diameter at the window (metres) and its growth (radians).
-    sigma_range : float
-        Metres.
-    sigma_px : float
-        Of an image line across itself, and of one coordinate of a pattern corner.
-    bias : float
-        How far outside an edge the centre of a spot still reads the board, in spot radii.
-    softness : float
-        Standard deviation of that from beam to beam, in spot radii.
-    """
+    """What beam and camera are, and how noisy."""
 
     model: CameraModel = field(default_factory=lambda: CameraModel(1280, 960, 1e3, 1e3, 639.5, 479.5, np.zeros(5)))
-    board: Board = field(default_factory=triangle_board)
-    step: float = np.radians(0.5)
-    spot: tuple[float, float] = (0.016, 0.0119)
-    sigma_range: float = 0.010
-    sigma_px: float = 0.3
-    bias: float = 0.0
-    softness: float = 0.1
+    board: Board = field(default_factory=triangle_board)  # A board without a pattern is seen as one with 23 corners
+    step: float = np.radians(0.5)  # between beams, radians
+    spot: tuple[float, float] = (0.016, 0.0119)  # diameter at the window (metres) and its growth (radians)
+    sigma_range: float = 0.010  # metres
+    sigma_px: float = 0.3  # of an image line across itself, and of one coordinate of a pattern corner
+    bias: float = 0.0  # how far outside an edge the centre of a spot still reads the board, in spot radii
+    softness: float = 0.1  # standard deviation of that from beam to beam, in spot radii
 
     def radius(self, ranges):
         """Of the spot, metres."""
@@ -63,28 +44,14 @@ class Devices:
 
 @dataclass(frozen=True)
 class Bench(Devices):
-    """Truth and noise of a rig to draw observations from; see also :class:`Devices`.
-
-    Attributes
-    ----------
-    T_head_lrf : RigidTransform
-    cameras : dict of str to RigidTransform
-        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform``.
-    mount : {'head', 'platform'}
-    pitch_step : float
-        Between scan lines, radians.
-    range_offset : float
-        Metres.
-    stretch : float
-        Of the recorded pitch: the head turns ``1 + stretch`` times as far.
-    """
+    """Truth and noise of a rig to draw observations from; see also :class:`Devices`."""
 
     T_head_lrf: RigidTransform
-    cameras: dict
-    mount: str = "head"
-    pitch_step: float = np.radians(0.5)
-    range_offset: float = 0.0
-    stretch: float = 0.0
+    cameras: dict  # T_camera_lrf (mount 'head') or T_camera_platform
+    mount: str = "head"  # one of head, platform
+    pitch_step: float = np.radians(0.5)  # between scan lines, radians
+    range_offset: float = 0.0  # metres
+    stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
 
 
 @dataclass(frozen=True, kw_only=True)

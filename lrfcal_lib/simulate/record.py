@@ -259,17 +259,7 @@ def _truth(setup, placements):
 def write_card(folder, names):
     """Write the data card: the sums of sessions in a file for ``sha256sum -c``, and a table of them in the README.
 
-    Parameters
-    ----------
-    folder : path-like
-        Holds the sessions and a README.md with the two marks between which the table stands.
-    names : sequence of str
-        Folders of the sessions.
-
-    Raises
-    ------
-    ValueError
-        If the README has no marks.
+    The folder holds the sessions of these names and a README.md with two marks, between which the table stands.
     """
     folder = Path(folder)
     files = sorted(f for name in names for f in (folder / name).rglob("*") if f.is_file())

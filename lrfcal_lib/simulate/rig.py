@@ -28,36 +28,17 @@ PLACES = 3  # stream of random numbers
 
 @dataclass(frozen=True)
 class Platform:
-    """A pitching platform that lies a little about its pitch; ValueError for impossible settings.
+    """A pitching platform that lies a little about its pitch; ValueError for impossible settings."""
 
-    Attributes
-    ----------
-    backlash : float
-        Play of the gear, radians: the head hangs back by half of it against the direction of motion.
-    stretch : float
-        The head turns ``1 + stretch`` times as far as the platform says.
-    latency : float
-        Seconds by which the measured pitch is older than its time stamp.
-    noise : float
-        Standard deviation of where the head comes to rest about where it should, radians.
-    encoder_step : float
-        Of the measured pitch, radians; 0 for none.
-    speed : float
-        Of continuous motion, radians a second.
-    settle : float
-        Seconds from a command to rest in stop-and-go.
-    limits : tuple of float
-        Least and greatest pitch, radians.
-    """
-
+    # play of the gear, radians: the head hangs back by half of it against the direction of motion
     backlash: float = 0.0
-    stretch: float = 0.0
-    latency: float = 0.0
-    noise: float = 0.0
-    encoder_step: float = 0.0
-    speed: float = math.radians(5.0)
-    settle: float = 0.4
-    limits: tuple[float, float] = (-math.radians(60), math.radians(60))
+    stretch: float = 0.0  # the head turns 1 + stretch times as far as the platform says
+    latency: float = 0.0  # seconds by which the measured pitch is older than its time stamp
+    noise: float = 0.0  # standard deviation of where the head comes to rest about where it should, radians
+    encoder_step: float = 0.0  # of the measured pitch, radians; 0 for none
+    speed: float = math.radians(5.0)  # of continuous motion, radians a second
+    settle: float = 0.4  # seconds from a command to rest in stop-and-go
+    limits: tuple[float, float] = (-math.radians(60), math.radians(60))  # least and greatest pitch, radians
 
     def __post_init__(self):
         for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
@@ -100,26 +81,13 @@ class Platform:
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera of the rig.
-
-    Attributes
-    ----------
-    name : str
-    model : CameraModel
-        True intrinsics.
-    mounting : RigidTransform
-        ``T_camera_lrf`` on the head, ``T_camera_platform`` on the base.
-    guess : RigidTransform
-        The same as a tape measure gives it.
-    mount : {'head', 'platform'}
-    exposure : Exposure
-    """
+    """A camera of the rig."""
 
     name: str
-    model: CameraModel
-    mounting: RigidTransform
-    guess: RigidTransform
-    mount: str = "head"
+    model: CameraModel  # true intrinsics
+    mounting: RigidTransform  # T_camera_lrf on the head, T_camera_platform on the base
+    guess: RigidTransform  # the same as a tape measure gives it
+    mount: str = "head"  # one of head, platform
     exposure: Exposure = Exposure()
 
     def __post_init__(self):
@@ -129,30 +97,17 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything that stays the same over a recording.
-
-    Attributes
-    ----------
-    beam : Beam
-    platform : Platform
-    T_head_lrf, T_head_lrf_stated : RigidTransform
-        The truth, and as a tape measure gives it.
-    cameras : tuple of RigCamera
-    board : Board
-        With corners.
-    ring : float
-        Width of the outermost squares of the board's pattern as a share of a square.
-    stated_sigma : tuple of float
-        How well the stated transform is said to be known: direction (radians) and offset (metres).
-    """
+    """Everything that stays the same over a recording."""
 
     beam: Beam
     platform: Platform
+    # the truth, and as a tape measure gives it
     T_head_lrf: RigidTransform
     T_head_lrf_stated: RigidTransform
     cameras: tuple[RigCamera, ...]
-    board: Board
-    ring: float = 0.65
+    board: Board  # with corners
+    ring: float = 0.65  # width of the outermost squares of the board's pattern as a share of a square
+    # how well the stated transform is said to be known: direction (radians) and offset (metres)
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
@@ -195,39 +150,19 @@ class Rig:
 
 @dataclass(frozen=True)
 class Setup:
-    """A recording to simulate; everything follows from it.
-
-    Attributes
-    ----------
-    name : str
-    seed : int
-    rig : Rig
-    pairs : int
-        Pairs of board placements.
-    distances : tuple of float
-        Of the board, metres.
-    step : float
-        Between the stops of a sweep, radians.
-    intrinsics_views : int
-        Images of the board held close, a camera.
-    room_sweep : tuple of float
-        First pitch, last pitch and step of the sweep of the room, radians; empty for none.
-    room_images : tuple of float
-        Pitch angles of the images of the room, radians.
-    quality : int
-        Of JPEG, 1 to 100.
-    """
+    """A recording to simulate; everything follows from it."""
 
     name: str
     seed: int
     rig: Rig
-    pairs: int
-    distances: tuple[float, float]
-    step: float = math.radians(0.25)
-    intrinsics_views: int = 20
+    pairs: int  # pairs of board placements
+    distances: tuple[float, float]  # of the board, metres
+    step: float = math.radians(0.25)  # between the stops of a sweep, radians
+    intrinsics_views: int = 20  # images of the board held close, a camera
+    # first pitch, last pitch and step of the sweep of the room, radians; empty for none
     room_sweep: tuple[float, ...] = ()
-    room_images: tuple[float, ...] = ()
-    quality: int = 95
+    room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
+    quality: int = 95  # of JPEG, 1 to 100
 
     def __post_init__(self):
         if not self.step > 0:
@@ -267,15 +202,13 @@ def load_setup(name):
     )
     beam, platform = LMS221.with_settings(**row["beam"]), Platform(**_radians(row["platform"]))
     rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
-    return Setup(name, rig=rig, **{k: tuple(row[k]) if isinstance(row[k], list) else row[k] for k in names})
+    return Setup(name, rig=rig, **{k: row[k] for k in names})
 
 
 def _radians(row):
-    """What ends in _deg in radians."""
-    turned = {k.removesuffix("_deg"): np.radians(v).tolist() for k, v in row.items() if k.endswith("_deg")}
-    return {k: v for k, v in row.items() if not k.endswith("_deg")} | {
-        k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()
-    }
+    """A row with what ends in _deg in radians, and no lists."""
+    turned = {k.removesuffix("_deg"): np.radians(v).tolist() if k.endswith("_deg") else v for k, v in row.items()}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()}
 
 
 SETUPS = {name: partial(load_setup, name) for name in _FILE}
@@ -284,23 +217,12 @@ sim_lms221, sim_quick = (SETUPS[name] for name in ("sim_lms221", "sim_quick"))
 
 @dataclass(frozen=True)
 class Placement:
-    """The board at one place, and what is recorded of it.
-
-    Attributes
-    ----------
-    number : int
-    T_platform_board : RigidTransform or None
-        None for a sweep of the room, with a laid table near the rig.
-    sweep : tuple of float
-        Pitch commands of the first and the last scan line, radians.
-    image_pitch : tuple of float
-        Pitch commands of the images in the order in which they are taken, radians.
-    """
+    """The board at one place, and what is recorded of it."""
 
     number: int
-    T_platform_board: RigidTransform | None
-    sweep: tuple[float, float]
-    image_pitch: tuple[float, ...]
+    T_platform_board: RigidTransform | None  # None for a sweep of the room, with a laid table near the rig
+    sweep: tuple[float, float]  # pitch commands of the first and the last scan line, radians
+    image_pitch: tuple[float, ...]  # pitch commands of the images in the order in which they are taken, radians
 
     @property
     def direction(self):
@@ -411,24 +333,9 @@ def _spans(rig, pose, margin):
 
 
 def held_close(rig, camera, count, rng):
-    """Poses ``T_camera_board`` of the board held in front of one camera, tilted every way.
+    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list of RigidTransform.
 
-    Parameters
-    ----------
-    rig : Rig
-    camera : RigCamera
-    count : int
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    list of RigidTransform
-        The whole pattern is inside the image; together they spread it over the image.
-
-    Raises
-    ------
-    ValueError
-        If the pattern does not fit into the image.
+    The whole pattern is inside the image, spread over all of it by the poses together; ValueError if it does not fit.
     """
     m, pattern, out = camera.model, rig.board.pattern, []
     if pattern is None and count:

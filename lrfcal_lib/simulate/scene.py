@@ -225,30 +225,14 @@ def chessboard(points, board, dark, light, ring=0.5):
 
 @dataclass(frozen=True)
 class Thing:
-    """A mesh with what its surface does with light.
+    """A mesh with what its surface does with light."""
 
-    Attributes
-    ----------
-    mesh : tuple of ndarray
-        Vertices (n, 3) in the thing's own frame, metres, and faces (m, 3).
-    texture : callable
-        Points in the thing's frame, shape (n, 3), to albedo, shape (n, 3).
-    pose : RigidTransform
-        ``T_platform_thing``.
-    infrared : float or None
-        Diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo.
-    dazzles : bool
-        The LRF is dazzled when its spot meets it (a lamp, the sun in a window).
-    glow : float
-        Light it gives off by itself, in units of full albedo.
-    """
-
-    mesh: tuple
-    texture: Callable
-    pose: RigidTransform = RigidTransform.identity()
-    infrared: float | None = None
-    dazzles: bool = False
-    glow: float = 0.0
+    mesh: tuple  # vertices (n, 3) in the thing's own frame, metres, and faces (m, 3)
+    texture: Callable  # points in the thing's frame, shape (n, 3), to albedo, shape (n, 3)
+    pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
+    infrared: float | None = None  # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
+    dazzles: bool = False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
+    glow: float = 0.0  # light it gives off by itself, in units of full albedo
 
 
 @dataclass(frozen=True)
@@ -400,33 +384,18 @@ def board_on_stand(board, T_platform_board, ring):
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a camera turns light into numbers.
+    """How a camera turns light into numbers."""
 
-    Attributes
-    ----------
-    gain : tuple of float
-        Least and greatest grey level of full white (albedo 1 at irradiance 1). The response is linear, as machine
-        vision cameras have it; automatic exposure puts the brightest 0.2 % of the image at `bright` within these
-        limits.
-    bright : float
-        Grey level.
-    blur_px : float
-        Standard deviation of the point spread of lens and sensor together, pixels.
-    read_noise, shot_noise : float
-        Variance in grey levels squared is ``read_noise^2 + shot_noise * level``.
-    vignetting : float
-        Loss of light in the corners of the image, a share.
-    samples : int
-        Rays across a pixel and down a pixel, where the pixel is not plain.
-    """
-
+    # least and greatest grey level of full white (albedo 1 at irradiance 1). The response is linear, as machine vision
+    # cameras have it; automatic exposure puts the brightest 0.2 % of the image at bright within these limits.
     gain: tuple[float, float] = (70.0, 300.0)
-    bright: float = 235.0
-    blur_px: float = 0.7
+    bright: float = 235.0  # grey level
+    blur_px: float = 0.7  # standard deviation of the point spread of lens and sensor together, pixels
+    # variance in grey levels squared is read_noise^2 + shot_noise * level
     read_noise: float = 0.8
     shot_noise: float = 0.008
-    vignetting: float = 0.15
-    samples: int = 3
+    vignetting: float = 0.15  # loss of light in the corners of the image, a share
+    samples: int = 3  # rays across a pixel and down a pixel, where the pixel is not plain
 
     def __post_init__(self):
         if not 0 < self.gain[0] <= self.gain[1]:
