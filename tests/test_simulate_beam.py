@@ -146,24 +146,6 @@ def test_a_moving_head_smears_a_fine_scan():
     assert middle[turns == 0].mean() - middle[turns == 3].mean() > 0.003
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"resolution": 25}, "no whole scans of 180 deg in steps of 0.25 deg; it can be set to 100/0.25"),
-        ({"field_of_view": 270}, "no whole scans of 270 deg"),
-        ({"sigma_range": -0.01}, "sigma_range is -0.01"),
-        ({"sigma_range": float("nan")}, "sigma_range is nan"),
-        ({"systematic": 0.05}, "beyond the maker's 0.035 m"),
-        ({"unit": 0.1}, "the unit is 0.001 or 0.01 m, got 0.1"),
-        ({"least_share": 1.5}, "least_share is 1.5"),
-        ({"rings": -1}, "-1 rings"),
-    ],
-)
-def test_impossible_settings(change, message):
-    with pytest.raises(ValueError, match=message):
-        LMS221.with_settings(**change)
-
-
 def test_a_100_deg_device_cannot_see_180():
     with pytest.raises(ValueError, match="LMS211-30206 has no whole scans of 180 deg"):
         LMS211.with_settings(field_of_view=180)

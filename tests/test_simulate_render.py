@@ -108,19 +108,6 @@ def test_a_camera_looks_out_of_the_window():
     assert np.isinf(hits.distance[0]) and world.radiance(np.zeros((1, 3)), up, hits).min() > 0.9
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"read_noise": -1.0}, "read_noise is -1.0: it cannot be negative"),
-        ({"gain": (0.0, 10.0)}, "two positive levels"),
-        ({"samples": 0}, "samples is 0"),
-    ],
-)
-def test_impossible_exposures(change, message):
-    with pytest.raises(ValueError, match=message):
-        Exposure(**change)
-
-
 def test_lenses_that_fold_and_odd_sizes():
     folded = CameraModel(512, 384, 200.0, 200.0, 255.0, 191.0, np.array([-0.9, 0.0, 0.0, 0.0, 0.0]))
     assert undistort([[0.0, 0.0]], folded).shape == (1, 2)

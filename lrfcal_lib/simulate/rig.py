@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.board import Board, Chessboard, triangle_board
 from lrfcal_lib.camera import CameraModel, project
+from lrfcal_lib.geometry import tilt
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scene import Exposure
 
@@ -135,8 +136,7 @@ class Rig:
         lift = np.arccos(np.clip(-(n[0] * x + h) / np.hypot(along, across), -1, 1))
         both = [np.angle(np.exp(1j * (turn + s * lift))) for s in (1, -1)]
         pitch = np.where(np.abs(both[0]) < np.abs(both[1]), *both)
-        c, s = np.cos(pitch), np.sin(pitch)
-        p_lrf = back.apply(np.stack([x, c * y + s * z, c * z - s * y], axis=1))
+        p_lrf = back.apply(tilt(p_platform, -pitch))
         return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
