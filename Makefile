@@ -57,7 +57,7 @@ data: setup
 	rm -rf $(addprefix data/,$(SIMULATED))
 	mv $(addprefix data/.new/,$(SIMULATED)) data
 	rmdir data/.new
-	$(RUN) -c "from lrfcal_lib.simulate.card import write_card; write_card('data', '$(SIMULATED)'.split())"
+	$(RUN) -c "from lrfcal_lib.simulate.record import write_card; write_card('data', '$(SIMULATED)'.split())"
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*

@@ -37,7 +37,7 @@ def _calibrate(args):
 
 def _simulate(args):
     from lrfcal_lib.simulate.record import simulate
-    from lrfcal_lib.simulate.setups import SETUPS
+    from lrfcal_lib.simulate.rig import SETUPS
 
     if args.setup not in SETUPS:
         raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
-from lrfcal_lib.simulate.observe import bench, board_poses, observe
+from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint_observations import JointObservations
 
 OFFSET = 0.005

@@ -11,7 +11,7 @@ from lrfcal_lib.candidates import board_grid, own_placements, visible
 from lrfcal_lib.forecast import candidate_information, measure_yield
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.residuals import range_residuals, view_residuals
-from lrfcal_lib.simulate.observe import bench, board_poses, observe
+from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_blocks import JointState
 from lrfcal_lib.solvers.joint_observations import JointObservations

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_case
 
 from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.solvers.bauermann import point_block, solve_bauermann
@@ -16,9 +16,7 @@ OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([
 
 
 def make(seed, noise=1.0, count=10):
-    rng = np.random.default_rng(seed)
-    rig = random_rig(rng)
-    return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig), noise=noise)
+    return camera_case(seed, count, noise=noise)
 
 
 def data(obs):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_case, camera_observations
 
 from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, starting_transform
@@ -25,12 +25,6 @@ from lrfcal_lib.solvers.start import start_from_lines, start_from_planes, start_
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 
 
-def make(seed=0, count=12, **options):
-    rng = np.random.default_rng(seed)
-    rig = random_rig(rng)
-    return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig), **options)
-
-
 def increment(found, truth):
     """Error as [w, v]."""
     turn = found.rotation * truth.rotation.inv()
@@ -45,7 +39,7 @@ def line_data(obs):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("given", [True, False])
 def test_every_method_recovers_exact_data(name, source, given):
-    rig, obs = make(1, source=source)
+    rig, obs = camera_case(1, source=source)
     found = METHODS[name].solve(obs, rig.T_camera_lrf * OFF if given else None)
     angle, distance = transform_difference(found.transform, rig.T_camera_lrf)
     assert angle < 1e-9 and distance < 1e-9
@@ -55,7 +49,7 @@ def test_every_method_recovers_exact_data(name, source, given):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_is_invariant_to_the_source_frame(name):
-    rig, obs = make(2, noise=1.0, source="platform")
+    rig, obs = camera_case(2, noise=1.0, source="platform")
     move = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 0.2, -0.7]))
     R = move.rotation.as_matrix()
     groups = {f"{g}_points": move.apply(getattr(obs, f"{g}_points")) for g in ("crossing", "plane", "scene")}
@@ -70,7 +64,7 @@ def test_every_method_is_invariant_to_the_source_frame(name):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_refuses_values_that_are_not_finite(name):
-    _, obs = make(3)
+    _, obs = camera_case(3)
     field = METHODS[name].uses + "_points"
     points = getattr(obs, field).copy()
     points[2, 1] = np.nan
@@ -80,7 +74,7 @@ def test_every_method_refuses_values_that_are_not_finite(name):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_refuses_one_placement_only(name):
-    _, obs = make(4)
+    _, obs = camera_case(4)
     one = obs.select([1])
     if METHODS[name].uses == "scene":
         one = replace(one, **{f: getattr(one, f)[:1] for f in vars(one) if f.startswith("scene_")})
@@ -92,7 +86,7 @@ def test_every_method_refuses_one_placement_only(name):
 def test_error_falls_with_more_placements_and_agrees_with_the_covariance(name):
     errors, scores = {}, []
     for count in (8, 32):
-        rig, obs = make(5, count)
+        rig, obs = camera_case(5, count)
         rng = np.random.default_rng(6)
         errors[count] = []
         for _ in range(25):
@@ -107,7 +101,7 @@ def test_error_falls_with_more_placements_and_agrees_with_the_covariance(name):
 
 
 def test_residuals_are_pixels_with_their_sign():
-    rig, obs = make(7)
+    rig, obs = camera_case(7)
     np.testing.assert_allclose(edge_residuals_px(obs, rig.T_camera_lrf), 0, atol=1e-9)
     np.testing.assert_allclose(plane_residuals_m(obs, rig.T_camera_lrf), 0, atol=1e-12)
     outside = replace(obs, crossing_lines=obs.crossing_lines + [0, 0, 2.5])
@@ -118,7 +112,7 @@ def test_residuals_are_pixels_with_their_sign():
 
 
 def test_lines_move_with_other_intrinsics():
-    rig, obs = make(8)
+    rig, obs = camera_case(8)
     other = rig.model.with_parameters(rig.model.parameters + [0, 0, 0, 0, 0.02, 0, 0, 0, 0])
     np.testing.assert_allclose(
         edge_residuals_px(obs, rig.T_camera_lrf, rig.model), edge_residuals_px(obs, rig.T_camera_lrf), atol=1e-6
@@ -127,7 +121,7 @@ def test_lines_move_with_other_intrinsics():
 
 
 def test_line_jacobian_against_a_numeric_one():
-    rig, obs = make(9, noise=1.0)
+    rig, obs = camera_case(9, noise=1.0)
     pose = pose_array(rig.T_camera_lrf * OFF)
     J = line_block(pose, *line_data(obs)).jacobian
     for k, step in enumerate(1e-6 * np.eye(6)):
@@ -136,7 +130,7 @@ def test_line_jacobian_against_a_numeric_one():
 
 
 def test_scipy_agrees():
-    rig, obs = make(10, noise=1.0)
+    rig, obs = camera_case(10, noise=1.0)
     start = pose_array(rig.T_camera_lrf)
     theirs = scipy.optimize.least_squares(
         lambda d: whiten(line_block(move_pose(start, d), *line_data(obs)), jacobian=False)[0],
@@ -150,7 +144,7 @@ def test_scipy_agrees():
 
 
 def test_batch_equals_single():
-    rig, obs = make(11, noise=1.0)
+    rig, obs = camera_case(11, noise=1.0)
     rng = np.random.default_rng(12)
     points = obs.crossing_points + rng.normal(0, 0.002, (4, *obs.crossing_points.shape)) * [1, 1, 0]
     rest = line_data(obs)[1:]
@@ -163,7 +157,7 @@ def test_batch_equals_single():
 
 
 def test_predicted_covariance_in_a_thousand_trials():
-    rig, obs = make(13, count=20)
+    rig, obs = camera_case(13, count=20)
     rng = np.random.default_rng(14)
     root = np.linalg.cholesky(obs.crossing_covariance + 1e-16 * np.eye(3))
     points = obs.crossing_points + (root @ rng.normal(size=(1000, *obs.crossing_points.shape, 1)))[..., 0]
@@ -180,7 +174,7 @@ def test_predicted_covariance_in_a_thousand_trials():
 
 
 def test_robust_loss_resists_wrong_edges():
-    rig, obs = make(15, count=20, noise=1.0)
+    rig, obs = camera_case(15, count=20, noise=1.0)
     lines = obs.crossing_lines.copy()
     lines[::10, 2] += 60.0
     spoiled = replace(obs, crossing_lines=lines)
@@ -190,7 +184,7 @@ def test_robust_loss_resists_wrong_edges():
 
 
 def test_unweighted_lines_are_plain_least_squares():
-    rig, obs = make(16, noise=1.0)
+    rig, obs = camera_case(16, noise=1.0)
     start = pose_array(rig.T_camera_lrf)
     theirs = scipy.optimize.least_squares(
         lambda d: line_block(move_pose(start, d), *line_data(obs)).residuals, np.zeros(6), xtol=1e-15, ftol=1e-15
@@ -202,13 +196,13 @@ def test_unweighted_lines_are_plain_least_squares():
 @pytest.mark.parametrize("start", [start_from_planes, start_from_lines, start_from_scene])
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 def test_starts_without_a_guess(start, source):
-    rig, obs = make(17, count=15, noise=1.0, source=source)
+    rig, obs = camera_case(17, count=15, noise=1.0, source=source)
     angle, distance = transform_difference(start(obs), rig.T_camera_lrf)
     assert angle < 0.05 and distance < 0.1
 
 
 def test_lines_alone_are_enough_to_start():
-    rig, obs = make(18, count=15)
+    rig, obs = camera_case(18, count=15)
     bare = replace(obs, **{f: getattr(obs, f)[:0] for f in vars(obs) if f.startswith(("plane_", "scene_"))})
     bare = replace(
         bare, **{f: getattr(obs, f)[:0] for f in ("placements", "board_poses", "board_covariance", "pattern_pixels")}
@@ -218,13 +212,13 @@ def test_lines_alone_are_enough_to_start():
 
 
 def test_nothing_to_start_from():
-    _, obs = make(19)
+    _, obs = camera_case(19)
     with pytest.raises(DegenerateGeometry, match="no start value.*planes:.*lines:.*scene:"):
         starting_transform(obs.select([]))
 
 
 def test_parallel_edges_leave_a_motion_open():
-    rig, obs = make(20, count=6)
+    rig, obs = camera_case(20, count=6)
     line = np.array([1.0, 0.0, -rig.model.cx])
     lines = np.repeat(line[None], len(obs.crossing_lines), axis=0)
     points = rig.T_camera_lrf.inv().apply(
@@ -237,7 +231,7 @@ def test_parallel_edges_leave_a_motion_open():
 
 
 def test_a_product_of_distances_vanishes_when_one_edge_fits():
-    rig, obs = make(21)
+    rig, obs = camera_case(21)
     lines = obs.crossing_lines.copy()
     for placement in np.unique(obs.crossing_placement):
         rows = np.flatnonzero(obs.crossing_placement == placement)
@@ -248,7 +242,7 @@ def test_a_product_of_distances_vanishes_when_one_edge_fits():
 
 
 def test_readings_need_pairs_of_edges():
-    rig, obs = make(22)
+    rig, obs = camera_case(22)
     single = replace(obs, crossing_edge=np.full(len(obs.crossing_edge), "left"))
     with pytest.raises(ValueError, match="crossings on two edges"):
         cost_readings(single, rig.T_camera_lrf, np.ones(6), [0.0])
@@ -256,7 +250,7 @@ def test_readings_need_pairs_of_edges():
 
 @pytest.mark.parametrize("kind", ["planes", "lines"])
 def test_outlying_placements_are_found_untold(kind):
-    rig, obs = make(23, count=16, noise=1.0, source="platform")
+    rig, obs = camera_case(23, count=16, noise=1.0, source="platform")
     shift = np.where(np.isin(obs.placements, (4, 9)), 0.08, 0.0)
     poses = obs.board_poses.copy()
     poses[:, :3, 3] += shift[:, None] * poses[:, :3, 2]
@@ -268,7 +262,7 @@ def test_outlying_placements_are_found_untold(kind):
 
 
 def test_good_placements_are_left_alone():
-    _, obs = make(24, count=16, noise=1.0, source="platform")
+    _, obs = camera_case(24, count=16, noise=1.0, source="platform")
     assert find_outlying_placements(obs, "planes").outlying == ()
     with pytest.raises(ValueError, match="unknown kind 'edges'"):
         find_outlying_placements(obs, "edges")

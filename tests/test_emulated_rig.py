@@ -24,9 +24,8 @@ from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.simulate import beam as lrf
-from lrfcal_lib.simulate.placements import Placement
-from lrfcal_lib.simulate.record import placements_of, world_of
-from lrfcal_lib.simulate.setups import sim_quick
+from lrfcal_lib.simulate.record import world_of
+from lrfcal_lib.simulate.rig import Placement, placements_of, sim_quick
 
 DEADLINE = 180.0  # s, against hanging
 QUARTERS = np.arange(160, 561)

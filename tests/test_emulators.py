@@ -16,7 +16,7 @@ from lrfcal_lib.drivers.emulators.motion import REACT_S
 from lrfcal_lib.drivers.emulators.pelco_d import tilt_elevation, tilt_raw
 from lrfcal_lib.drivers.lms2xx import decode_scan, encode_telegram, parse_telegram, split_stream
 from lrfcal_lib.drivers.lms2xx_replies import Configuration, parse_configuration, parse_status
-from lrfcal_lib.simulate.platform import Platform
+from lrfcal_lib.simulate.rig import Platform
 
 DEADLINE = 60.0  # s, against hanging; nothing is timed by it
 ZEROS = "00 " * 21

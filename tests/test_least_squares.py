@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_case
 
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.camera import line_block, solve_lines_batch
@@ -243,9 +243,7 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
 
 
 def test_a_thousand_trials_take_less_than_half_a_second():
-    rng = np.random.default_rng(8)
-    rig = random_rig(rng)
-    obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig))
+    rng, (rig, obs) = np.random.default_rng(8), camera_case(8, 20)
     points = obs.crossing_points[None] + rng.normal(0, 0.003, (1000, *obs.crossing_points.shape))
     arguments = (obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model, rig.T_camera_lrf)
     assert points.shape[1] >= 36
@@ -284,9 +282,7 @@ def test_motions_in_words(delta, words):
 
 
 def test_corrected_jacobian_is_the_derivative_of_whitened_residuals():
-    rng = np.random.default_rng(10)
-    rig = random_rig(rng)
-    obs = camera_observations(rng, rig, random_board_poses(rng, 6, rig), noise=1.0)
+    rig, obs = camera_case(10, 6, noise=1.0)
     pose = pose_array(rig.T_camera_lrf)
     data = (obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
     _, J = whiten(line_block(pose, *data))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_case
 
 from lrfcal_lib.evaluate.shots import crossings, shots_table, solve_shots, start_near
 from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
@@ -24,12 +24,6 @@ from lrfcal_lib.solvers.pose import pose_array
 FULL = ("points", "covariance", "half_step", "noise", "radius", "background", "lines", "line_sigma")
 BIASES = (-0.5, -0.25, 0.0, 0.25, 0.5)
 TRIALS = 20  # of each bias: 100 for either beam spacing
-
-
-def make(seed=0, count=12, **options):
-    rng = np.random.default_rng(seed)
-    rig = random_rig(rng)
-    return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig), **options)
 
 
 @pytest.fixture(scope="module", params=[0.25, 0.5])
@@ -70,7 +64,7 @@ def test_the_bias_is_found_and_its_uncertainty_is_not_played_down(tables):
 
 
 def test_score_is_the_derivative_of_the_cost():
-    rig, obs = make(3, noise=1.0)
+    rig, obs = camera_case(3, noise=1.0)
     own = (obs.crossing_half_step, obs.crossing_noise, obs.crossing_radius, obs.crossing_background)
     intervals = _Intervals(obs.crossing_points, *own, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
     state = np.concatenate([pose_array(rig.T_camera_lrf), [[0.4], [-1.0], [0.0]]], axis=1)
@@ -89,7 +83,7 @@ def test_batch_equals_single():
     T0 = start_near(shots, np.random.default_rng(6))
     found = crossings(shots, setup)
     batch = solve_line_ml_batch(*(found[k] for k in FULL), setup.model, T0, groups=found["groups"])
-    _, obs = make()
+    _, obs = camera_case(0)
     names = {k: f"crossing_{k}" for k in FULL}
     other = {"crossing_placement": found["groups"], "model": setup.model}
     for i in range(3):
@@ -113,13 +107,13 @@ def test_the_start_does_not_matter():
 
 
 def test_without_a_start_value():
-    rig, obs = make(9, noise=1.0)
+    rig, obs = camera_case(9, noise=1.0)
     angle, distance = transform_difference(solve_line_ml(obs).transform, solve_line_ml(obs, rig.T_camera_lrf).transform)
     assert angle < 1e-7 and distance < 1e-7
 
 
 def test_bias_in_metres_follows_the_radius():
-    _, obs = make(10, noise=1.0)
+    _, obs = camera_case(10, noise=1.0)
     found = solve_line_ml(obs)
     shift, sigma = edge_bias(found, 0.02)
     assert (shift, sigma) == pytest.approx(tuple(0.02 * v for v in edge_bias(found)))
@@ -127,7 +121,7 @@ def test_bias_in_metres_follows_the_radius():
 
 
 def test_too_few_crossings_are_refused():
-    _, obs = make(11)
+    _, obs = camera_case(11)
     few = replace(obs, **{f: getattr(obs, f)[:6] for f in vars(obs) if f.startswith("crossing_")})
     with pytest.raises(DegenerateGeometry, match="at least 7 needed"):
         solve_line_ml(few)

@@ -9,7 +9,7 @@ from lrfcal_lib.drivers.emulators import EmulatedHead, Head
 from lrfcal_lib.drivers.emulators.faults import FAULTS
 from lrfcal_lib.drivers.errors import DeviceError
 from lrfcal_lib.drivers.pan_tilt import HeadSettings, PanTilt
-from lrfcal_lib.simulate.platform import Platform
+from lrfcal_lib.simulate.rig import Platform
 
 DEGREE = math.radians(1)
 QUICK = HeadSettings(baudrate=38400, settle_s=0.08, stall_s=0.2, poll_s=0.02, reply_s=0.1, gap_s=0.01, reconnect_s=3.0)

@@ -18,8 +18,7 @@ from lrfcal_lib.pairing import observe_all
 from lrfcal_lib.pipeline import calibrate_cameras, calibrate_platform, prepare
 from lrfcal_lib.session import model_to_json, open_session, validate
 from lrfcal_lib.simulate import record as simulated
-from lrfcal_lib.simulate.placements import pairs
-from lrfcal_lib.simulate.setups import sim_quick
+from lrfcal_lib.simulate.rig import PLACES, pairs, random, sim_quick
 
 METHOD = "line"
 STEP = np.radians(1.25)
@@ -31,7 +30,7 @@ def small_setup():
     rig = emulated_camera.scaled(sim_quick().rig, 480)
     setup = replace(sim_quick(), rig=replace(rig, cameras=rig.cameras[:1]), pairs=3, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
-    found = pairs(setup.rig, setup.pairs, setup.distances, simulated.random(setup, simulated.PLACES), np.radians(1.0))
+    found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0))
     return setup, [replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found]
 
 

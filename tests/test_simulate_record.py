@@ -16,10 +16,10 @@ from lrfcal_lib.__main__ import main
 from lrfcal_lib.board import triangle_board
 from lrfcal_lib.geometry import lrf_to_platform
 from lrfcal_lib.session import open_session, transform_from_json, validate
-from lrfcal_lib.simulate import card, record
-from lrfcal_lib.simulate.placements import check_size, held_close, pairs
-from lrfcal_lib.simulate.platform import Platform, step_angles
-from lrfcal_lib.simulate.setups import SETUPS, sim_lms221, sim_quick
+from lrfcal_lib.simulate import record
+from lrfcal_lib.simulate.beam import LMS221
+from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
+from lrfcal_lib.simulate.scene import Exposure
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 QUICK = DATA / "sim_quick"
@@ -75,26 +75,10 @@ def test_the_measured_pitch_of_a_moving_head_lags():
 
 
 def test_stops_are_multiples_of_the_step():
-    np.testing.assert_allclose(step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
-    np.testing.assert_allclose(step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
+    np.testing.assert_allclose(record.step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(record.step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
     with pytest.raises(ValueError, match="a pitch step must be positive, got 0.0"):
-        step_angles(0, 1, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"noise": -1e-4}, "platform: noise is -0.0001"),
-        ({"backlash": float("inf")}, "backlash is inf"),
-        ({"speed": 0.0}, "speed is 0.0"),
-        ({"stretch": 2.0}, "stretch is 2.0"),
-    ],
-)
-def test_impossible_platforms(change, message):
-    with pytest.raises(ValueError, match=message):
-        Platform(**change)
-    with pytest.raises(ValueError, match="pitch -10.0 to 80.0 deg is asked for"):
-        Platform().stop(np.radians([-10, 80]), 1, np.random.default_rng(0))
+        record.step_angles(0, 1, 0.0)
 
 
 def test_the_scan_plane_meets_a_point_at_the_sweep_pitch(setup):
@@ -171,13 +155,13 @@ def test_a_sweep_and_an_image_are_rebuilt(setup, session):
 
 @pytest.mark.parametrize("name", SETUPS)
 def test_the_data_card_has_the_sums_of_all_files(name):
-    lines = [line for line in (DATA / card.SUMS).read_text().splitlines() if f"  {name}/" in line]
+    lines = [line for line in (DATA / record.SUMS).read_text().splitlines() if f"  {name}/" in line]
     files = [f for f in (DATA / name).rglob("*") if f.is_file()]
     assert len(lines) == len(files)
     for line in lines:
         value, file = line.split("  ")
         assert hashlib.sha256((DATA / file).read_bytes()).hexdigest() == value
-    assert hashlib.sha256((DATA / card.SUMS).read_bytes()).hexdigest() in (DATA / "README.md").read_text()
+    assert hashlib.sha256((DATA / record.SUMS).read_bytes()).hexdigest() in (DATA / "README.md").read_text()
 
 
 def test_sizes():
@@ -188,7 +172,7 @@ def test_sizes():
 def test_a_card_needs_its_marks(tmp_path):
     (tmp_path / "README.md").write_text("nothing")
     with pytest.raises(ValueError, match="marks"):
-        card.write_card(tmp_path, [])
+        record.write_card(tmp_path, [])
 
 
 def test_simulate_writes_a_session(tmp_path, tiny):
@@ -229,21 +213,58 @@ def test_a_board_larger_than_the_view(tmp_path, tiny):
         check_size(replace(tiny.rig, board=triangle_board(0.9, 1.0)), 1.3)
 
 
-def test_impossible_setups(tiny):
-    for change, message in (
-        ({"step": 0.0}, "the pitch step is 0.0"),
-        ({"quality": 0}, "JPEG quality is 1 to 100, got 0"),
-        ({"intrinsics_views": -1}, "-1 intrinsics views"),
-        ({"room_sweep": (0.0, 1.0)}, "room_sweep is"),
+FULL = sim_quick()
+
+
+@pytest.mark.parametrize(
+    ("given", "change", "message"),
+    [
+        (LMS221, {"resolution": 25}, "no whole scans of 180 deg in steps of 0.25 deg; it can be set to 100/0.25"),
+        (LMS221, {"field_of_view": 270}, "no whole scans of 270 deg"),
+        (LMS221, {"sigma_range": -0.01}, "sigma_range is -0.01"),
+        (LMS221, {"sigma_range": float("nan")}, "sigma_range is nan"),
+        (LMS221, {"systematic": 0.05}, "beyond the maker's 0.035 m"),
+        (LMS221, {"unit": 0.1}, "the unit is 0.001 or 0.01 m, got 0.1"),
+        (LMS221, {"least_share": 1.5}, "least_share is 1.5"),
+        (LMS221, {"rings": -1}, "-1 rings"),
+        (Exposure(), {"read_noise": -1.0}, "read_noise is -1.0: it cannot be negative"),
+        (Exposure(), {"gain": (0.0, 10.0)}, "two positive levels"),
+        (Exposure(), {"samples": 0}, "samples is 0"),
+        (Platform(), {"noise": -1e-4}, "platform: noise is -0.0001"),
+        (Platform(), {"backlash": float("inf")}, "backlash is inf"),
+        (Platform(), {"speed": 0.0}, "speed is 0.0"),
+        (Platform(), {"stretch": 2.0}, "stretch is 2.0"),
+        (FULL, {"step": 0.0}, "the pitch step is 0.0"),
+        (FULL, {"quality": 0}, "JPEG quality is 1 to 100, got 0"),
+        (FULL, {"intrinsics_views": -1}, "-1 intrinsics views"),
+        (FULL, {"room_sweep": (0.0, 1.0)}, "room_sweep is"),
+        (FULL.rig.cameras[0], {"mount": "roof"}, "mount is one of head, platform, got 'roof'"),
+    ],
+)
+def test_impossible_settings(given, change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(given, **change)
+
+
+def test_what_cannot_be_recorded(tiny):
+    rng = np.random.default_rng(0)
+    for refused, message in (
+        (lambda: Platform().stop(np.radians([-10, 80]), 1, rng), "pitch -10.0 to 80.0 deg is asked for"),
+        (lambda: pairs(tiny.rig, 0, (1.0, 2.0), rng), "0 pairs"),
+        (lambda: held_close(replace(tiny.rig, board=triangle_board()), tiny.rig.cameras[0], 3, rng), "has no pattern"),
     ):
         with pytest.raises(ValueError, match=message):
-            replace(tiny, **change)
-    with pytest.raises(ValueError, match="0 pairs"):
-        pairs(tiny.rig, 0, (1.0, 2.0), np.random.default_rng(0))
-    with pytest.raises(ValueError, match="has no pattern"):
-        held_close(replace(tiny.rig, board=triangle_board()), tiny.rig.cameras[0], 3, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="mount is one of head, platform, got 'roof'"):
-        replace(tiny.rig.cameras[0], mount="roof")
+            refused()
+
+
+def test_a_set_up_takes_over_what_it_does_not_say():
+    quick, full = sim_quick(), sim_lms221()
+    assert quick.rig.beam == full.rig.beam and quick.rig.platform == full.rig.platform and quick.step == full.step
+    assert (quick.pairs, full.pairs, quick.quality, full.quality) == (2, 12, 90, 95)
+    for small, large in zip(quick.rig.cameras, full.rig.cameras, strict=True):
+        assert (small.model.width, small.model.height, large.model.width) == (640, 480, 1024)
+        assert small.model.fx / small.model.width == pytest.approx(large.model.fx / large.model.width)
+        np.testing.assert_array_equal(small.guess.as_matrix(), large.guess.as_matrix())
 
 
 def test_cameras_on_the_base_do_not_turn(tiny):

@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.camera import project
 from lrfcal_lib.geometry import lrf_to_platform, lrf_to_source, polar_to_points
-from lrfcal_lib.simulate.observe import bench, board_poses, observe
+from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_observations import JointObservations
 from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, random_board_poses, random_rig
+from synthetic import camera_case
 
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.camera import edge_residuals_px, solve_lines
@@ -20,9 +20,7 @@ OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([
 
 @pytest.fixture
 def noisy():
-    rng = np.random.default_rng(1)
-    rig = random_rig(rng)
-    return rig, camera_observations(rng, rig, random_board_poses(rng, 15, rig), noise=1.0)
+    return camera_case(1, 15, noise=1.0)
 
 
 def test_distance_is_the_pixel_distance_scaled_by_depth(noisy):

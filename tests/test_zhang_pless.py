@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_observations, near_lines, random_board_poses, random_rig
+from synthetic import camera_case, camera_observations, near_lines, random_board_poses, random_rig
 
 from lrfcal_lib.camera import project
 from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
@@ -33,15 +33,9 @@ from lrfcal_lib.solvers.zhang_pless import (
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 
 
-def make(seed=0, count=12, spread=0.6, **options):
-    rng = np.random.default_rng(seed)
-    rig = random_rig(rng)
-    return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig, spread), **options)
-
-
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 def test_closed_form_is_exact_on_exact_data(source):
-    rig, obs = make(1, source=source)
+    rig, obs = camera_case(1, source=source)
     sets = plane_sets(obs)
     triangles = compress(sets, 1.0)
     assert common_plane(triangles)[1] == (source == "lrf")
@@ -52,13 +46,13 @@ def test_closed_form_is_exact_on_exact_data(source):
 
 @pytest.mark.parametrize("count", [3, 4])
 def test_single_scan_lines_on_few_boards(count):
-    rig, obs = make(2, count)
+    rig, obs = camera_case(2, count)
     found = solve_zhang_pless(obs)
     assert np.abs(plane_residuals_m(obs, found.transform)).max() < 1e-9
 
 
 def test_compression_keeps_every_sum_of_squares():
-    rig, obs = make(3, noise=1.0, source="platform")
+    rig, obs = camera_case(3, noise=1.0, source="platform")
     sets, rng = plane_sets(obs), np.random.default_rng(4)
     triangles = compress(sets, 1.0)
     for _ in range(5):
@@ -70,7 +64,7 @@ def test_compression_keeps_every_sum_of_squares():
 
 
 def test_plane_jacobians_against_numeric_ones():
-    rig, obs = make(5, noise=1.0)
+    rig, obs = camera_case(5, noise=1.0)
     sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
     triangles = compress(sets, 100.0)
     _, by_pose, by_board = plane_terms(pose, triangles, sets.boards)
@@ -85,7 +79,7 @@ def test_plane_jacobians_against_numeric_ones():
 
 def test_correlated_weighting_equals_the_full_covariance():
     """Chi-square from four numbers a placement is that of all points with the board error common to them."""
-    rig, obs = make(6, noise=1.0)
+    rig, obs = camera_case(6, noise=1.0)
     sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf)
     triangles, offset, rest = correct_and_compress(sets, pose)
     whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
@@ -103,7 +97,7 @@ def test_correlated_weighting_equals_the_full_covariance():
 
 
 def test_plain_least_squares_agrees_with_scipy():
-    rig, obs = make(7, noise=1.0, source="platform")
+    rig, obs = camera_case(7, noise=1.0, source="platform")
     start = pose_array(rig.T_camera_lrf)
     theirs = scipy.optimize.least_squares(
         lambda d: plane_residuals_m(obs, pose_transform(move_pose(start, d))),
@@ -118,7 +112,7 @@ def test_plain_least_squares_agrees_with_scipy():
 
 
 def test_batch_equals_single():
-    rig, obs = make(8, noise=1.0)
+    rig, obs = camera_case(8, noise=1.0)
     sets = plane_sets(obs)
     rng = np.random.default_rng(9)
     noise = rng.normal(0, 0.002, (3, *obs.plane_points.shape)) * [1, 1, 0]
@@ -131,7 +125,7 @@ def test_batch_equals_single():
 
 
 def test_predicted_covariance_in_many_trials():
-    rig, obs = make(10, count=20, source="platform")
+    rig, obs = camera_case(10, count=20, source="platform")
     rng, sets = np.random.default_rng(11), plane_sets(obs)
     trials = 300
     root = np.linalg.cholesky(sets.covariance)
@@ -147,7 +141,7 @@ def test_predicted_covariance_in_many_trials():
 
 
 def test_robust_loss_resists_bad_board_poses():
-    rig, obs = make(12, count=16, noise=1.0)
+    rig, obs = camera_case(12, count=16, noise=1.0)
     poses = obs.board_poses.copy()
     poses[[2, 7], :3, 3] += 0.15 * poses[[2, 7], :3, 2]
     spoiled = replace(obs, board_poses=poses)
@@ -158,7 +152,7 @@ def test_robust_loss_resists_bad_board_poses():
 
 
 def test_joint_refinement_repairs_the_intrinsics():
-    rig, obs = make(13, count=25, noise=0.3, sigma_px=0.05)
+    rig, obs = camera_case(13, count=25, noise=0.3, sigma_px=0.05)
     wrong = rig.model.with_parameters(rig.model.parameters + [8, -6, 5, -4, 0.02, -0.02, 0, 0, 0])
     found = solve_zhang_pless_joint(replace(obs, model=wrong))
     assert found.converged and found.names[6:8] == ("fx", "fy")
@@ -169,7 +163,7 @@ def test_joint_refinement_repairs_the_intrinsics():
 
 
 def test_joint_solution_agrees_with_scipy():
-    rig, obs = make(14, count=4, noise=1.0, source="platform")
+    rig, obs = camera_case(14, count=4, noise=1.0, source="platform")
     ours = solve_zhang_pless_joint(obs, sigma_plane=0.0)
     sets = plane_sets(obs)
     triangles, offset, _ = correct_and_compress(sets, pose_array(solve_zhang_pless(obs).transform))
@@ -188,7 +182,7 @@ def test_joint_solution_agrees_with_scipy():
 
 
 def test_joint_refinement_skips_corners_that_were_not_seen():
-    rig, obs = make(15)
+    rig, obs = camera_case(15)
     pixels = obs.pattern_pixels.copy()
     pixels[::3, ::4] = np.nan
     found = solve_zhang_pless_joint(replace(obs, pattern_pixels=pixels))
@@ -197,7 +191,7 @@ def test_joint_refinement_skips_corners_that_were_not_seen():
 
 def test_joint_refinement_bears_errors_common_to_a_placement():
     """Boards that bend by some millimetres must not bend the intrinsics."""
-    rig, obs = make(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
+    rig, obs = camera_case(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
     rng = np.random.default_rng(21)
     shift = rng.normal(0, 0.008, 21)[obs.plane_placement]
     along = obs.plane_points / np.linalg.norm(obs.plane_points, axis=1, keepdims=True)
@@ -213,7 +207,7 @@ def test_joint_refinement_bears_errors_common_to_a_placement():
 
 
 def test_joint_refinement_needs_a_pattern():
-    _, obs = make(16, pattern=False)
+    _, obs = camera_case(16, pattern=False)
     with pytest.raises(ValueError, match="0 pattern corners"):
         solve_zhang_pless_joint(obs)
 
@@ -221,7 +215,7 @@ def test_joint_refinement_needs_a_pattern():
 @pytest.mark.parametrize("solve", [solve_zhang_pless, solve_zhang_pless_joint])
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 def test_parallel_boards_are_refused(solve, source):
-    rig, obs = make(17, spread=1e-4, source=source)
+    rig, obs = camera_case(17, spread=1e-4, source=source)
     with pytest.raises(DegenerateGeometry, match="all 12 boards are parallel: the rotation about their normal"):
         solve(obs, rig.T_camera_lrf)
 
@@ -240,7 +234,7 @@ def test_boards_turned_about_one_axis_are_refused():
 
 
 def test_too_few_placements_are_refused():
-    _, obs = make(19)
+    _, obs = camera_case(19)
     with pytest.raises(DegenerateGeometry, match="2 placements with a board pose"):
         solve_zhang_pless(obs.select([1, 2]))
 
@@ -259,7 +253,7 @@ def test_single_lines_near_by_are_no_sweeps(seed):
 
 def test_lines_in_another_common_plane_of_the_source():
     """Single shots of a head that was pitched and shifted, in the frame of its base."""
-    rig, obs = make(22)
+    rig, obs = camera_case(22)
     moved = replace(obs, plane_points=OFF.apply(obs.plane_points))
     found = solve_zhang_pless(moved)
     assert transform_difference(found.transform * OFF, rig.T_camera_lrf)[1] < 1e-9
@@ -267,7 +261,7 @@ def test_lines_in_another_common_plane_of_the_source():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_weights_never_hold_a_bad_start(seed):
-    rig, obs = make(seed, noise=1.0)
+    rig, obs = camera_case(seed, noise=1.0)
     rng = np.random.default_rng(seed)
     bad = RigidTransform.from_components(rng.normal(0, 0.3, 3), Rotation.from_rotvec(rng.normal(0, 0.6, 3)))
     weighted, plain = (solve_zhang_pless(obs, rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False))
@@ -277,7 +271,7 @@ def test_weights_never_hold_a_bad_start(seed):
 
 @pytest.mark.parametrize(("count", "spread"), [(12, 1e-4), (2, 0.6)])
 def test_what_is_not_required_needs_no_start_value(count, spread):
-    _, obs = make(17, spread=spread, source="platform")
+    _, obs = camera_case(17, spread=spread, source="platform")
     few = obs.select(range(1, count + 1))
     found = solve_zhang_pless(few, required=False)
     assert found.unobservable and np.abs(plane_residuals_m(few, found.transform)).max() < 1e-3

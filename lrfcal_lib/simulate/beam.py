@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,62 +18,34 @@ RAYS_AT_ONCE = 1 << 19
 
 @dataclass(frozen=True)
 class Beam:
-    """Settings of a laser range finder.
-
-    Attributes
-    ----------
-    name : str
-    angles : tuple of int
-        Fields of view that the device can be set to, degrees (technical description, chapter 12).
-    spot_exit : float
-        Diameter of the spot at the window, metres (technical description).
-    divergence : float
-        Growth of the diameter with distance, radians (technical description).
-    sigma_range : float
-        Statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200).
-    systematic : float
-        Constant error of this one device, metres.
-    systematic_bound : tuple of (float, float)
-        Largest systematic error that the maker admits, by unit, metres.
-    field_of_view, resolution : int
-        Variant in degrees and 1/100 degree, as telegram 0x3B sets them.
-    unit : float
-        Metres a count: 0.001 or 0.01.
-    pulse : float
-        Surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m).
-    least_energy : float
-        Weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there.
-    least_share : float
-        An echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the
-        strongest echo; the maker states nothing. It widens what stands before a brighter background.
-    rings : int
-        Of sub-rays over the spot, 1 + 3 rings (rings + 1) of them.
-
-    Raises
-    ------
-    ValueError
-        For settings that the device does not have.
-    """
+    """Settings of a laser range finder; ValueError for those that the device does not have."""
 
     name: str
-    angles: tuple[int, ...]
+    angles: tuple[int, ...]  # fields of view that the device can be set to, degrees (technical description, chapter 12)
+    # diameter of the spot at the window, metres, and its growth with distance, radians (technical description)
     spot_exit: float
     divergence: float
-    sigma_range: float
-    systematic: float
-    systematic_bound: tuple[tuple[float, float], ...]
+    sigma_range: float  # statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200)
+    systematic: float  # constant error of this one device, metres
+    systematic_bound: tuple[tuple[float, float], ...]  # largest systematic error that the maker admits, by unit, metres
+    # variant in degrees and 1/100 degree, as telegram 0x3B sets them
     field_of_view: int
     resolution: int
-    unit: float = 0.001
+    unit: float = 0.001  # metres a count: 0.001 or 0.01
+    # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m)
     pulse: float = 1.0
+    # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there
     least_energy: float = 0.1 / 30.0**2
+    # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the strongest
+    # echo; the maker states nothing. It widens what stands before a brighter background.
     least_share: float = 0.25
-    rings: int = 4
+    rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
-        variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
         if self.field_of_view not in self.angles or (self.field_of_view, self.resolution) not in WHOLE_SCANS:
-            raise ValueError(f"{self.name} has no whole scans of {variant}; it can be set to {self._variants()}")
+            variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
+            known = ", ".join(f"{a}/{step / 100:g}" for a, step in sorted(WHOLE_SCANS) if a in self.angles)
+            raise ValueError(f"{self.name} has no whole scans of {variant}; it can be set to {known}")
         for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{self.name}: {name} is {getattr(self, name)}, it must be zero or positive")
@@ -87,10 +59,6 @@ class Beam:
         if self.rings < 0:
             raise ValueError(f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
 
-    def _variants(self):
-        fits = sorted(v for v in WHOLE_SCANS if v[0] in self.angles)
-        return ", ".join(f"{angle}/{step / 100:g}" for angle, step in fits)
-
     @property
     def rays(self):
         """Sub-rays of one spot."""
@@ -103,21 +71,17 @@ class Beam:
 
     def bearings(self):
         """Bearings of a whole scan, shape (B,), radians; 0 right, pi/2 ahead (40 to 140 deg for 100 deg variants)."""
-        first = 90 - self.field_of_view / 2
         count = self.field_of_view * 100 // self.resolution + 1
-        return np.radians(first + np.arange(count) * self.resolution / 100)
+        return np.radians(90 - self.field_of_view / 2 + np.arange(count) * self.resolution / 100)
 
     def beam_times(self):
         """Time of every beam after the scan began, shape (B,), seconds.
 
-        Notes
-        -----
         The mirror always turns in steps of 1 deg; turn k starts k times the resolution later, so neighbours of a fine
         scan are one turn apart in time (telegram listing, 7.5).
         """
         bearings = self.bearings()
-        turn = np.arange(len(bearings)) % self.turns
-        return turn * MIRROR_TURN + bearings / (2 * np.pi) * MIRROR_TURN
+        return np.arange(len(bearings)) % self.turns * MIRROR_TURN + bearings / (2 * np.pi) * MIRROR_TURN
 
     def spot(self, distance):
         """Diameter of the spot, metres."""
@@ -125,17 +89,13 @@ class Beam:
 
     def with_settings(self, **changes):
         """The same device set otherwise."""
-        return Beam(**{**self.__dict__, **changes})
+        return replace(self, **changes)
 
 
 _OUTDOOR = {
-    "spot_exit": 0.016,
-    "divergence": 0.0119,
-    "sigma_range": 0.010,
-    "systematic": 0.0,
-    "systematic_bound": ((0.001, 0.035), (0.01, 0.05)),
-    "resolution": 50,
-}
+    "spot_exit": 0.016, "divergence": 0.0119, "sigma_range": 0.010, "systematic": 0.0,
+    "systematic_bound": ((0.001, 0.035), (0.01, 0.05)), "resolution": 50,
+}  # fmt: skip
 LMS211 = Beam("LMS211-30206", (100,), field_of_view=100, **_OUTDOOR)
 LMS221 = Beam("LMS221-30206", (100, 180), field_of_view=180, **_OUTDOOR)
 _INDOOR = {"systematic_bound": ((0.001, 0.015), (0.01, 0.04)), "least_energy": 0.1 / 10.0**2}
@@ -144,31 +104,16 @@ LMS200 = Beam("LMS200-30106", (100, 180), 0.012, 0.0044, 0.005, 0.0, field_of_vi
 
 @dataclass(frozen=True)
 class Scan:
-    """Scan lines as the device sends them.
-
-    Attributes
-    ----------
-    words : ndarray of uint16, shape (L, B)
-        13-bit values in the device's unit, codes included.
-    ranges : ndarray, shape (L, B)
-        Metres; NaN for codes.
-    """
+    """Scan lines as the device sends them: 13-bit words, shape (L, B), and ranges in metres, NaN for codes."""
 
     words: np.ndarray
     ranges: np.ndarray
 
 
 def spot_pattern(rings):
-    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on the k-th ring.
+    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on the k-th ring, shape (K, 2).
 
-    Parameters
-    ----------
-    rings : int
-
-    Returns
-    -------
-    ndarray, shape (1 + 3 rings (rings + 1), 2)
-        Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those of the disc.
+    Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those of the disc.
     """
     count = np.r_[1, 6 * np.arange(1, rings + 1)]
     inside = np.cumsum(count)
@@ -178,55 +123,9 @@ def spot_pattern(rings):
     return np.repeat(radius, count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-def sub_rays(beam, bearings, pitch, T_head_lrf):
-    """Rays that fill the spots of beams.
-
-    Parameters
-    ----------
-    beam : Beam
-    bearings : ndarray, shape (n,)
-        Radians.
-    pitch : ndarray, shape (n,)
-        Of the head while each beam is measured, radians.
-    T_head_lrf : RigidTransform
-
-    Returns
-    -------
-    origins, directions : ndarray, shape (n, K, 3)
-        Platform frame; they leave a disc of `spot_exit` about the mirror.
-    """
-    c, s = np.cos(bearings), np.sin(bearings)
-    zero = np.zeros_like(c)
-    across, up = np.stack([-s, c, zero], axis=-1), np.array([0.0, 0.0, 1.0])
-    disc = spot_pattern(beam.rings)
-    shift = disc[:, :1] * across[:, None] + disc[:, 1:] * up
-    directions = np.stack([c, s, zero], axis=-1)[:, None] + beam.divergence / 2 * shift
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rotation = T_head_lrf.rotation.as_matrix().T
-    origins = beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation
-    return tilt(origins, pitch[:, None]), tilt(directions @ rotation, pitch[:, None])
-
-
 def echo(beam, distance, energy):
-    """One reading out of the sub-rays of a spot.
+    """One reading (n,), NaN without an echo, and the whole energy (n,) out of the sub-rays (n, K) of spots.
 
-    Parameters
-    ----------
-    beam : Beam
-    distance : ndarray, shape (n, K)
-        Metres; inf where a sub-ray meets nothing.
-    energy : ndarray, shape (n, K)
-        What comes back along each sub-ray.
-
-    Returns
-    -------
-    reading : ndarray, shape (n,)
-        Metres; NaN where no echo is strong enough.
-    total : ndarray, shape (n,)
-        Energy of all echoes.
-
-    Notes
-    -----
     Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy (a mixed pixel); what
     is farther makes an echo of its own. The first echo above both thresholds is the reading.
     """
@@ -255,7 +154,7 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     beam : Beam
     world : World
     bearings, pitch : ndarray, shape (n,)
-        Radians.
+        Radians; the pitch of the head while each beam is measured.
     T_head_lrf : RigidTransform
 
     Returns
@@ -268,38 +167,32 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
 
     Notes
     -----
-    The energy of a sub-ray is reflectivity times cosine of incidence over squared distance (a Lambertian surface). The
-    nearer part of a spot on a slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
+    Sub-rays leave a disc of `spot_exit` about the mirror. The energy of one is reflectivity times cosine of incidence
+    over squared distance (a Lambertian surface). The nearer part of a spot on a slanted plane is therefore brighter: at
+    45 deg the reading is 0.09 mm short.
     """
-    origins, directions = sub_rays(beam, bearings, pitch, T_head_lrf)
-    flat = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    hits = world.cast(*flat)
+    c, s = np.cos(bearings), np.sin(bearings)
+    zero, disc = np.zeros_like(c), spot_pattern(beam.rings)
+    across, up = np.stack([-s, c, zero], axis=-1), np.array([0.0, 0.0, 1.0])
+    shift = disc[:, :1] * across[:, None] + disc[:, 1:] * up
+    directions = np.stack([c, s, zero], axis=-1)[:, None] + beam.divergence / 2 * shift
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rotation = T_head_lrf.rotation.as_matrix().T
+    origins = tilt(beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(-1, 3)
+    directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
+    hits = world.cast(origins, directions)
     seen = hits.face >= 0
-    energy = np.zeros(len(seen))
-    points = flat[0][seen] + hits.distance[seen, None] * flat[1][seen]
-    cosine = np.abs(np.sum(world.normals[hits.face[seen]] * flat[1][seen], axis=1))
-    energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / hits.distance[seen] ** 2 / beam.rays
-    shape = origins.shape[:2]
+    energy, distance = np.zeros(len(seen)), hits.distance[seen]
+    points = origins[seen] + distance[:, None] * directions[seen]
+    cosine = np.abs(np.sum(world.normals[hits.face[seen]] * directions[seen], axis=1))
+    energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / distance**2 / beam.rays
+    shape = len(bearings), beam.rays
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
     return reading, total, world.dazzling(hits.thing).reshape(shape).any(axis=1)
 
 
 def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines.
-
-    Parameters
-    ----------
-    beam : Beam
-    world : World
-    pitch : ndarray, shape (L, 1) or (L, B)
-        True pitch of the head in each line, or while each beam is measured, radians.
-    T_head_lrf : RigidTransform
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Scan
-    """
+    """Record scan lines, a Scan, at the true pitch of the head in each line (L, 1) or beam (L, B), radians."""
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
     flat, step = (bearings.ravel(), pitch.ravel()), max(1, RAYS_AT_ONCE // beam.rays)
     starts = range(0, bearings.size, step)
@@ -310,26 +203,9 @@ def scan(beam, world, pitch, T_head_lrf, rng):
 
 
 def encode(beam, readings, total, dazzled):
-    """Round readings to the device's unit and put its codes where there is no range.
-
-    Parameters
-    ----------
-    beam : Beam
-    readings : ndarray
-        Metres, NaN without an echo.
-    total : ndarray
-        Returned energy.
-    dazzled : ndarray of bool
-
-    Returns
-    -------
-    Scan
-    """
+    """A Scan: readings (metres, NaN: no echo) rounded to the device's unit, its codes where there is no range."""
     counts = np.rint(np.nan_to_num(readings, nan=0.0) / beam.unit)
-    words = np.clip(counts, 0, LARGEST_WORD)
-    words = np.where(counts > LARGEST_WORD, TOO_FAR, words)
-    weak = np.where(total > 0, WEAK, NOT_VALID)
-    words = np.where(np.isfinite(readings), words, weak)
+    words = np.where(counts > LARGEST_WORD, TOO_FAR, np.clip(counts, 0, LARGEST_WORD))
+    words = np.where(np.isfinite(readings), words, np.where(total > 0, WEAK, NOT_VALID))
     words = np.where(dazzled, DAZZLED, words).astype(np.uint16)
-    ranges = np.where(words <= LARGEST_WORD, words * beam.unit, np.nan)
-    return Scan(words, ranges)
+    return Scan(words, np.where(words <= LARGEST_WORD, words * beam.unit, np.nan))

@@ -1,8 +1,9 @@
-"""Record a session with a simulated rig: telegrams, platform log, images and the truth."""
+"""Record a session with a simulated rig: telegrams, platform log, images and the truth; and the card of its sums."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -29,15 +30,15 @@ from lrfcal_lib.session import (
 )
 from lrfcal_lib.session.writer import write_file
 from lrfcal_lib.simulate import beam as lrf
-from lrfcal_lib.simulate import room
-from lrfcal_lib.simulate.placements import Placement, held_close, pairs
-from lrfcal_lib.simulate.platform import step_angles
-from lrfcal_lib.simulate.render import Imager
+from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
+from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room
 
 LICENCE = "CC-BY-4.0"
-PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
-SWEEP, STOPS, PHOTO, PLACES, VIEWS = range(5)  # streams of random numbers
+SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACES is one more
 REPLY_TIME = 0.0016 + 0.016  # s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
+SUMS = "SHA256SUMS"
+BEGIN, END = "<!-- sums -->", "<!-- end of sums -->"
+SMALL = ("session.json", "lrf/telegrams.bin", "lrf/index.csv", "platform.csv", "images.csv", "truth.json")
 
 
 class SimulationError(ValueError):
@@ -46,13 +47,7 @@ class SimulationError(ValueError):
 
 @dataclass(frozen=True)
 class Stops:
-    """The head at rest, one after the other.
-
-    Attributes
-    ----------
-    commanded, true, measured : ndarray, shape (n,)
-        Pitch, radians.
-    """
+    """The head at rest, one after the other: pitch, radians, shape (n,)."""
 
     commanded: np.ndarray
     true: np.ndarray
@@ -61,21 +56,10 @@ class Stops:
 
 @dataclass(frozen=True)
 class Shots:
-    """Images of one camera in one arrangement of the room.
+    """Images of one camera, by its number in the rig, in one arrangement of the room.
 
-    Attributes
-    ----------
-    camera : int
-        Number in the rig.
-    placement : int
-        -1 for the board held close.
-    purpose : str
-    T_platform_board : RigidTransform or None
-        None where there is no board but a table with things.
-    poses : tuple of RigidTransform
-        ``T_camera_platform``.
-    key : tuple of int
-        Of the random numbers.
+    The placement is -1 for the board held close; `T_platform_board` None where there is no board but a table with
+    things; `poses` are ``T_camera_platform``, `key` that of the random numbers.
     """
 
     camera: int
@@ -86,120 +70,62 @@ class Shots:
     key: tuple
 
 
-def random(setup, *key):
-    """Random numbers that depend on the setup's seed and a key alone, whatever else is simulated."""
-    return np.random.default_rng([setup.seed, *key])
-
-
-def placements_of(setup):
-    """The board placements of a setup, a list of Placement."""
-    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
-
-
-def room_placement(setup):
-    """The sweep of the room as a placement without a board; None where the setup has none."""
-    if not setup.room_sweep:
-        return None
-    first, last, _ = setup.room_sweep
-    return Placement(2 * setup.pairs + 1, None, (first, last), setup.room_images)
-
-
 def world_of(setup, T_platform_board, stand=True):
     """The room with the board on its stand (or held by nothing); with a laid table where the pose is None."""
     if T_platform_board is None:
-        return room.furnished_room(*room.still_life())
-    things = room.board_on_stand(setup.rig.board, T_platform_board, ring=setup.rig.ring)
-    return room.furnished_room(*(things if stand else things[:1]))
+        return furnished_room(*furnished("still life"))
+    things = board_on_stand(setup.rig.board, T_platform_board, setup.rig.ring)
+    return furnished_room(*(things if stand else things[:1]))
+
+
+def step_angles(first, last, step):
+    """Pitch commands of a stop-and-go sweep: multiples of `step` from about `first` to about `last`, radians."""
+    if step <= 0:
+        raise ValueError(f"a pitch step must be positive, got {step} rad")
+    low, high = sorted((first, last))
+    angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
+    return angles if last >= first else angles[::-1]
 
 
 def stops_of(setup, placement):
-    """Where the head stands for the images and for the scan lines of a placement.
-
-    Parameters
-    ----------
-    setup : Setup
-    placement : Placement
-
-    Returns
-    -------
-    images, lines : Stops
-    """
+    """Where the head stands for the images and for the scan lines of a placement, two Stops."""
     step = setup.step if placement.T_platform_board is not None else setup.room_sweep[2]
-    commands = np.asarray(placement.image_pitch), step_angles(*placement.sweep, step)
     rng, stops = random(setup, STOPS, placement.number), []
-    for commanded in commands:
-        true, measured = setup.rig.platform.stop(commanded, placement.direction, rng)
-        stops.append(Stops(commanded, true, measured))
+    for commanded in (np.asarray(placement.image_pitch), step_angles(*placement.sweep, step)):
+        stops.append(Stops(commanded, *setup.rig.platform.stop(commanded, placement.direction, rng)))
     return tuple(stops)
 
 
 def sweep_of(setup, placement):
-    """The scan lines of a placement, one at every stop of the sweep.
-
-    Parameters
-    ----------
-    setup : Setup
-    placement : Placement
-
-    Returns
-    -------
-    Scan
-    """
+    """The scan lines of a placement, one at every stop of the sweep, a Scan."""
     _, lines = stops_of(setup, placement)
     world, rng = world_of(setup, placement.T_platform_board), random(setup, SWEEP, placement.number)
     return lrf.scan(setup.rig.beam, world, lines.true[:, None], setup.rig.T_head_lrf, rng)
 
 
 def shots_of(setup, placements):
-    """All images of a setup in the order in which they are written.
-
-    Parameters
-    ----------
-    setup : Setup
-    placements : sequence of Placement
-        The room's last, if any.
-
-    Returns
-    -------
-    list of Shots
-    """
-    out = []
-    for number, camera in enumerate(setup.rig.cameras):
-        still = setup.rig.camera_pose(camera, 0.0)
-        views = held_close(setup.rig, camera, setup.intrinsics_views, random(setup, VIEWS, number))
+    """All images of a setup in the order in which they are written, a list of Shots."""
+    out, rig = [], setup.rig
+    for number, camera in enumerate(rig.cameras):
+        still = rig.camera_pose(camera, 0.0)
+        views = held_close(rig, camera, setup.intrinsics_views, random(setup, VIEWS, number))
         for i, pose in enumerate(views):
             out.append(Shots(number, -1, "intrinsics", still.inv() * pose, (still,), (PHOTO, number, 0, i)))
     for placement in placements:
-        true = stops_of(setup, placement)[0].true
-        purpose = "scene" if placement.T_platform_board is None else "board"
-        for number, camera in enumerate(setup.rig.cameras):
-            poses = tuple(setup.rig.camera_pose(camera, pitch) for pitch in true)
-            key = PHOTO, number, placement.number
-            out.append(Shots(number, placement.number, purpose, placement.T_platform_board, poses, key))
+        true, pose = stops_of(setup, placement)[0].true, placement.T_platform_board
+        for number, camera in enumerate(rig.cameras):
+            poses, key = tuple(rig.camera_pose(camera, pitch) for pitch in true), (PHOTO, number, placement.number)
+            out.append(Shots(number, placement.number, "scene" if pose is None else "board", pose, poses, key))
     return out
 
 
 def photograph(setup, shots):
-    """Take pictures.
-
-    Parameters
-    ----------
-    setup : Setup
-    shots : Shots
-
-    Returns
-    -------
-    list of bytes
-        JPEG files.
-    """
+    """Take pictures, a list of JPEG files as bytes."""
     camera = setup.rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
     world = world_of(setup, shots.T_platform_board, stand=shots.purpose == "board")
-    rng, out = random(setup, *shots.key), []
-    for pose in shots.poses:
-        image = imager.render(world, pose, rng)
-        out.append(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, setup.quality])[1].tobytes())
-    return out
+    rng, quality = random(setup, *shots.key), [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
+    return [cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes() for pose in shots.poses]
 
 
 def simulate(path, setup, workers=1):
@@ -236,21 +162,22 @@ def simulate(path, setup, workers=1):
 
 
 def _record(folder, name, setup, workers):
-    placements, bare = placements_of(setup), room_placement(setup)
-    everything = placements if bare is None else [*placements, bare]
+    boards, room, beam = placements_of(setup), room_placement(setup), setup.rig.beam
+    everything = boards if room is None else [*boards, room]
     for placement in everything:
         setup.rig.platform.check(np.array(placement.sweep))
-    clock, log, truth = 0.0, [], _truth(setup, placements)
+    clock, log, truth = 0.0, ["t_s,commanded_deg,measured_deg"], _truth(setup, boards)
     with _writer(folder, name, setup) as writer:
-        writer.add_telegrams(-1, [_configuration(setup.rig.beam)], time_s=0.0)
+        mode = Configuration().changed(measuring_mode=0, unit="mm" if beam.unit < 0.005 else "cm")
+        writer.add_telegrams(-1, [encode_configuration(mode)], time_s=0.0)
         shots = shots_of(setup, everything)
         files = _photographs(setup, shots, workers)
         for item in (s for s in shots if s.placement < 0):
             _add_images(writer, setup, item, next(files), truth)
         for placement in everything:
-            own = [s for s in shots if s.placement == placement.number]
-            clock = _add_placement(writer, setup, placement, [(s, next(files)) for s in own], clock, log, truth)
-    write_file(folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n", folder)
+            own = [(s, next(files)) for s in shots if s.placement == placement.number]
+            clock = _add_placement(writer, setup, placement, own, clock, log, truth)
+    write_file(folder / "platform.csv", "\n".join(log) + "\n", folder)
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 
@@ -265,16 +192,11 @@ def _photographs(setup, shots, workers) -> Iterator[list[bytes]]:
 
 def _writer(folder, name, setup):
     rig, beam = setup.rig, setup.rig.beam
-    bearings = beam.bearings()
     info = LrfInfo(
-        model=f"{beam.name} (simulated)",
-        field_of_view=(float(bearings[0]), float(bearings[-1])),
-        bearing_step=math.radians(beam.resolution / 100),
-        sigma_range=beam.sigma_range,
-        range_resolution=beam.unit,
-        max_range=lrf.LARGEST_WORD * beam.unit,
-        spot=(beam.spot_exit, beam.divergence),
-    )
+        model=f"{beam.name} (simulated)", field_of_view=tuple(beam.bearings()[[0, -1]].tolist()),
+        bearing_step=math.radians(beam.resolution / 100), sigma_range=beam.sigma_range, range_resolution=beam.unit,
+        max_range=lrf.LARGEST_WORD * beam.unit, spot=(beam.spot_exit, beam.divergence),
+    )  # fmt: skip
     cameras = [CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in rig.cameras]
     reference = {
         "recording": "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at rest",
@@ -287,21 +209,16 @@ def _writer(folder, name, setup):
     )  # fmt: skip
 
 
-def _configuration(beam):
-    return encode_configuration(Configuration().changed(measuring_mode=0, unit="mm" if beam.unit < 0.005 else "cm"))
-
-
 def _add_placement(writer, setup, placement, photos, clock, log, truth):
     """Write the images and then the sweep of a placement; the time when it is done."""
-    rig, (images, lines) = setup.rig, stops_of(setup, placement)
-    pause = rig.platform.settle
+    beam, pause, (images, lines) = setup.rig.beam, setup.rig.platform.settle, stops_of(setup, placement)
     shot_at = clock + pause * np.arange(1, len(images.true) + 1)
     for item, files in photos:
         _add_images(writer, setup, item, files, truth, images, shot_at)
-    scan_time = rig.beam.turns * lrf.MIRROR_TURN
+    scan_time = beam.turns * lrf.MIRROR_TURN
     began = shot_at[-1] + pause + (pause + scan_time) * np.arange(len(lines.true))
-    scan, unit = sweep_of(setup, placement), "mm" if rig.beam.unit < 0.005 else "cm"
-    telegrams = [encode_words(words, unit=unit) for words in scan.words]
+    unit = "mm" if beam.unit < 0.005 else "cm"
+    telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement).words]
     writer.add_telegrams(placement.number, telegrams, lines.measured, np.round(began + scan_time + REPLY_TIME, 4))
     for stops, times in ((images, shot_at), (lines, began)):
         rows = zip(times, np.degrees(stops.commanded), np.degrees(stops.measured), strict=True)
@@ -315,11 +232,11 @@ def _add_images(writer, setup, item, files, truth, stops=None, times=None):
     for i, data in enumerate(files):
         picture = writer.path / f"{name}.jpg"
         write_file(picture, data, writer.path)
-        pitch = 0.0 if stops is None else float(stops.measured[i])
+        pitch, true = (0.0, 0.0) if stops is None else (float(stops.measured[i]), float(stops.true[i]))
         time = math.nan if times is None else float(np.round(times[i], 4))
         writer.add_image(name, picture, item.placement, pitch=pitch, time_s=time, purpose=item.purpose)
         picture.unlink()
-        known = {"pitch_rad": 0.0 if stops is None else float(stops.true[i])}
+        known = {"pitch_rad": true}
         if item.T_platform_board is not None:
             known["T_camera_board"] = transform_to_json(item.poses[i] * item.T_platform_board)
         truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
@@ -327,22 +244,43 @@ def _add_images(writer, setup, item, files, truth, stops=None, times=None):
 
 def _truth(setup, placements):
     """What only the simulator knows; sweeps and images follow as they are made."""
-    rig = setup.rig
-    cameras = {}
+    rig, cameras = setup.rig, {}
     for c in rig.cameras:
         key = "T_camera_lrf" if c.mount == "head" else "T_camera_platform"
         cameras[c.name] = {key: transform_to_json(c.mounting), "intrinsics": model_to_json(c.model)}
         cameras[c.name]["exposure"] = asdict(c.exposure)
     return {
-        "simulated": True,
-        "setup": setup.name,
-        "seed": setup.seed,
-        "T_head_lrf": transform_to_json(rig.T_head_lrf),
-        "cameras": cameras,
-        "board": board_to_json(rig.board),
+        "simulated": True, "setup": setup.name, "seed": setup.seed,
+        "T_head_lrf": transform_to_json(rig.T_head_lrf), "cameras": cameras, "board": board_to_json(rig.board),
         "boards": {p.number: {"T_platform_board": transform_to_json(p.T_platform_board)} for p in placements},
-        "lrf": asdict(rig.beam),
-        "platform": asdict(rig.platform),
-        "sweeps": {},
-        "images": {},
-    }
+        "lrf": asdict(rig.beam), "platform": asdict(rig.platform), "sweeps": {}, "images": {},
+    }  # fmt: skip
+
+
+def write_card(folder, names):
+    """Write the data card: the sums of sessions in a file for ``sha256sum -c``, and a table of them in the README.
+
+    The folder holds the sessions of these names and a README.md with two marks, between which the table stands.
+    """
+    folder = Path(folder)
+    files = sorted(f for name in names for f in (folder / name).rglob("*") if f.is_file())
+    sums = {f.relative_to(folder).as_posix(): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+    lines = {name: f"{value}  {name}\n" for name, value in sums.items()}
+    before, first, rest = (folder / "README.md").read_text().partition(BEGIN)
+    _, last, after = rest.partition(END)
+    if not (first and last):
+        raise ValueError(f"{folder / 'README.md'}: put the marks '{BEGIN}' and '{END}' around the table of sums")
+    rows = ["| file | bytes | SHA-256 |", "|---|---|---|"]
+    for name in names:
+        rows += [f"| {name}/{f} | {(folder / name / f).stat().st_size} | `{sums[f'{name}/{f}']}` |" for f in SMALL]
+        images = [f for f in sums if f.startswith(f"{name}/images/")]
+        joint, size = _sum("".join(lines[f] for f in images)), sum((folder / f).stat().st_size for f in images)
+        rows.append(f"| {name}/images, {len(images)} files (sum of their lines in {SUMS}) | {size} | `{joint}` |")
+    listing = "".join(lines.values())
+    rows.append(f"| {SUMS} | {len(listing)} | `{_sum(listing)}` |")
+    (folder / SUMS).write_text(listing)
+    (folder / "README.md").write_text(f"{before}{BEGIN}\n" + "\n".join(rows) + f"\n{END}{after}")
+
+
+def _sum(text):
+    return hashlib.sha256(text.encode()).hexdigest()

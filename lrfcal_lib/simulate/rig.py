@@ -1,45 +1,94 @@
-"""The simulated rig: a laser range finder and cameras on a pitching head, and the board they look at."""
+"""The simulated rig, the set-ups by name (``setups.json``), and the places that the board is put."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board
+from lrfcal_lib.board import Board, Chessboard, triangle_board
 from lrfcal_lib.camera import CameraModel, project
-from lrfcal_lib.simulate.beam import Beam
-from lrfcal_lib.simulate.platform import Platform
-from lrfcal_lib.simulate.render import Exposure
+from lrfcal_lib.geometry import tilt
+from lrfcal_lib.simulate.beam import LMS221, Beam
+from lrfcal_lib.simulate.scene import Exposure
 
 MOUNTS = ("head", "platform")
-AHEAD = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # lrf or platform axes to those of a camera
+AHEAD = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # axes ahead to those of a camera or an upright board
+MOST_TRIES = 4000
+PITCH_GRID = np.radians(np.arange(-30.0, 30.1, 0.5))  # pitch angles at which an image may be taken
+OUTSIDE = np.radians(2.0)  # a sweep begins and ends this far outside the board
+LEAST_SPAN = np.radians(4.0)  # of the pitch angles at which all cameras see the board
+CLOSE = (0.22, 0.45)  # metres from the camera to a board that is held close
+PLACES = 3  # stream of random numbers
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A pitching platform that lies a little about its pitch; ValueError for impossible settings."""
+
+    # play of the gear, radians: the head hangs back by half of it against the direction of motion
+    backlash: float = 0.0
+    stretch: float = 0.0  # the head turns 1 + stretch times as far as the platform says
+    latency: float = 0.0  # seconds by which the measured pitch is older than its time stamp
+    noise: float = 0.0  # standard deviation of where the head comes to rest about where it should, radians
+    encoder_step: float = 0.0  # of the measured pitch, radians; 0 for none
+    speed: float = math.radians(5.0)  # of continuous motion, radians a second
+    settle: float = 0.4  # seconds from a command to rest in stop-and-go
+    limits: tuple[float, float] = (-math.radians(60), math.radians(60))  # least and greatest pitch, radians
+
+    def __post_init__(self):
+        for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"platform: {name} is {getattr(self, name)}, it must be zero or positive")
+        if not 0 < self.speed < math.inf:
+            raise ValueError(f"platform: speed is {self.speed} rad/s, it must be positive")
+        if not abs(self.stretch) < 0.5:
+            raise ValueError(f"platform: stretch is {self.stretch}, a share of the angle (0.01 is one per cent)")
+
+    def stop(self, commanded, direction, rng):
+        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or from above (-1).
+
+        The encoder sits on the motor: it sees neither backlash nor stretch.
+        """
+        commanded = np.asarray(commanded, float)
+        self.check(commanded)
+        return self._told(commanded + self.noise * rng.standard_normal(commanded.shape), direction)
+
+    def sweep(self, start, stop, time_s):
+        """True and measured pitch while moving at constant speed; the measured one lags by the latency."""
+        self.check(np.array([start, stop]))
+        way, instants = np.sign(stop - start), (time_s, time_s - self.latency)
+        now, then = (start + way * np.clip(self.speed * t, 0, abs(stop - start)) for t in instants)
+        return self._told(now, way)[0], self._told(then, way)[1]
+
+    def check(self, pitch):
+        """Refuse angles beyond the limits."""
+        low, high = self.limits
+        if pitch.size and (pitch.min() < low or pitch.max() > high):
+            asked, has = (np.round(np.degrees([a, b]), 2) for a, b in ((pitch.min(), pitch.max()), self.limits))
+            wanted = f"pitch {asked[0]} to {asked[1]} deg is asked for"
+            raise ValueError(f"platform: {wanted}, it turns {has[0]} to {has[1]} deg")
+
+    def _told(self, motor, direction):
+        """Where the head is and what the encoder says where the motor is."""
+        head, step = (1 + self.stretch) * motor - np.asarray(direction) * self.backlash / 2, self.encoder_step
+        return head, np.rint(motor / step) * step if step else motor
 
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera of the rig.
-
-    Attributes
-    ----------
-    name : str
-    model : CameraModel
-        True intrinsics.
-    mounting : RigidTransform
-        ``T_camera_lrf`` on the head, ``T_camera_platform`` on the base.
-    guess : RigidTransform
-        The same as a tape measure gives it.
-    mount : {'head', 'platform'}
-    exposure : Exposure
-    """
+    """A camera of the rig."""
 
     name: str
-    model: CameraModel
-    mounting: RigidTransform
-    guess: RigidTransform
-    mount: str = "head"
+    model: CameraModel  # true intrinsics
+    mounting: RigidTransform  # T_camera_lrf on the head, T_camera_platform on the base
+    guess: RigidTransform  # the same as a tape measure gives it
+    mount: str = "head"  # one of head, platform
     exposure: Exposure = Exposure()
 
     def __post_init__(self):
@@ -49,43 +98,21 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything that stays the same over a recording.
-
-    Attributes
-    ----------
-    beam : Beam
-    platform : Platform
-    T_head_lrf : RigidTransform
-        The truth.
-    T_head_lrf_stated : RigidTransform
-        As a tape measure gives it.
-    stated_sigma : tuple of float
-        How well it is said to be known: direction (radians) and offset (metres).
-    cameras : tuple of RigCamera
-    board : Board
-        With corners.
-    ring : float
-        Width of the outermost squares of the board's pattern as a share of a square.
-    """
+    """Everything that stays the same over a recording."""
 
     beam: Beam
     platform: Platform
+    # the truth, and as a tape measure gives it
     T_head_lrf: RigidTransform
     T_head_lrf_stated: RigidTransform
     cameras: tuple[RigCamera, ...]
-    board: Board
-    ring: float = 0.65
+    board: Board  # with corners
+    ring: float = 0.65  # width of the outermost squares of the board's pattern as a share of a square
+    # how well the stated transform is said to be known: direction (radians) and offset (metres)
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` while the head stands at a true pitch.
-
-        Parameters
-        ----------
-        camera : RigCamera
-        pitch : float
-            Radians.
-        """
+        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch, radians."""
         if camera.mount == "platform":
             return camera.mounting
         back = RigidTransform.from_rotation(Rotation.from_rotvec([-pitch, 0.0, 0.0]))
@@ -93,21 +120,13 @@ class Rig:
 
     def outline(self, T_platform_board):
         """Corners of the board in the platform frame, shape (n, 3)."""
-        corners = self.board.known_corners()
-        return T_platform_board.apply(np.column_stack([corners, np.zeros(len(corners))]))
+        return T_platform_board.apply(_flat(self.board.known_corners()))
 
     def sweep_pitch(self, p_platform):
-        """Pitch at which the scan plane meets points, and their bearing there.
+        """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
 
-        Parameters
-        ----------
-        p_platform : ndarray, shape (n, 3)
-
-        Returns
-        -------
-        pitch, bearing : ndarray, shape (n,)
-            Radians. With n the third row of the rotation of ``T_head_lrf.inv()`` and h its shift, the point p lies in
-            the scan plane where ``n . Rx(-pitch) p + h = 0``; of the two solutions the one ahead is taken.
+        With n the third row of the rotation of ``T_head_lrf.inv()`` and h its shift, the point p lies in the scan plane
+        where ``n . Rx(-pitch) p + h = 0``; of the two solutions the one ahead is taken.
         """
         back = self.T_head_lrf.inv()
         n, h = back.rotation.as_matrix()[2], back.translation[2]
@@ -117,36 +136,230 @@ class Rig:
         lift = np.arccos(np.clip(-(n[0] * x + h) / np.hypot(along, across), -1, 1))
         both = [np.angle(np.exp(1j * (turn + s * lift))) for s in (1, -1)]
         pitch = np.where(np.abs(both[0]) < np.abs(both[1]), *both)
-        c, s = np.cos(pitch), np.sin(pitch)
-        p_lrf = back.apply(np.stack([x, c * y + s * z, c * z - s * y], axis=1))
+        p_lrf = back.apply(tilt(p_platform, -pitch))
         return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
         """Whether a camera sees points of the board, its corners by default, inside the image by a margin in pixels."""
-        corners = self.board.known_corners()
-        points = np.column_stack([corners, np.zeros(len(corners))]) if points is None else points
-        p = T_camera_board.apply(points)
+        p = T_camera_board.apply(_flat(self.board.known_corners()) if points is None else points)
         if p[:, 2].min() < 0.1 or np.abs(p[:, :2] / p[:, 2:]).max() > 1.0:
             return False
-        uv, size = project(p, camera.model), [camera.model.width, camera.model.height]
-        return bool(np.all((uv > margin) & (uv < np.asarray(size) - 1 - margin)))
+        uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
+        return bool(np.all((uv > margin) & (uv < size - 1 - margin)))
 
 
-def camera_mounting(centre_lrf, turn_deg):
-    """``T_camera_lrf`` of a camera that looks ahead.
+@dataclass(frozen=True)
+class Setup:
+    """A recording to simulate; everything follows from it."""
+
+    name: str
+    seed: int
+    rig: Rig
+    pairs: int  # pairs of board placements
+    distances: tuple[float, float]  # of the board, metres
+    step: float = math.radians(0.25)  # between the stops of a sweep, radians
+    intrinsics_views: int = 20  # images of the board held close, a camera
+    # first pitch, last pitch and step of the sweep of the room, radians; empty for none
+    room_sweep: tuple[float, ...] = ()
+    room_images: tuple[float, ...] = ()  # pitch angles of the images of the room, radians
+    quality: int = 95  # of JPEG, 1 to 100
+
+    def __post_init__(self):
+        if not self.step > 0:
+            raise ValueError(f"setup '{self.name}': the pitch step is {self.step} rad, it must be positive")
+        if not 1 <= self.quality <= 100:
+            raise ValueError(f"setup '{self.name}': JPEG quality is 1 to 100, got {self.quality}")
+        if self.intrinsics_views < 0:
+            raise ValueError(f"setup '{self.name}': {self.intrinsics_views} intrinsics views; 0 or more are possible")
+        if len(self.room_sweep) not in (0, 3):
+            raise ValueError(f"setup '{self.name}': room_sweep is (first, last, step) or empty, got {self.room_sweep}")
+
+
+def printed_triangle():
+    """The paper's triangle (315 and 380 mm at an exact right angle) with 4 x 5 inner corners beside the right angle."""
+    return triangle_board(name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
+
+
+_FILE = json.loads(Path(__file__).with_name("setups.json").read_text())
+
+
+def load_setup(name):
+    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is like."""
+    row = _radians(_FILE[_FILE[name].get("like", name)] | _FILE[name])
+    names = ("seed", "pairs", "distances", "step", "intrinsics_views", "room_sweep", "room_images", "quality")
+    cameras = []
+    for camera, c in row["cameras"].items():
+        scale, turn = row["image_width"] / c["size"][0], Rotation.from_rotvec(c["turn"], degrees=True) * AHEAD
+        mounting = RigidTransform.from_components(-turn.apply(c["centre"]), turn)
+        off = Rotation.from_rotvec(c["guess"]["turn"], degrees=True) * mounting.rotation
+        guess = RigidTransform.from_components(mounting.translation + np.array(c["guess"]["shift"]), off)
+        size, pinhole = (round(v * scale) for v in c["size"]), (v * scale for v in c["pinhole"])
+        model = CameraModel(*size, *pinhole, np.array(c["distortion"]))
+        cameras.append(RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"])))
+    heads = (
+        RigidTransform.from_components(row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True))
+        for k in ("head", "head_stated")
+    )
+    beam, platform = LMS221.with_settings(**row["beam"]), Platform(**_radians(row["platform"]))
+    rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
+    return Setup(name, rig=rig, **{k: row[k] for k in names})
+
+
+def _radians(row):
+    """A row with what ends in _deg in radians, and no lists."""
+    turned = {k.removesuffix("_deg"): np.radians(v).tolist() if k.endswith("_deg") else v for k, v in row.items()}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()}
+
+
+SETUPS = {name: partial(load_setup, name) for name in _FILE}
+sim_lms221, sim_quick = (SETUPS[name] for name in ("sim_lms221", "sim_quick"))
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The board at one place, and what is recorded of it."""
+
+    number: int
+    T_platform_board: RigidTransform | None  # None for a sweep of the room, with a laid table near the rig
+    sweep: tuple[float, float]  # pitch commands of the first and the last scan line, radians
+    image_pitch: tuple[float, ...]  # pitch commands of the images in the order in which they are taken, radians
+
+    @property
+    def direction(self):
+        """+1 for a sweep upwards, -1 downwards."""
+        return 1 if self.sweep[1] >= self.sweep[0] else -1
+
+
+def random(setup, *key):
+    """Random numbers that depend on the setup's seed and a key alone, whatever else is simulated."""
+    return np.random.default_rng([setup.seed, *key])
+
+
+def placements_of(setup):
+    """The board placements of a setup, a list of Placement."""
+    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
+
+
+def room_placement(setup):
+    """The sweep of the room as a placement without a board; None where the setup has none."""
+    if not setup.room_sweep:
+        return None
+    return Placement(2 * setup.pairs + 1, None, setup.room_sweep[:2], setup.room_images)
+
+
+def check_size(rig, nearest):
+    """Refuse a board that does not fit into the view of the LRF or of a camera at a distance, metres."""
+    corners = rig.board.known_corners()
+    length = np.linalg.norm(corners[:, None] - corners, axis=2).max()
+    angle = np.degrees(2 * np.arctan(length / 2 / nearest))
+    views = {f"{rig.beam.name}": float(rig.beam.field_of_view)}
+    for m, name in ((camera.model, camera.name) for camera in rig.cameras):
+        views[f"camera '{name}'"] = float(np.degrees(2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2)))
+    for name, view in views.items():
+        if angle > 0.9 * view:
+            raise ValueError(
+                f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m, but {name} sees "
+                f"{view:.0f} deg; take a smaller board or a greater distance"
+            )
+
+
+def pairs(rig, count, distances, rng, margin=OUTSIDE):
+    """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
     Parameters
     ----------
-    centre_lrf : array_like, shape (3,)
-        Optical centre in the LRF frame, metres.
-    turn_deg : array_like, shape (3,)
-        Further turn about the camera's axes (right, down, ahead), a rotation vector in degrees.
+    rig : Rig
+    count : int
+        Of pairs.
+    distances : tuple of float
+        Least and greatest distance of the board from the platform, metres.
+    rng : numpy.random.Generator
+    margin : float
+        The sweep begins and ends this far outside the board, radians.
+
+    Returns
+    -------
+    list of Placement
+        Numbered from 1. The first of each pair has images at three pitch angles, the second at one. Sweeps go upwards
+        at odd placements and downwards at even ones.
+
+    Raises
+    ------
+    ValueError
+        If the board does not fit into a view, or no place is found that everything sees.
     """
-    turn = Rotation.from_rotvec(turn_deg, degrees=True) * AHEAD
-    return RigidTransform.from_components(-turn.apply(centre_lrf), turn)
+    if count < 1 or not 0.3 <= distances[0] <= distances[1]:
+        raise ValueError(f"{count} pairs at {distances} m: at least one pair, at 0.3 m or more, is needed")
+    check_size(rig, distances[0])
+    out = []
+    for i, distance in enumerate(rng.permutation(np.linspace(*distances, count))):
+        turn = -135.0 + 90.0 * (i % 4)  # which way the right angle points: up, left, down, right
+        for _ in range(MOST_TRIES):
+            poses = _pair(rig, distance, turn, rng)
+            spans = [_spans(rig, pose, margin) for pose in poses]
+            if all(spans):
+                break
+        else:
+            raise ValueError(f"no place at {distance:.2f} m where the LRF and all cameras see board '{rig.board.name}'")
+        for k, (pose, (sweep, seen)) in enumerate(zip(poses, spans, strict=True)):
+            middle, half = np.mean(seen), min(np.ptp(seen) * 0.4, np.radians(9.0))
+            angles = middle + half * np.array([[-1.0, 0.0, 1.0], [0.0]][k])
+            angles, way = np.radians(np.round(np.degrees(angles), 2)), (1, -1)[k]
+            out.append(Placement(2 * i + k + 1, pose, sweep[::way], tuple(angles[::way])))
+    return out
 
 
-def disturbed(transform, turn_deg, shift):
-    """A transform as it would be measured by hand, off by a turn (rotation vector, degrees) and a shift (metres)."""
-    turn = Rotation.from_rotvec(turn_deg, degrees=True) * transform.rotation
-    return RigidTransform.from_components(transform.translation + np.asarray(shift), turn)
+def _pair(rig, distance, turn, rng):
+    """Two poses about one middle; boards face the rig up to 35 deg."""
+    azimuth, height = np.radians(rng.uniform(-24, 24)), rng.uniform(-0.22, 0.28) * distance / 1.6
+    middle = np.array([distance * np.sin(azimuth), distance * np.cos(azimuth), height])
+    centre = np.r_[np.mean(rig.board.known_corners(), axis=0), 0.0]
+    out = []
+    for more in (0.0, 90.0):
+        angles = [rng.uniform(-35, 35), rng.uniform(-28, 28), turn + more + rng.uniform(-12, 12)]
+        turned = Rotation.from_euler("z", -azimuth) * AHEAD * Rotation.from_euler("YXZ", angles, degrees=True)
+        out.append(RigidTransform.from_components(middle - turned.apply(centre), turned))
+    return out
+
+
+def _spans(rig, pose, margin):
+    """First and last pitch of a sweep, and at which all cameras see the whole board; None where that is too little."""
+    shown = [all(rig.shows(c, rig.camera_pose(c, at) * pose) for c in rig.cameras) for at in PITCH_GRID]
+    seen, (pitch, bearing) = PITCH_GRID[np.array(shown)], rig.sweep_pitch(rig.outline(pose))
+    beside = np.abs(bearing - np.pi / 2).max() >= np.radians(rig.beam.field_of_view / 2) - 2 * margin
+    if beside or not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
+        return None
+    return (pitch.min() - margin, pitch.max() + margin), (seen[0], seen[-1])
+
+
+def held_close(rig, camera, count, rng):
+    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list of RigidTransform.
+
+    The whole pattern is inside the image, spread over all of it by the poses together; ValueError if it does not fit.
+    """
+    m, pattern, out = camera.model, rig.board.pattern, []
+    if pattern is None and count:
+        raise ValueError(f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics")
+    size, columns = np.array([m.width, m.height]), int(np.ceil(np.sqrt(count * 4 / 3)))
+    for i in range(count):
+        points, rows = pattern.points(), np.ceil(count / columns)
+        pixel = np.array([(i % columns + 0.5) / columns, (i // columns + 0.5) / rows]) * size
+        for attempt in range(MOST_TRIES):
+            uv = pixel + (size / 2 - pixel) * attempt / MOST_TRIES + rng.normal(0, 15, 2)
+            z = rng.uniform(*CLOSE)
+            angles = [rng.uniform(-42, 42), rng.uniform(-42, 42), rng.uniform(-180, 180)]
+            turn = Rotation.from_euler("x", 180, degrees=True) * Rotation.from_euler("YXZ", angles, degrees=True)
+            place = z * np.array([(uv[0] - m.cx) / m.fx, (uv[1] - m.cy) / m.fy, 1.0])
+            pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
+            if rig.shows(camera, pose, points, margin=18.0):
+                break
+        else:
+            where = f"the image of camera '{camera.name}'"
+            raise ValueError(f"the pattern of board '{rig.board.name}' does not fit into {where}")
+        out.append(pose)
+    return out
+
+
+def _flat(corners):
+    """Corners (n, 2) of a board as points of its frame, shape (n, 3)."""
+    return np.column_stack([corners, np.zeros(len(corners))])

@@ -1,69 +1,245 @@
-"""Things with materials, put together into a world that rays can be cast into."""
+"""A world that rays can be cast into: things with textures, a furnished room (``room.json``), and pictures of it.
+
+A row of ``room.json`` is a shape and a texture with their settings (functions of this module), the pose of the thing
+(``at``, metres; turned about the vertical, then tipped about its own x, degrees) and more settings of :class:`Thing`.
+Its numbers are kept to the last bit: the shipped sessions are rebuilt from them to the byte.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from scipy.spatial.transform import RigidTransform
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.camera import CameraModel, distort, undistort
+
+FLOOR = -1.1  # metres, below the platform
+SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
+FLAT = 0.03  # difference of light over a block of pixels below which its four corners tell the rest
+BLOCK = 2  # pixels
+BATCH = 1 << 19  # rays that are cast at once
+LATTICE = np.random.default_rng(20091001).random((64,) * 3)  # random values that textures are made of
+TEXTURES = {}  # by name, for room.json
 
 
-@dataclass(frozen=True)
-class Material:
-    """What a surface does with light.
+# Shapes: triangle meshes of simple bodies, (vertices (n, 3), faces (m, 3)), metres
 
-    Attributes
-    ----------
-    texture : callable
-        Points in the thing's frame, shape (n, 3), to albedo, shape (n, 3); see :mod:`.textures`.
-    infrared : float or None
-        Diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo.
-    dazzles : bool
-        The LRF is dazzled when its spot meets it (a lamp, the sun in a window).
-    glow : float
-        Light it gives off by itself, in units of full albedo.
+
+def polygon(corners):
+    """A flat convex sheet of no thickness in the plane z = 0."""
+    corners = np.asarray(corners, float)
+    fan = np.arange(1, len(corners) - 1)
+    return np.column_stack([corners, np.zeros(len(corners))]), np.stack([0 * fan, fan, fan + 1], axis=1)
+
+
+def rectangle(width, height):
+    """A sheet about the origin in the plane z = 0."""
+    w, h = width / 2, height / 2
+    return polygon([[-w, -h], [w, -h], [w, h], [-w, h]])
+
+
+def grid_surface(points):
+    """A sheet through a grid of points, shape (rows, columns, 3)."""
+    rows, columns = points.shape[:2]
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    low = np.stack([first, first + 1, first + columns], axis=1)
+    high = np.stack([first + 1, first + columns + 1, first + columns], axis=1)
+    return points.reshape(-1, 3), np.concatenate([low, high])
+
+
+def box(size):
+    """A box about the origin with edges along the axes."""
+    signs = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
+    quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+    return signs * np.asarray(size, float) / 2, np.array([[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)])
+
+
+def lathe(radius, height, sides=48):
+    """A body of revolution about z: its outline from below to above; a radius of zero closes an end."""
+    turn = np.linspace(0, 2 * np.pi, sides + 1)
+    radius, height = np.asarray(radius, float)[:, None], np.asarray(height, float)[:, None]
+    return grid_surface(np.stack([radius * np.cos(turn), radius * np.sin(turn), height + 0 * turn], axis=-1))
+
+
+def cylinder(radius, height, sides=48, top=None):
+    """A closed cylinder about z from z = 0 upwards; `top` is the upper radius of a cone."""
+    return lathe([0, radius, radius if top is None else top, 0], [0, 0, height, height], sides)
+
+
+def sphere(radius):
+    """A ball about the origin."""
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 24)
+    return lathe(radius * np.cos(turn), radius * np.sin(turn))
+
+
+def rod(start, end, radius, sides=12):
+    """A thin round bar between two points."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    length = np.linalg.norm(end - start)
+    z = (end - start) / length
+    x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    vertices, faces = cylinder(radius, length, sides)
+    return start + vertices @ np.stack([x, np.cross(z, x), z]), faces
+
+
+def curtain(width, height, depth, folds):
+    """A hanging cloth in the plane y = 0 with sine-shaped folds along x, `depth` from trough to crest."""
+    s = np.linspace(-0.5, 0.5, 24 * folds)
+    z = np.linspace(0.0, height, 5)[:, None]
+    wave = depth / 2 * np.sin(2 * np.pi * folds * s) * (0.7 + 0.3 * z / height)
+    return grid_surface(np.stack(np.broadcast_arrays(width * s, wave, z), axis=-1))
+
+
+SHAPES = {f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)}
+
+# Textures: of their settings, to functions of points (n, 3) in a thing's own frame that give the albedo (n, 3)
+
+
+def _texture(function):
+    """Make of a function of points and settings one of the settings that returns a function of points."""
+
+    def make(*settings):
+        return lambda points: function(points, *settings)
+
+    make.__doc__ = function.__doc__
+    TEXTURES[function.__name__] = make
+    return make
+
+
+def value_noise(points, cell):
+    """Smooth noise between 0 and 1, shape (n,), from random values on a lattice of cells of this size, metres."""
+    at = points / cell
+    low = np.floor(at).astype(np.int64)
+    f = at - low
+    f = f * f * (3 - 2 * f)
+    i, j = low & 63, (low + 1) & 63
+    out = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        pick = [(j if c else i)[:, axis] for axis, c in enumerate(corner)]
+        weight = np.prod([f[:, axis] if c else 1 - f[:, axis] for axis, c in enumerate(corner)], axis=0)
+        out = out + weight * LATTICE[tuple(pick)]
+    return out
+
+
+@_texture
+def plain(points, color, rough=0.0, cell=0.15):
+    """One colour, with a soft variation of the share `rough`."""
+    if not rough:
+        return np.broadcast_to(np.asarray(color, float), points.shape)
+    return np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
+
+
+@_texture
+def wood(points, color, cell=(0.5, 0.03, 0.03)):
+    """Grain along x."""
+    return np.asarray(color, float) * (0.8 + 0.4 * value_noise(points, np.asarray(cell)))[:, None]
+
+
+@_texture
+def planks(points, color, width=0.18, length=1.4):
+    """A wooden floor: boards along y with dark joints."""
+    row = np.floor(points[:, 0] / width)
+    tone = LATTICE[row.astype(int) & 63, np.floor(points[:, 1] / length + 0.37 * row).astype(int) & 63, 7]
+    joint = np.minimum(np.abs(points[:, 0] / width - np.round(points[:, 0] / width)) * width, 1.0)
+    dark = np.where(joint < 0.002, 0.55, 1.0)
+    return wood(color, (0.03, 0.6, 1.0))(points) * ((0.85 + 0.3 * tone) * dark)[:, None]
+
+
+@_texture
+def stripes(points, first, second, period, axis=0):
+    """Two colours in turn along an axis."""
+    return np.array([first, second], float)[np.floor(2 * points[:, axis] / period).astype(int) & 1]
+
+
+@_texture
+def tiles(points, color, joint, size):
+    """Square tiles in x and z with joints of 4 mm."""
+    at = points[:, [0, 2]] / size
+    near = np.abs(at - np.round(at)).min(axis=1) * size < 0.002
+    tile = np.asarray(color, float) * (0.94 + 0.12 * value_noise(points, size))[:, None]
+    return np.where(near[:, None], np.asarray(joint, float), tile)
+
+
+@_texture
+def printed_page(points, width, height, heading=0.1, line=0.0055):
+    """Lines of text on white paper in the plane z = 0 about the origin: words as dark bars, a heading, a picture."""
+    x, y = points[:, 0] / width + 0.5, 0.5 - points[:, 1] / height
+    row = np.floor(points[:, 1] / line).astype(int)
+    word = np.floor((points[:, 0] + 0.31 * row * line) / (2.1 * line)).astype(int)
+    ink = (LATTICE[row & 63, word & 63, 3] > 0.22) & (np.mod(points[:, 1] / line, 1.0) < 0.5)
+    ink &= (x > 0.1) & (x < 0.9) & (y > 0.18) & (y < 0.93)
+    ink |= (np.abs(y - heading) < 0.025) & (x > 0.2) & (x < 0.8)
+    picture = (x > 0.52) & (x < 0.88) & (y > 0.55) & (y < 0.8)
+    grey = np.where(picture, 0.25 + 0.5 * value_noise(points, 0.02), np.where(ink, 0.12, 0.86))
+    return np.repeat(grey[:, None], 3, axis=1)
+
+
+@_texture
+def poster(points, width, height, colors):
+    """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
+    sky, sun, far, near = np.asarray(colors, float)
+    x, y = points[:, 0] / width + 0.5, points[:, 1] / height + 0.5
+    out = sky * (0.7 + 0.4 * y)[:, None]
+    disc = np.hypot(points[:, 0] - 0.2 * width, points[:, 1] - 0.2 * height) < 0.11 * width
+    out = np.where(disc[:, None], sun, out)
+    out = np.where((y < 0.45 + 0.12 * np.sin(7 * x + 1))[:, None], far, out)
+    out = np.where((y < 0.25 + 0.08 * np.sin(11 * x))[:, None], near, out)
+    return np.where(((np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48))[:, None], 0.85, out)
+
+
+@_texture
+def book_spines(points, seed, pitch=0.035):
+    """Coloured backs of books side by side along x."""
+    rng = np.random.default_rng(seed)
+    palette = rng.uniform(0.1, 0.6, (64, 1)) * (0.55 + rng.uniform(0.0, 0.6, (64, 3)))
+    at = points[:, 0] / pitch
+    label = (np.mod(points[:, 2], 0.3) > 0.19) & (np.mod(points[:, 2], 0.3) < 0.225)
+    color = np.where(label[:, None], 0.75, palette[np.floor(at).astype(int) & 63])
+    return np.where((np.abs(at - np.round(at)) < 0.05)[:, None], 0.04, color)
+
+
+@_texture
+def chessboard(points, board, dark, light, ring=0.5):
+    """A dark board with its chessboard, if it has one; the square diagonally before the first inner corner is light.
+
+    The outermost squares are `ring` squares wide: only inner corners count, so that all may be larger.
     """
+    grey, pattern = np.full(len(points), float(dark)), board.pattern
+    if pattern is not None:
+        at = (points[:, :2] - np.asarray(pattern.origin)) / pattern.square
+        inside = np.all((at > -ring) & (at < np.array([pattern.columns, pattern.rows]) - 1 + ring), axis=1)
+        grey[inside & (np.floor(at).astype(int).sum(axis=1) % 2 == 0)] = light
+    return np.repeat(grey[:, None], 3, axis=1)
 
-    texture: Callable
-    infrared: float | None = None
-    dazzles: bool = False
-    glow: float = 0.0
+
+# The world
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A mesh with one material.
+    """A mesh with what its surface does with light."""
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (n, 3)
-        In the thing's own frame, metres.
-    faces : ndarray of int, shape (m, 3)
-    material : Material
-    pose : RigidTransform
-        ``T_platform_thing``.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    material: Material
-    pose: RigidTransform = field(default_factory=RigidTransform.identity)
+    mesh: tuple  # vertices (n, 3) in the thing's own frame, metres, and faces (m, 3)
+    texture: Callable  # points in the thing's frame, shape (n, 3), to albedo, shape (n, 3)
+    pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
+    infrared: float | None = None  # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
+    dazzles: bool = False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
+    glow: float = 0.0  # light it gives off by itself, in units of full albedo
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Point lights and an even background light.
+    """Point lights and the same light from everywhere.
 
-    Attributes
-    ----------
-    positions : ndarray, shape (k, 3)
-        Platform frame, metres.
-    strengths : ndarray, shape (k,)
-        Irradiance at 1 m and normal incidence, in units of full white; falls with the square of the distance.
-    ambient : float
-        The same from everywhere.
+    Strengths (k,) are irradiances at 1 m and normal incidence, in units of full white.
     """
 
     positions: np.ndarray
@@ -73,17 +249,7 @@ class Lights:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end.
-
-    Attributes
-    ----------
-    distance : ndarray, shape (n,)
-        Metres along the ray; inf where it meets nothing.
-    face : ndarray of int, shape (n,)
-        Number of the triangle in the world, -1 for none.
-    thing : ndarray of int, shape (n,)
-        Number of the thing, -1 for none.
-    """
+    """Where rays end: metres along them (inf: at nothing), numbers of the triangle and of the thing (-1: none)."""
 
     distance: np.ndarray
     face: np.ndarray
@@ -91,21 +257,8 @@ class Hits:
 
 
 class World:
-    """Things in the platform frame, ready for ray casting.
+    """Things in the platform frame, ready for ray casting; only images need lights.
 
-    Parameters
-    ----------
-    things : sequence of Thing
-    lights : Lights, optional
-        Only images need them.
-
-    Raises
-    ------
-    ValueError
-        If there is nothing in it.
-
-    Notes
-    -----
     Open3D (Embree, single precision) decides which triangle a ray meets; the distance is then computed in double
     precision from the triangle's plane.
     """
@@ -114,9 +267,9 @@ class World:
         if not things:
             raise ValueError("a world needs at least one thing to see, got none")
         self.things, self.lights = tuple(things), lights
-        vertices = [thing.pose.apply(thing.vertices) for thing in self.things]
+        vertices = [thing.pose.apply(thing.mesh[0]) for thing in self.things]
         starts = np.cumsum([0] + [len(v) for v in vertices[:-1]])
-        faces = np.concatenate([t.faces + s for t, s in zip(self.things, starts, strict=True)])
+        faces = np.concatenate([t.mesh[1] + s for t, s in zip(self.things, starts, strict=True)])
         vertices = np.concatenate(vertices)
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -124,22 +277,12 @@ class World:
         whole = size > 1e-12  # the poles of a lathe make empty triangles
         self.normals = normals[whole] / size[whole, None]
         self.offsets = np.sum(self.normals * corners[whole, 0], axis=1)
-        self.thing_of = np.repeat(np.arange(len(self.things)), [len(t.faces) for t in self.things])[whole]
+        self.thing_of = np.repeat(np.arange(len(self.things)), [len(t.mesh[1]) for t in self.things])[whole]
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(vertices.astype(np.float32), faces[whole].astype(np.uint32))
 
     def cast(self, origins, directions):
-        """Follow rays to the first surface.
-
-        Parameters
-        ----------
-        origins, directions : array_like, shape (n, 3)
-            Platform frame; unit directions.
-
-        Returns
-        -------
-        Hits
-        """
+        """Follow rays, shape (n, 3), unit directions in the platform frame, to the first surface."""
         origins, directions = np.broadcast_arrays(np.asarray(origins, float), np.asarray(directions, float))
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
         found = self._scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
@@ -152,24 +295,18 @@ class World:
         return Hits(distance, face, np.where(seen, self.thing_of[face], -1))
 
     def albedo(self, points, thing):
-        """Albedo of surface points, shape (n, 3); zero where there is no thing.
-
-        Parameters
-        ----------
-        points : ndarray, shape (n, 3)
-            Platform frame.
-        thing : ndarray of int, shape (n,)
-        """
-        out = np.zeros((len(points), 3))
-        for number, rows in _groups(thing):
+        """Albedo of points on things of these numbers, shape (n, 3); zero where there is none."""
+        out, order = np.zeros((len(points), 3)), np.argsort(thing, kind="stable")
+        numbers, starts = np.unique(thing[order], return_index=True)
+        for number, rows in zip(numbers, np.split(order, starts[1:]), strict=False):
             if number >= 0:
                 item = self.things[number]
-                out[rows] = item.material.texture(item.pose.inv().apply(points[rows]))
+                out[rows] = item.texture(item.pose.inv().apply(points[rows]))
         return out
 
     def infrared(self, points, thing):
         """Reflectivity of surface points for the LRF, shape (n,); zero where there is no thing."""
-        fixed = np.array([np.nan if t.material.infrared is None else t.material.infrared for t in self.things] + [0.0])
+        fixed = np.array([np.nan if t.infrared is None else t.infrared for t in self.things] + [0.0])
         out = fixed[thing]
         ask = np.isnan(out)
         out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
@@ -177,52 +314,182 @@ class World:
 
     def dazzling(self, thing):
         """Whether things dazzle the LRF, shape (n,)."""
-        return np.array([t.material.dazzles for t in self.things] + [False])[thing]
-
-    def glow(self, thing):
-        """Light the things give off, shape (n,)."""
-        return np.array([t.material.glow for t in self.things] + [1.0])[thing]
+        return np.array([t.dazzles for t in self.things] + [False])[thing]
 
     def radiance(self, origins, directions, hits):
         """Light that comes back along rays, linear, shape (n, 3).
 
-        Parameters
-        ----------
-        origins, directions : ndarray, shape (n, 3)
-        hits : Hits
-
-        Notes
-        -----
         Lambert's law for every point light, each casting hard shadows, over an even background light. What is seen
         through an opening of the room is bright sky.
         """
         seen = hits.face >= 0
-        points = origins[seen] + hits.distance[seen, None] * directions[seen]
+        points, thing = origins[seen] + hits.distance[seen, None] * directions[seen], hits.thing[seen]
         normal = self.normals[hits.face[seen]]
         normal *= -np.sign(np.einsum("ni,ni->n", normal, directions[seen]))[:, None]
         light = np.full(len(points), self.lights.ambient)
         for position, strength in zip(self.lights.positions, self.lights.strengths, strict=True):
-            light += strength * self._lit(points, normal, position)
-        out = np.tile([0.95, 0.98, 1.0], (len(seen), 1))
-        glow = self.glow(hits.thing[seen])
-        out[seen] = self.albedo(points, hits.thing[seen]) * (light + glow)[:, None]
-        return out
-
-    def _lit(self, points, normal, position):
-        """Cosine over squared distance of a point light, zero in its shadow."""
-        way = position - points
-        squared = np.einsum("ni,ni->n", way, way)
-        share = np.einsum("ni,ni->n", normal, way) / (squared * np.sqrt(squared))
-        ask = share > 1e-3
-        out = np.zeros(len(points))
-        start = points[ask] + 2e-3 * normal[ask]
-        rays = np.concatenate([start, 0.999 * way[ask]], axis=1, dtype=np.float32)
-        out[ask] = share[ask] * ~self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
+            way = position - points
+            squared = np.einsum("ni,ni->n", way, way)
+            share = np.einsum("ni,ni->n", normal, way) / (squared * np.sqrt(squared))
+            ask = share > 1e-3
+            rays = np.concatenate([points[ask] + 2e-3 * normal[ask], 0.999 * way[ask]], axis=1, dtype=np.float32)
+            dark = self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
+            light[ask] += strength * (share[ask] * ~dark)
+        out = np.tile(SKY, (len(seen), 1))
+        glow = np.array([t.glow for t in self.things])[thing]
+        out[seen] = self.albedo(points, thing) * (light + glow)[:, None]
         return out
 
 
-def _groups(labels):
-    """(label, rows) of every label that occurs."""
-    order = np.argsort(labels, kind="stable")
-    values, starts = np.unique(labels[order], return_index=True)
-    return zip(values, np.split(order, starts[1:]) if len(values) else [], strict=True)
+@cache
+def _room():
+    return json.loads(Path(__file__).with_name("room.json").read_text())
+
+
+def furnished(*parts):
+    """Things of parts of ``room.json``."""
+    things = []
+    for row in (dict(row) for part in parts for row in _room()[part]):
+        (shape, *sizes), (texture, *settings) = row.pop("shape"), row.pop("texture")
+        turned = Rotation.from_euler("ZX", [row.pop("turn", 0.0), row.pop("tip", 0.0)], degrees=True)
+        pose = RigidTransform.from_components(row.pop("at", [0.0, 0.0, 0.0]), turned)
+        things.append(Thing(SHAPES[shape](*sizes), TEXTURES[texture](*settings), pose, **row))
+    return things
+
+
+def furnished_room(*more):
+    """The room around the rig with further things in it, a World: flat, curved and thin things under two lamps."""
+    lights = _room()["lights"]
+    parts = ("shell", "fittings", "bookshelf", "desk", "chair", "plant", "standing lamp", "small things")
+    lamps = Lights(np.array(lights["positions"]), np.array(lights["strengths"]), lights["ambient"])
+    return World([*furnished(*parts), *more], lamps)
+
+
+def board_on_stand(board, T_platform_board, ring):
+    """The board, a sheet of no thickness, so that its edges are exactly its outline, held from behind by a tripod."""
+    centre = np.mean(board.corners, axis=0)
+    middle, behind = T_platform_board.apply([*centre, -0.004]), T_platform_board.apply([*centre, -0.07])
+    away = T_platform_board.rotation.apply([0.0, 0.0, -1.0]) * [1, 1, 0]
+    head = behind + 0.3 * away / np.linalg.norm(away) + np.array([0.0, 0.0, -0.02])  # a tilted board stays clear of it
+    knee = np.array([head[0], head[1], min(head[2] - 0.3, FLOOR + 0.75)])
+    rods = [(middle, behind, 0.006), (behind, head, 0.008), (head, knee, 0.011)]
+    for turn in np.radians([80, 200, 320]):
+        rods.append((knee, [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR], 0.010))
+    sheet = Thing(polygon(board.corners), chessboard(board, 0.07, 0.75, ring), T_platform_board)
+    return [sheet, *(Thing(rod(*each), plain((0.4, 0.41, 0.43))) for each in rods)]
+
+
+# Pictures
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How a camera turns light into numbers."""
+
+    # least and greatest grey level of full white (albedo 1 at irradiance 1). The response is linear, as machine vision
+    # cameras have it; automatic exposure puts the brightest 0.2 % of the image at bright within these limits.
+    gain: tuple[float, float] = (70.0, 300.0)
+    bright: float = 235.0  # grey level
+    blur_px: float = 0.7  # standard deviation of the point spread of lens and sensor together, pixels
+    # variance in grey levels squared is read_noise^2 + shot_noise * level
+    read_noise: float = 0.8
+    shot_noise: float = 0.008
+    vignetting: float = 0.15  # loss of light in the corners of the image, a share
+    samples: int = 3  # rays across a pixel and down a pixel, where the pixel is not plain
+
+    def __post_init__(self):
+        if not 0 < self.gain[0] <= self.gain[1]:
+            raise ValueError(f"gain is {self.gain}: two positive levels are needed, the smaller first")
+        for name in ("bright", "blur_px", "read_noise", "shot_noise", "vignetting"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it cannot be negative")
+        if self.samples < 1:
+            raise ValueError(f"samples is {self.samples}: at least one ray a pixel is needed")
+
+
+class Imager:
+    """A camera with the viewing ray of every corner of every pixel.
+
+    Raises ValueError if the lens folds the image (two viewing rays would fall on one pixel), or for an odd size.
+    """
+
+    def __init__(self, model: CameraModel, exposure: Exposure | None = None):
+        if model.width % BLOCK or model.height % BLOCK:
+            raise ValueError(f"the image is {model.width} x {model.height} pixels, both must be multiples of {BLOCK}")
+        self.model, self.exposure = model, exposure or Exposure()
+        v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
+        corners = np.stack([u, v], axis=-1)
+        self.grid = (undistort(corners, model) - [model.cx, model.cy]) / [model.fx, model.fy]
+        again = distort(self.grid, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
+        miss = np.abs(again - corners).max()
+        if not miss < 1e-3:
+            raise ValueError(f"lens {model.distortion} folds the image (off by {miss:.3g} px): weaken the distortion")
+
+    def render(self, world, T_camera_platform, rng):
+        """Take a picture.
+
+        Parameters
+        ----------
+        world : World
+            With lights.
+        T_camera_platform : RigidTransform
+        rng : numpy.random.Generator
+            Places the rays in the pixels and makes the noise.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            Blue, green, red.
+        """
+        e, m = self.exposure, self.model
+        light = self.light(world, T_camera_platform, rng)
+        light = gaussian_filter(light, (e.blur_px, e.blur_px, 0), mode="nearest", truncate=5.0)
+        v, u = np.mgrid[: m.height, : m.width]
+        radius = ((u - m.cx) ** 2 + (v - m.cy) ** 2) / (m.width**2 + m.height**2) * 4
+        gain = np.clip(e.bright / max(np.quantile(light, 0.998), 1e-6), *e.gain)
+        level = light * (gain * (1 - e.vignetting * radius))[..., None]
+        noisy = level + np.sqrt(e.read_noise**2 + e.shot_noise * level) * rng.standard_normal(level.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., ::-1]
+
+    def light(self, world, T_camera_platform, rng):
+        """Light on every pixel, linear, shape (height, width, 3), before lens blur and sensor.
+
+        The corners of blocks of pixels are cast first. Blocks over which neither the light nor the thing changes are
+        interpolated; every pixel of the others gets `samples` x `samples` rays, one at a random place in each cell.
+        """
+        g, n = self.grid, self.exposure.samples
+        color, thing = self._trace(world, T_camera_platform, g[::BLOCK, ::BLOCK])
+        four, things = _corners(color), _corners(thing)
+        changes = np.ptp(four, axis=0).max(axis=-1) > FLAT
+        changes |= np.ptp(things, axis=0) > 0
+        f = (np.arange(BLOCK) + 0.5) / BLOCK
+        out = np.zeros((four.shape[1], BLOCK, four.shape[2], BLOCK, 3))
+        for corner, (down, across) in zip(four, ((1 - f, 1 - f), (1 - f, f), (f, 1 - f), (f, f)), strict=True):
+            out += corner[:, None, :, None] * down[:, None, None, None] * across[:, None]
+        out = out.reshape(self.model.height, self.model.width, 3)
+        rows, columns = np.nonzero(np.kron(changes, np.ones((BLOCK, BLOCK), bool)))
+        cells = np.stack(np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), axis=-1).reshape(-1, 2)
+        for part in np.array_split(np.arange(len(rows)), 1 + len(rows) * n * n // BATCH):
+            f = (cells + rng.random((len(part), n * n, 2))) / n
+            row, column, down, across = rows[part, None], columns[part, None], f[..., :1], f[..., 1:]
+            top = g[row, column] * (1 - across) + g[row, column + 1] * across
+            low = g[row + 1, column] * (1 - across) + g[row + 1, column + 1] * across
+            color, _ = self._trace(world, T_camera_platform, top * (1 - down) + low * down)
+            out[rows[part], columns[part]] = color.mean(axis=1)
+        return out
+
+    def _trace(self, world, T_camera_platform, rays):
+        """Light and thing along viewing rays (..., 2)."""
+        back, flat = T_camera_platform.inv(), rays.reshape(-1, 2)
+        directions = np.column_stack([flat, np.ones(len(flat))])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = directions @ back.rotation.as_matrix().T
+        origins = np.broadcast_to(back.translation, directions.shape)
+        hits = world.cast(origins, directions)
+        light, shape = world.radiance(origins, directions, hits), rays.shape[:-1]
+        return light.reshape(*shape, 3), hits.thing.reshape(shape)
+
+
+def _corners(grid):
+    """The four corners of every block out of a grid of block corners, shape (4, rows, columns, ...)."""
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]])

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.simulate.record import world_of
-from lrfcal_lib.simulate.render import Imager
+from lrfcal_lib.simulate.scene import Imager
 
 LOG = logging.getLogger(__name__)
 BOUNDARY = "frame"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lrfcal_lib.simulate.platform import Platform
+from lrfcal_lib.simulate.rig import Platform
 
 REACT_S = 0.04  # from a command to the motor
 WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed

@@ -10,9 +10,7 @@ from lrfcal_lib.drivers.emulators.camera import scaled
 from lrfcal_lib.drivers.emulators.rig import EmulatedRig
 from lrfcal_lib.drivers.rig import host_clock
 from lrfcal_lib.session import model_to_json
-from lrfcal_lib.simulate.placements import pairs
-from lrfcal_lib.simulate.record import PLACES, random
-from lrfcal_lib.simulate.setups import SETUPS, sim_quick
+from lrfcal_lib.simulate.rig import PLACES, SETUPS, pairs, random, sim_quick
 
 PRACTICE = "practice"
 NAMES = (PRACTICE, *SETUPS)

@@ -19,7 +19,7 @@ from lrfcal_lib.drivers.emulators.world import EmulatedWorld
 from lrfcal_lib.session import CameraInfo, LrfInfo, board_to_json, transform_to_json
 from lrfcal_lib.session.stated import SCHEMA, camera_to_json, lrf_to_json
 from lrfcal_lib.simulate.beam import LARGEST_WORD
-from lrfcal_lib.simulate.setups import SETUPS
+from lrfcal_lib.simulate.rig import SETUPS
 
 SILENCE_S = 600.0  # that says nothing about an emulated camera: it sends no image while the head moves
 FIRMWARE = {"LMS200": "V02.19 ", "LMS211": "X01.27 ", "LMS221": "X01.27 "}

@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.drivers.emulators.motion import Head
 from lrfcal_lib.session import board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate import beam as lrf
-from lrfcal_lib.simulate.placements import held_close
-from lrfcal_lib.simulate.record import VIEWS, placements_of, random, room_placement, world_of
+from lrfcal_lib.simulate.record import VIEWS, world_of
+from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
 
 DAZZLED, NOT_VALID, WEAK = 2, 1, 4  # index into lms2xx.REASONS
 STILL = 1e-7  # radians within which a scan at rest is cast once
