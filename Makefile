@@ -11,12 +11,13 @@ SIMULATED := sim_lms221 sim_quick
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup report test notebooks lab data bench fuzz clean
+.PHONY: help setup report test notebooks golden lab data bench fuzz clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
 	@echo "make test                    lint and run all tests, the notebooks included"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
+	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
 	@echo "make bench                   compare speed with scipy and OpenCV"
 	@echo "make fuzz                    200 000 damaged sessions and rig files: only our own errors, within bounds"
 	@echo "make lab [SESSION=path]      open JupyterLab"
@@ -36,6 +37,11 @@ test: setup
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $${SESSION:+"$$SESSION"}
+
+golden: setup
+	@for session in data/sim_quick data/sim_lms221 reports/.sessions/lms400_zed; do \
+		$(RUN) -m lrfcal_lib.report $$session || exit 1; name=$$(basename $$session); \
+		rm -rf tests/golden/$$name; mkdir -p tests/golden/$$name; cp reports/$$name/tables/*.csv tests/golden/$$name; done
 
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \

@@ -11,6 +11,7 @@ from notebook_runs import (
     WITH_SESSION,
     WITHOUT_SESSION,
     check,
+    check_tables,
     code_cells,
     has_outputs,
     read,
@@ -84,16 +85,26 @@ def test_no_output_of_a_recording_is_stored(path):
     assert not has_outputs(path)
 
 
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    """Folder that takes the tables of all notebooks."""
+    return tmp_path_factory.mktemp("report")
+
+
 @pytest.mark.parametrize("path", WITHOUT_SESSION, ids=lambda p: p.stem)
-def test_runs_alone(path):
-    check(run_nbval(path))
+def test_runs_alone(path, tables):
+    check(run_nbval(path, report=tables))
 
 
 @pytest.mark.skipif(not SHIPPED.is_file(), reason="no simulated session ships yet")
 @pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
-def test_stored_outputs_are_those_of_the_shipped_session(path):
+def test_stored_outputs_are_those_of_the_shipped_session(path, tables):
     assert has_outputs(path)
-    check(run_nbval(path))
+    check(run_nbval(path, report=tables))
+
+
+def test_tables_are_the_golden_ones(tables):
+    check_tables(tables, "sim_lms221")
 
 
 def test_falsified_output_is_caught(tmp_path):
