@@ -39,9 +39,7 @@ notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $${SESSION:+"$$SESSION"}
 
 golden: setup
-	@for session in data/sim_quick data/sim_lms221 reports/.sessions/lms400_zed; do \
-		$(RUN) -m lrfcal_lib.report $$session || exit 1; name=$$(basename $$session); \
-		rm -rf tests/golden/$$name; mkdir -p tests/golden/$$name; cp reports/$$name/tables/*.csv tests/golden/$$name; done
+	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadfile tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py
 
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \
