@@ -12,6 +12,7 @@ import numpy as np
 
 from lrfcal_lib.drivers.control import ask
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
+from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
 from lrfcal_lib.drivers.rig_events import Moved, Photographed, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import RigFileError
@@ -43,11 +44,13 @@ class Rig:
     cameras : dict of str to Camera
     clock : callable
         Host clock, s, of all of them.
+    host : Host
+        Machine that the drivers run on.
     """
 
-    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time):
+    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time, host=REAL):
         self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras or {}, clock
-        self._closing = contextlib.ExitStack()
+        self._closing, self._now = contextlib.ExitStack(), host.now
 
     @classmethod
     def open(cls, stated, *, log=LOG, clock=None):
@@ -200,7 +203,7 @@ class Rig:
 
     def _request(self, after):
         """Scans one by one, all later than an instant; a line that was lost is given one chance to come back."""
-        found, mended, end = [], False, time.monotonic() + SCAN_S
+        found, mended, end = [], False, self._now() + SCAN_S
         while len(found) < self.stated.plan.scans_per_stop:
             try:
                 reading = self.lrf.request()
@@ -212,8 +215,8 @@ class Rig:
                 mended = True
                 continue
             if reading.time_s > after:
-                found, after, end = [*found, reading], reading.time_s, time.monotonic() + SCAN_S
-            elif time.monotonic() > end:
+                found, after, end = [*found, reading], reading.time_s, self._now() + SCAN_S
+            elif self._now() > end:
                 raise NoReply(f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s")
         return found
 
@@ -237,13 +240,13 @@ class Rig:
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
         self.lrf.start()
         held = [self.lrf.newest(timeout=SCAN_S)]
-        heard, newest = time.monotonic(), held[-1].time_s
+        heard, newest = self._now(), held[-1].time_s
         self.head.start_sweep(float(last), self.stated.plan.sweep_speed)
         while self.head.moving():
             fresh = self._since(newest)
             if fresh:
-                heard, newest = time.monotonic(), fresh[-1].time_s
-            elif time.monotonic() - heard > GAP_S:
+                heard, newest = self._now(), fresh[-1].time_s
+            elif self._now() - heard > GAP_S:
                 raise NoReply(f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder")
             known, held = self._placed(held + fresh, self._usable(self.head.track))
             if known:
@@ -257,9 +260,9 @@ class Rig:
 
     def _since(self, instant):
         """All scans after an instant that come within the time of a batch."""
-        end, found = time.monotonic() + BATCH_S, []
+        end, found = self._now() + BATCH_S, []
         with contextlib.suppress(NoReply):
-            while time.monotonic() < end:
+            while self._now() < end:
                 found += self.lrf.take(1, after=instant, timeout=BATCH_S)
                 instant = found[-1].time_s
         return found
