@@ -2,43 +2,36 @@
 
 import errno
 import os
-import threading
 import time
 import tty
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import serial
+from virtual import INDEXED, Bench
+from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import lms2xx_link, serial_port
-from lrfcal_lib.drivers.emulators import EmulatedLms
-from lrfcal_lib.drivers.emulators.lms2xx_scans import SyntheticSource
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
 from lrfcal_lib.drivers.lms2xx_device import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import TURN_S, Link, interval_s, transfer_s
 from lrfcal_lib.drivers.lms2xx_replies import Configuration
 from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock
 from lrfcal_lib.drivers.serial_port import open_port, set_rate
+from lrfcal_lib.emulators import EmulatedLms
+from lrfcal_lib.emulators.lms2xx import SyntheticSource
 
-INDEXED = Configuration().changed(unit="mm", realtime_indices=True)
-DEADLINE_S = 30  # guards against hanging only; a loaded machine is slow
+
+def emulated(**options):
+    """A device on a virtual host, at 38400 Bd with indices unless told otherwise."""
+    return lms_on(**({"baudrate": 38400, "configuration": INDEXED, "seed": 1, "boot_s": 0.5} | options))
 
 
-@pytest.fixture
-def emulated(tmp_path):
-    """Function (**options) -> EmulatedLms that is running, at 38400 Bd with indices unless told otherwise."""
-    made = []
-
-    def make(**options):
-        options = {"baudrate": 38400, "configuration": INDEXED, "seed": 1, "boot_s": 0.5} | options
-        made.append(EmulatedLms(path=tmp_path / f"lrf{len(made)}", **options).start())
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
+def opened(device, **options):
+    """Its driver, on the same host."""
+    return LMS2xx.open(device.path, host=device.clock.machine, **options)
 
 
 @pytest.fixture
@@ -64,14 +57,6 @@ def record_of(device, reading):
     """The emulated device's own records of the telegrams of a reading."""
     by_telegram = {one.telegram: one for one in device.scans}
     return [by_telegram[raw] for raw in reading.telegrams]
-
-
-def wait_for(condition):
-    """Wait until a condition holds."""
-    end = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < end, "the condition never came true"
-        time.sleep(0.01)
 
 
 # ------------------------------------------------------------------------------------------------------- ports
