@@ -14,7 +14,7 @@ from lrfcal_lib.drivers.lms2xx_device import LMS2xx
 from lrfcal_lib.emulators import FAULTS
 
 DEVICES = 4
-RECOVERY_S, CALL_S = 4.0, 25.0  # longest: until all works again, and of any call
+RECOVERY_S, CALL_S = 3.0, 12.0  # longest: until all works again, and of any call
 KINDS = [name for name, fault in FAULTS.items() if "lrf" in fault.devices]
 LONG = {"unplug", "reboot", "rate", "deaf", "echo"}  # they last for a while, so there are fewer of them
 ON_REQUESTS = {"request_drop", "request_flip", "deaf", "echo", "nak", "no_ack", "refused", "reboot", "rate", "stuck",
