@@ -15,13 +15,11 @@ import pytest
 import serial
 
 from lrfcal_lib.drivers.control import ask
-from lrfcal_lib.drivers.emulators import EmulatedRig, Head
-from lrfcal_lib.drivers.emulators.camera import CameraServer, scaled
-from lrfcal_lib.drivers.emulators.line import Clock
-from lrfcal_lib.drivers.emulators.run import main, summary
-from lrfcal_lib.drivers.emulators.world import EmulatedWorld
 from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.emulators import Clock, EmulatedRig, Head
+from lrfcal_lib.emulators.rig import main, summary
+from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.placements import Placement
@@ -280,7 +278,7 @@ def test_a_rig_that_is_sped_up_says_what_it_is_for(setup):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_line_cleans_up(tmp_path, number):
     file, folder = tmp_path / "rig.json", tmp_path / "ports"
-    code = "import sys; from lrfcal_lib.drivers.emulators.run import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from lrfcal_lib.emulators.rig import main; sys.exit(main(sys.argv[1:]))"
     call = [sys.executable, "-c", code, "--no-cameras", "--rig-file", str(file), "--folder", str(folder)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
     until(lambda: file.exists() or run.poll() is not None, "the rig file")

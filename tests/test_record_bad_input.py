@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lrfcal_lib.drivers.emulators import EmulatedRig
-from lrfcal_lib.drivers.emulators.practice import practice_setup
+from lrfcal_lib.emulators import EmulatedRig
+from lrfcal_lib.emulators.rig import practice_setup
 from lrfcal_lib.session import model_to_json, open_session, validate
 
 DEADLINE = 120.0  # s, against hanging

@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import chi2
 
 from lrfcal_lib.acquisition import Terminal, check_placement, record
-from lrfcal_lib.drivers.emulators import EmulatedRig
-from lrfcal_lib.drivers.emulators import camera as emulated_camera
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.emulators import EmulatedRig
+from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.evaluate import trusted_sigma
 from lrfcal_lib.joint_calibration import calibrate_jointly
 from lrfcal_lib.pairing import observe_all
@@ -29,7 +29,7 @@ QUICKLY = 5.0  # times as fast as real devices
 
 def small_setup():
     """Six placements, coarse sweeps, one camera with known intrinsics and one small image a placement."""
-    rig = emulated_camera.scaled(sim_quick().rig, 480)
+    rig = scaled(sim_quick().rig, 480)
     setup = replace(sim_quick(), rig=replace(rig, cameras=rig.cameras[:1]), pairs=3, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(setup.rig, setup.pairs, setup.distances, simulated.random(setup, simulated.PLACES), np.radians(1.0))

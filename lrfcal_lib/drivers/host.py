@@ -13,6 +13,8 @@ import time
 from lrfcal_lib.drivers.errors import PortError
 from lrfcal_lib.drivers.serial_port import open_port, set_rate
 
+LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
+
 
 class Host:
     """This machine; names and meanings are those of `time` and `threading`."""
@@ -60,9 +62,10 @@ class VirtualHost:
 
     def wait(self, holds, seconds=None):
         """Wait until ``holds()`` is true, at most for so long (None: for ever); returns what it is then."""
-        if found := holds():
+        if (found := holds()) or seconds is not None and seconds <= 0:
             return found
-        return self._pass_on(_Waiting(holds, math.inf if seconds is None else self._now + max(0.0, seconds)))
+        end = math.inf if seconds is None else self._now + max(seconds, LEAST_S)
+        return self._pass_on(_Waiting(holds, end))
 
     def event(self):
         """As threading.Event."""

@@ -1,7 +1,7 @@
 """A whole emulated rig: its devices, its control socket, rigs for practice, ``python -m lrfcal_lib emulate``.
 
-A line to the socket is a command with its arguments, ``place 3``, or the same as JSON, ``{"command": "place",
-"arguments": [3]}``. Every line is answered by one line of JSON, ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``.
+A line to the socket is a command with its arguments, ``place 3``; in JSON ``{"command": "place", "arguments": [3]}``.
+Every line is answered by one line of JSON, ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``.
 """
 
 from __future__ import annotations
