@@ -7,7 +7,6 @@ import json
 import os
 import resource
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -286,10 +285,16 @@ def in_child(work, *arguments):
     os._exit(1)
 
 
-def record_slowly(data, path, told):
-    """What the child does; `told` is a pipe that hears of every finished placement."""
-    rig = make_rig(data)
-    rig.lrf.wait = lambda: time.sleep(0.001)
+def record_and_die(data, path, told, writes):
+    """What the child does; `told` is a pipe that hears of every finished placement, `writes` how many are safe."""
+    rig, fsync, left = make_rig(data), os.fsync, iter(range(writes))
+
+    def dying(handle):
+        if next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        fsync(handle)
+
+    os.fsync = dying
     recording = Recording(rig, path, resume=True)
     for placement in recording.to_do():
         for _ in recording.run(placement):
@@ -303,12 +308,9 @@ def test_twenty_kills_lose_nothing_that_was_finished(tmp_path):
     plan = {placement.number: placement for placement in rig.stated.plan.to_do()}
     for _ in range(20):
         read_end, write_end = os.pipe()
-        child = in_child(record_slowly, data, path, write_end)
+        child = in_child(record_and_die, data, path, write_end, int(rng.integers(60)))
         os.close(write_end)
         with os.fdopen(read_end, "rb", buffering=0) as stream:
-            known |= set(stream.read(rng.integers(3)))  # waits for none to two placements
-            time.sleep(rng.uniform(0.0, 0.1))
-            os.kill(child, signal.SIGKILL)
             known |= set(stream.read())
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL, "it ended before it was killed"
         if not known:
