@@ -4,6 +4,8 @@ PYTHON ?= python3
 RUN := .venv/bin/python
 # Open3D brings dash, whose extension makes JupyterLab ask whether to rebuild itself
 NO_BUILD_QUESTION := --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
+# JupyterLab refuses root, who often is the only user of a container or a board computer
+AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
 SIMULATED := sim_lms221 sim_quick
 # one thread a process: two notebooks run side by side, and sums come out the same on every machine
 export OMP_NUM_THREADS ?= 1
@@ -34,9 +36,12 @@ test: setup
 notebooks: setup
 	@$(RUN) -m lrfcal_lib.report --store $(if $(SESSION),"$(SESSION)")
 
+lab: export SESSION := $(SESSION)
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \
-	LRFCAL_CACHE="$$folder" $(if $(SESSION),LRFCAL_SESSION="$(abspath $(SESSION))") .venv/bin/jupyter lab $(NO_BUILD_QUESTION) notebooks
+	[ -z "$$SESSION" ] || export LRFCAL_SESSION="$$(realpath -- "$$SESSION")"; \
+	[ -w notebooks ] || echo "this folder is read-only: notebooks run, changes to them cannot be saved" >&2; \
+	LRFCAL_CACHE="$$folder" .venv/bin/jupyter lab $(AS_ROOT) $(NO_BUILD_QUESTION) notebooks
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py

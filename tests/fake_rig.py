@@ -154,7 +154,7 @@ class Lrf(Device):
         if self.head.sweep is not None:
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
-        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0), BEARINGS, instant, times)
+        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times)
         self.readings.append(reading)
         return reading
 

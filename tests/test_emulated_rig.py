@@ -275,7 +275,7 @@ def test_a_rig_that_is_sped_up_says_what_it_is_for(setup):
         assert "times as fast" not in summary(rig)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_command_line_cleans_up(tmp_path, number):
     file, folder = tmp_path / "rig.json", tmp_path / "ports"
     code = "import sys; from lrfcal_lib.emulators.rig import main; sys.exit(main(sys.argv[1:]))"

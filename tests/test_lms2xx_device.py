@@ -184,8 +184,8 @@ def test_bytes_are_paced_at_500000_baud_only(rate, writes):
 
 def test_nobody_there_and_somebody_else_are_told_apart():
     far = Far()
-    with pytest.raises(NoReply, match="no reply at 38400, 9600, 19200, 500000 Bd: check power.*crossed.*RS-422"):
-        opened(far, find_s=1.2)
+    with pytest.raises(NoReply, match="19200, 500000 Bd, address 5: check power.*address, .*crossed.*RS-422"):
+        opened(far, find_s=1.2, address=5)
     assert far.clock.now() < 2.5
 
     def talk(instant):
@@ -193,7 +193,7 @@ def test_nobody_there_and_somebody_else_are_told_apart():
         far.at(instant + 0.05, talk)
 
     talk(far.clock.now())
-    with pytest.raises(WrongDevice, match="bytes arrive, but no telegram of an LMS2xx"):
+    with pytest.raises(WrongDevice, match=r"bytes arrive, but no telegram of an LMS2xx at .* Bd, address 0 \(any\)"):
         opened(far, find_s=1.2)
     with pytest.raises(WrongDevice, match="'LMX400' answers, not an LMS2xx"):
         opened(emulated(model="LMX400;302063;X01.27 "))
@@ -268,6 +268,17 @@ def test_only_what_differs_is_set():
             lms.set_variant(180, 0.25)
         with pytest.raises(ValueError, match="unit is one of .*got 'inch'"):
             lms.configure(unit="inch")
+
+
+@pytest.mark.parametrize("mode", [0x0F, 0x3F])
+def test_a_measuring_mode_without_ranges_is_refused_or_changed_at_opening(mode):
+    device = emulated(configuration=Configuration().changed(measuring_mode=mode))
+    with pytest.raises(WrongDevice, match=f"in measuring mode {mode:02X}, .*state measuring_mode, 0 to 6"):
+        opened(device)
+    assert device.memory.flash_writes == 0
+    with opened(device, measuring_mode=4, unit="mm") as lms:
+        assert device.memory.flash_writes == 1 and lms.configuration.measuring_mode == 4
+        assert len(lms.request().ranges) == 361
 
 
 def test_what_the_device_declines_is_said():

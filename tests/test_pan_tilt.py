@@ -625,7 +625,7 @@ def test_missing_port(tmp_path):
      ("degrees_per_second", (4.0, 0.0)), ("repeat_s", 0.0), ("settle_s", -1.0), ("echo", "loud")],
 )  # fmt: skip
 def test_settings_that_no_head_has(name, value):
-    with pytest.raises(ValueError, match=f"{name} of the head is"):
+    with pytest.raises(ValueError, match=f"head.{name} is"):
         HeadSettings(**{name: value})
 
 

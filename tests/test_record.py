@@ -6,6 +6,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from lrfcal_lib.acquisition import (
 from lrfcal_lib.acquisition.checks import edge_rise
 from lrfcal_lib.board import Chessboard
 from lrfcal_lib.camera import CameraModel
+from lrfcal_lib.drivers import emergency
 from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.rig import Moved, Scanned
 from lrfcal_lib.session import SessionError, SessionRecorder, finish, open_session, validate
@@ -553,6 +555,51 @@ def test_ctrl_c_amid_a_sweep(rig_file, tmp_path, monkeypatch, capsys, scans):
     rig.lrf.wait = None
     assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "", ""), resume=True) == 0
     assert validate(tmp_path / "s") == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_say_what_is_safe_and_how_to_go_on(rig_file, tmp_path, monkeypatch, capsys, number):
+    """As `emergency` turns them into an exit, amid the second placement."""
+    rig, seen = make_rig(listed(-4, 0, 4)), []
+    emergency.guard(rig.head)
+    rig.head.emergency_stop = rig.head.stop
+
+    def end():
+        seen.append(1)
+        if len(seen) == 5:
+            signal.raise_signal(number)
+
+    rig.lrf.wait = end
+    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "", "")) == 128 + number
+    emergency.release(rig.head)
+    said = f"stopped by {number.name}; placements 1 are safe; --resume goes on from there"
+    assert rig.head.stops and capsys.readouterr().err.strip() == said
+    rig.lrf.wait = None
+    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", ""), resume=True) == 0
+
+
+@pytest.mark.parametrize("removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"])
+@pytest.mark.parametrize("scans", [5, 9, 0])
+def test_a_session_removed_amid_a_recording_is_not_called_safe(
+    rig_file, tmp_path, monkeypatch, capsys, removed, scans
+):
+    """While the second or the last placement is recorded, or before the third one is begun."""
+    rig, seen, path = make_rig(listed(-4, 0, 4)), [], tmp_path / "s" / removed
+
+    def remove(*_):
+        seen.append(1)
+        if len(seen) == (scans or 3):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        return ""
+
+    if scans:
+        rig.lrf.wait = remove
+    code = run(rig_file, tmp_path, rig, monkeypatch, answers("", "", "") if scans else remove)
+    said = capsys.readouterr()
+    whole = removed == "session.json"  # written anew, with all that it stated
+    assert whole or code == 2 and "was removed or damaged while it was recorded: record again" in said.err
+    assert whole or "are safe" not in said.out + said.err
+    assert not whole or validate(tmp_path / "s") == [] and code == 0
 
 
 FAULTS = [

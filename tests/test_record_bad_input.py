@@ -139,7 +139,7 @@ def no_socket(data, rig):
 
 SPOILT = {
     missing: "error: lrf: there is no port /dev/no_such_port: check cable and power",
-    swapped: "check power",
+    swapped: "error: head: ",
     shared: "devices.lrf.port and devices.head.port are both",
     too_far: "pitch_limits_deg are -1 to 1: ask for less",
     no_camera: "error: camera 'left': http://127.0.0.1:9/left.mjpg gives no video: open http",

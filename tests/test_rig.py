@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import socket
 import threading
 import time
@@ -9,13 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_rig import SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
+from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
+from lrfcal_lib.drivers.head_settings import HEAD, HeadSettings
 from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, Configuration, parse_configuration
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
+from lrfcal_lib.drivers.serial_port import open_port
+from lrfcal_lib.drivers.video_sources import find_source
 
 # ------------------------------------------------------------------------------------------------------ rig file
 
@@ -55,32 +59,38 @@ WRONG = {
     r"devices\.head\.port are both /dev/fake_lrf": ("devices.head.port", "/dev/fake_lrf"),
     r"devices\.head is 7: an object": ("devices.head", 7),
     r"devices\.head\.adress is not known; known are port, address": ("devices.head.adress", 1),
-    r"devices\.head: tilt_speed of the head is 99": ("devices.head.tilt_speed", 99),
-    r"devices\.head: address of the head is 'one'": ("devices.head.address", "one"),
-    r"devices\.lrf\.unit is 'inch'": ("devices.lrf.unit", "inch"),
-    r"devices\.lrf\.variant is 180": ("devices.lrf.variant", 180),
+    r"devices\.head\.tilt_speed is 99: a whole number from 0 to 63": ("devices.head.tilt_speed", 99),
+    r"devices\.head\.address is 'one': a whole number from 0 to 255": ("devices.head.address", "one"),
+    r"devices\.lrf\.unit is 'inch': 'mm' or 'cm'": ("devices.lrf.unit", "inch"),
+    r"devices\.lrf\.variant is 180: a list of 2": ("devices.lrf.variant", 180),
     r"devices\.lrf is 'COM1': an object": ("devices.lrf", "COM1"),
+    r"devices\.lrf\.baudrate is 300: 9600 or 19200 or 38400 or 500000": ("devices.lrf.baudrate", 300),
     r"devices\.cameras\.left\.source is missing": ("devices.cameras.left.source", None),
     r"devices\.cameras\.left\.focus is not known": ("devices.cameras.left.focus", 3),
     r"devices\.cameras\.left\.size is \[640, 480\], rig\.cameras\.left states \[32, 24\]":
         ("devices.cameras.left.size", [640, 480]),
     r"devices\.cameras are none, rig\.cameras left": ("devices.cameras", {}),
-    r"plan\.mode is 'fast'": ("plan.mode", "fast"),
+    r"plan\.mode is 'fast': 'stop-and-go' or 'continuous'": ("plan.mode", "fast"),
     r"plan\.speed is not known": ("plan.speed", 3),
-    r"plan\.scans_per_stop is 0": ("plan.scans_per_stop", 0),
+    r"plan\.scans_per_stop is 0: a whole number from 1": ("plan.scans_per_stop", 0),
     r"plan\.count is True": ("plan.count", True),
     r"plan\.intrinsics_images is -1": ("plan.intrinsics_images", -1),
-    r"plan\.pitch_deg is \[-4, 4, 0\]: first, last, and a positive step": ("plan.pitch_deg", [-4, 4, 0]),
-    r"plan\.pitch_deg is \(-4, 4\): a list of 3 numbers": ("plan.pitch_deg", [-4, 4]),
+    r"plan\.pitch_deg is \[-4, 4, 0\]: first, last, and a step of 0\.001 or more": ("plan.pitch_deg", [-4, 4, 0]),
+    r"plan\.pitch_deg is \[-4, 4\]: a list of 3, each a number from -180 to 180 deg": ("plan.pitch_deg", [-4, 4]),
     r"plan\.pitch_deg is \[0, 0, 1\]": ("plan.pitch_deg", [0, 0, 1]),
     r"plan\.image_pitch_deg is '0'": ("plan.image_pitch_deg", "0"),
-    r"plan\.image_pitch_deg is \('up',\)": ("plan.image_pitch_deg", ["up"]),
+    r"plan\.image_pitch_deg is \['up'\]": ("plan.image_pitch_deg", ["up"]),
     r"placement 1 asks for a pitch of -4 to 90 deg, .*pitch_limits_deg are -60 to 60": ("plan.image_pitch_deg", [90]),
     r"plan\.placements\[0\]\.number is -3": ("plan.placements", [{"number": -3}]),
     r"plan\.placements\[0\]\.pitch is not known": ("plan.placements", [{"pitch": 3}]),
     r"plan\.placements: numbers must differ, got \[1, 1\]": ("plan.placements", [{"number": 1}, {"number": 1}]),
     r"square_m": ("board.pattern.square_m", -1),
-    r"key 'board' is missing": ("board", None),
+    r"board is missing": ("board", None),
+    r"board\.edges is missing": ("board.edges", None),
+    r"rig\.lrf\.sigma_range_m is missing": ("rig.lrf.sigma_range_m", None),
+    r"rig\.cameras\.left\.mount is missing": ("rig.cameras.left.mount", None),
+    r"rig\.platform is \[\]: an object": ("rig.platform", []),
+    r"more than 10000000 bytes": ("source", "x" * 10_000_000),
 }  # fmt: skip
 
 
@@ -88,6 +98,64 @@ WRONG = {
 def test_a_wrong_rig_file_is_refused(tmp_path, message):
     with pytest.raises(RigFileError, match=rf"rig\.json: .*{message}"):
         read(tmp_path, changed(*WRONG[message]))
+
+
+VALUES = [None, True, -1, 0, 1.5, 99, 10**400, 1e9, 1e-320, 1e308, math.nan, math.inf, "", "x", "a\0b", "\ud800", [],
+          [1], ["x"], [1, 2], [1e-320] * 3, [10**400] * 3, {}, {"x": 1}, [[[]]] * 3]  # fmt: skip
+
+
+def paths(data, way=()):
+    """Where all values of a rig file stand."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ():
+        yield (*way, key)
+        yield from paths(value, (*way, key))
+
+
+def every_key():
+    """A rig file that states all that can be stated about devices and plan."""
+    data = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
+    head = {name: getattr(HeadSettings(), name) for name in HEAD}
+    data["devices"]["head"] |= head | {"degrees_per_second": 4.0, "repeat_s": 0.5, "pitch_limits_deg": [-60, 60]}
+    data["devices"]["lrf"] |= {"baudrate": 9600, "address": 1, "password": "SICK_LMS", "measuring_mode": 0,
+                               "realtime_indices": True, "interlaced": False}  # fmt: skip
+    data["devices"]["cameras"]["left"] |= {"size": list(SIZE), "exposure": 0.01, "fps": 10, "silence_s": 10}
+    data["devices"]["control"] = "/tmp/control"
+    data["plan"] |= {"mode": "stop-and-go", "scans_per_stop": 1, "sweep_speed": 32, "intrinsics_images": 0}
+    return data
+
+
+@pytest.mark.parametrize("way", list(paths(every_key())), ids=lambda way: ".".join(map(str, way)))
+def test_any_value_anywhere_is_taken_or_refused_in_words(tmp_path, way):
+    """What is taken can be asked of the drivers: their calls raise nothing but DeviceError, and no time is endless."""
+    for value in VALUES:
+        data = every_key()
+        at = data
+        for key in way[:-1]:
+            at = at[key]
+        at[way[-1]] = value
+        try:
+            stated = read(tmp_path, data)
+        except RigFileError as error:
+            assert "rig.json: " in str(error)
+            if way[0] in ("devices", "plan"):
+                assert way[0] in str(error) or "head." in str(error), (value, error)
+            continue
+        waits = [v for name, v in vars(stated.head_settings).items() if name.endswith("_s") and v is not None]
+        waits += [one.get("silence_s", 0) for one in stated.camera_devices.values()]
+        assert max(waits) <= 3600
+        for device in (stated.lrf_device["port"], stated.head_device):
+            with pytest.raises(PortError):
+                open_port(f"/nowhere{device}", stated.head_settings.baudrate, timeout=0.1)
+        bytes(7) * stated.head_settings.sends, range(stated.head_settings.retries)
+        for one in stated.camera_devices.values():
+            find_source(one["source"], one.get("silence_s", 1.0))
+
+
+@pytest.mark.parametrize("text", [b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b""])
+def test_what_is_no_json_is_said(tmp_path, text):
+    (tmp_path / "rig.json").write_bytes(text)
+    with pytest.raises(RigFileError, match=r"rig\.json: "):
+        read_rig_file(tmp_path / "rig.json")
 
 
 def test_no_rig_file(tmp_path):
@@ -98,6 +166,10 @@ def test_no_rig_file(tmp_path):
         read_rig_file(tmp_path / "text.json")
     with pytest.raises(RigFileError, match="the file is .*: an object"):
         read(tmp_path, [1, 2])
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", tmp_path, "/dev/zero"):
+        with pytest.raises(RigFileError, match="no file, or one of more than"):
+            read_rig_file(path)
 
 
 def test_interlaced_scans_need_a_head_at_rest(tmp_path):
@@ -231,6 +303,36 @@ def test_nothing_is_held_back():
 def test_a_head_without_feedback_says_so():
     assert not any(e.measured for e in events_of(make_rig(feedback=False)) if isinstance(e, Moved))
     assert all(e.measured for e in events_of(make_rig()) if isinstance(e, Moved))
+
+
+def scans(moving, noise, step=0.0):
+    """Ranges of 40 scans of a wall, 361 beams, while a head moves by 20 deg or not; a person walks by."""
+    rng, pitch = np.random.default_rng(5), np.linspace(-10, 10, 40) * moving
+    ranges = np.repeat(2.5 / np.cos(np.radians(pitch))[:, None], 361, axis=1)
+    ranges[10:25, 30:38] = 1.5
+    ranges[:, 150:300] = 2  # a wall beside, which is seen the same at any pitch
+    ranges = ranges + noise * rng.standard_normal(ranges.shape)
+    ranges[:, 300:] = np.where(rng.random((40, 61)) < 0.5, np.nan, 3)
+    return np.round(ranges / step) * step if step else ranges
+
+
+@pytest.mark.parametrize(("noise", "step"), [(0.005, 0), (0.01, 0.01), (0.002, 0.01), (0, 0), (0.02, 0)])
+def test_scans_that_differ_by_noise_alone_are_told_from_those_of_a_head_that_moves(noise, step):
+    assert unchanged(scans(False, noise, step)) and not unchanged(scans(True, noise, step))
+    assert not unchanged(np.full((9, 5), np.nan))
+
+
+@pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
+def test_a_head_that_tells_nothing_and_does_not_move_ends_the_sweep(mode):
+    """As with a wrong address or rate: the driver reckons that it moved, the scans say that it did not."""
+    rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]), feedback=False)
+    scan = rig.lrf._scan
+    rig.lrf._scan = lambda instant: replace(scan(instant), ranges=np.full(BEAMS, 2.0))
+    with pytest.raises(NoReply, match="the head did not move: .*address 1 and 2400 Bd at /dev/fake_head"):
+        events_of(rig)
+    assert rig.head.stops and len(rig.lrf.readings) > 8
+    rig.lrf._scan = scan
+    assert events_of(rig)
 
 
 class Boom(Exception):
@@ -391,6 +493,9 @@ def test_what_the_device_says_about_itself_counts():
     info = rig.lrf_info
     np.testing.assert_allclose(np.degrees(info.field_of_view), [0, 180])
     assert math.degrees(info.bearing_step) == pytest.approx(0.5) and info.range_resolution == 0.01
+    for mode, unit, longest in ((0, "cm", 81.82), (0, "mm", 8.182), (4, "mm", 16.374), (6, "mm", 32.758)):
+        rig.lrf.configuration = Configuration().changed(unit=unit, measuring_mode=mode)
+        assert rig.lrf_info.max_range == pytest.approx(longest)
     rig.stated.lrf_device["interlaced"] = True
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
 

@@ -149,6 +149,35 @@ def test_setup_keeps_the_environment_until_environment_txt_changes(checkout):
     assert calls.read_text().count("-m venv") == 1
 
 
+def lab(tmp_path, uid, *arguments):
+    """What `make lab` calls, with a set-up and a JupyterLab that only tell."""
+    for name, script in ((".ci/setup", ""), (".venv/bin/jupyter", 'echo "$* LRFCAL_SESSION=$LRFCAL_SESSION"')):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        write_command((tmp_path / name).parent, Path(name).name, script)
+    (tmp_path / "notebooks").mkdir(exist_ok=True)
+    write_command(tmp_path / "bin", "id", f"echo {uid}")
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path)}
+    call = ["make", "-s", "lab", *arguments]
+    return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize("name", ["plain", "a b", "it's $HOME; \"x\""])
+def test_the_lab_opens_any_session_and_as_root(tmp_path, name):
+    (tmp_path / name).mkdir()
+    said = lab(tmp_path, 0, "SESSION=" + name.replace("$", "$$"))
+    assert said.strip().endswith(f"LRFCAL_SESSION={tmp_path.resolve() / name}") and "--allow-root" in said
+    assert "--allow-root" not in lab(tmp_path, 1000) and lab(tmp_path, 1000).strip().endswith("LRFCAL_SESSION=")
+
+
+def test_setup_says_of_a_read_only_checkout_what_to_do(checkout):
+    write_command(checkout / "bin", "python3", FAKE_PYTHON)
+    write_command(checkout / "bin", "touch", "exit 1")
+    done = run_setup(checkout, checkout / "bin")
+    assert done.returncode == 1 and f"{checkout} cannot be written: copy the repository to a folder" in done.stderr
+    assert not (checkout / ".venv").exists()
+
+
 def test_setup_that_failed_is_done_again(checkout):
     write_command(checkout / "bin", "python3", FAKE_PYTHON + 'case "$*" in *pip*) exit 3 ;; esac')
     assert run_setup(checkout, checkout / "bin").returncode != 0

@@ -238,6 +238,12 @@ def test_no_stream():
         Camera.open(server.url, name="left")
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1:port", "127.0.0.1:99999", "[::1", "", "a" * 70, "x y", ":80"])
+def test_a_url_that_names_no_host(host):
+    with pytest.raises(PortError, match="gives no video: open http"):
+        Camera.open(f"http://{host}/left.mjpg", name="left", silence_s=0.3)
+
+
 def test_size_and_exposure_that_a_stream_cannot_set(server, caplog):
     asked = {"size": (640, 480), "exposure": 0.01}
     with Camera.open(server.url, name="left", **asked) as camera:

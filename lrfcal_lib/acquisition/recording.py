@@ -11,7 +11,7 @@ import numpy as np
 
 from lrfcal_lib.acquisition.checks import check_image, check_placement
 from lrfcal_lib.drivers.rig import Moved, Photographed, Scanned, Tracked
-from lrfcal_lib.session import SessionRecorder, open_session
+from lrfcal_lib.session import SessionError, SessionRecorder, open_session
 
 HOW = {
     "stop-and-go": "stop-and-go: the head rests at every pitch step, scans and images are taken at rest",
@@ -155,14 +155,33 @@ class Recording:
             self.writer.drop_placement(number)
 
     def finish(self):
-        """Close the session; without this it can still be opened, and the recording can go on."""
+        """Close the session; without this it can still be opened, and the recording can go on.
+
+        Raises
+        ------
+        RecordingError
+            If the session on the disk does not hold what was finished.
+        """
         with self._safely():
             self.writer.finish()
+        if self._readable() != set(self.finished):
+            raise RecordingError(f"{self.path}: {self.safe()}")
 
-    def safe(self):
-        """What is safe, as half a sentence."""
+    def safe(self, resume=False):
+        """What is safe on the disk and, if asked for, how to go on; half a sentence."""
+        there = self._readable()
+        if there is None or set(self.finished) - there:
+            return "the session was removed or damaged while it was recorded: record again, to another folder"
         numbers = ", ".join(map(str, self.finished))
-        return f"placements {numbers} are safe" if numbers else "no placement was finished"
+        safe = f"placements {numbers} are safe" if numbers else "no placement was finished"
+        return f"{safe}; --resume goes on from there" if resume else safe
+
+    def _readable(self):
+        """Numbers of the finished placements that a reader finds with their scans; None where there is no session."""
+        try:
+            return set(open_session(self.path).scans["placement"].tolist()) & set(self.finished)
+        except (SessionError, OSError):
+            return None if self.finished or not self.path.exists() else set()
 
     def _write(self, event):
         writer = self.writer
@@ -184,7 +203,7 @@ class Recording:
         except OSError as error:
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
             remedy = "free some space" if full else "check the disk and its permissions"
-            safe = f"{self.safe()}; --resume goes on from there" if hasattr(self, "writer") else "then record again"
+            safe = self.safe(resume=True) if hasattr(self, "writer") else "then record again"
             raise RecordingError(f"{self.path}: cannot be written ({error.strerror}): {remedy}; {safe}") from error
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import shutil
+import signal
 import sys
 import time
 
@@ -12,6 +14,7 @@ from lrfcal_lib.acquisition.recording import Recording, RecordingError
 from lrfcal_lib.drivers.errors import DeviceError
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.session import SessionError
 
 FAILED, INTERRUPTED = 2, 130  # exit codes
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
@@ -128,8 +131,8 @@ def record(rig, path, *, resume=False, count=None, advice=None, terminal=None):
         _close_views(recording, terminal)
         _placements(recording, terminal, advice)
         recording.finish()
-    except (DeviceError, KeyboardInterrupt) as error:
-        error.add_note(f"{recording.safe()}; --resume goes on from there")
+    except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal, see `emergency`
+        error.add_note(recording.safe(resume=True))
         raise
     return recording
 
@@ -194,7 +197,8 @@ def main(rig_file, path, *, resume=False, count=None, mode=None, advice=None, te
     Returns
     -------
     int
-        0; 2 after a message on stderr that says what to do; 130 after Ctrl-C. The head is stopped in any case.
+        0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal.
+        The head is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
@@ -204,12 +208,15 @@ def main(rig_file, path, *, resume=False, count=None, mode=None, advice=None, te
     except (DeviceError, RecordingError, ValueError) as error:
         return _failed(f"error: {error}", error, FAILED)
     except KeyboardInterrupt as error:
-        return _failed("stopped by Ctrl-C", error, INTERRUPTED)
+        return _failed("\nstopped by Ctrl-C", error, INTERRUPTED)
+    except SystemExit as error:
+        return _failed(f"\nstopped by {signal.Signals(error.code - 128).name}", error, error.code)
     print(f"{path}: {recording.safe()}; 'python -m lrfcal_lib calibrate {path}' calibrates the rig")
     return 0
 
 
 def _failed(text, error, code):
     """One line on stderr, notes included."""
-    print("; ".join(["\n" + text if code == INTERRUPTED else text, *getattr(error, "__notes__", [])]), file=sys.stderr)
+    with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
+        print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
     return code

@@ -23,7 +23,7 @@ def guard(device):
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not _on_signal:
+            if signal.getsignal(number) not in (_on_signal, signal.SIG_IGN):  # nohup ignores SIGHUP: go on
                 _before[number] = signal.signal(number, _on_signal)
 
 

@@ -6,6 +6,19 @@ import math
 from dataclasses import dataclass
 
 from lrfcal_lib.drivers.pelco_d import FASTEST
+from lrfcal_lib.drivers.stated import FLAG, check, either, listed, number, one_of, whole
+
+PERHAPS = one_of("auto", True, False)
+ANGLE, SPEED, SECONDS = number(-180, 180, "deg"), number(0.01, 360, "deg/s"), number(0, 60, "s")
+HEAD = {
+    "address": whole(0, 255), "baudrate": whole(50, 4_000_000), "feedback": PERHAPS, "absolute": PERHAPS,
+    "echo": PERHAPS, "pitch_limits_deg": listed(ANGLE, 2), "position_zero_deg": number(-360, 360, "deg"),
+    "invert": FLAG, "tilt_speed": whole(0, FASTEST), "degrees_per_second": either(SPEED, listed(SPEED, 2)),
+    "start_delay_s": number(-10, 10, "s"), "start_pitch_deg": ANGLE, "tolerance_deg": number(1e-4, 45, "deg"),
+    "arrival_deg": number(1e-4, 45, "deg"), "settle_s": SECONDS, "stall_s": SECONDS, "poll_s": SECONDS,
+    "reply_s": number(1e-3, 10, "s"), "gap_s": number(0, 10, "s"), "retries": whole(0, 20), "sends": whole(1, 20),
+    "repeat_s": number(1e-3, 60, "s"), "reconnect_s": number(0, 3600, "s"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -19,7 +32,8 @@ class HeadSettings:
     baudrate : int
         2400, the most common default; 9600 is the next.
     feedback : "auto" or bool
-        Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer.
+        Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not
+        state it means true: a silent head may as well be one with another address or rate.
     absolute : "auto" or bool
         Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
     echo : "auto" or bool
@@ -94,22 +108,10 @@ class HeadSettings:
     reconnect_s: float = 3.0
 
     def __post_init__(self):
-        for name in ("feedback", "absolute", "echo"):
-            self._need(name, getattr(self, name) in ("auto", True, False), '"auto", true or false')
-        self._need("address", self.address in range(256), "a byte, 0 to 255, as its DIP switches say")
-        self._need("tilt_speed", self.tilt_speed in range(FASTEST + 1), f"0 to {FASTEST}")
+        check(vars(self), HEAD, "head")
         low, high = self.pitch_limits_deg
-        self._need("pitch_limits_deg", -180 <= low < high <= 180, "(lowest, highest) within -180 to 180")
-        self._need("degrees_per_second", self.degrees_per_second is None or min(self.speeds_deg) > 0, "positive")
-        for name in ("baudrate", "tolerance_deg", "arrival_deg", "reply_s", "sends"):
-            self._need(name, getattr(self, name) > 0, "positive")
-        for name in ("settle_s", "stall_s", "poll_s", "gap_s", "retries", "reconnect_s"):
-            self._need(name, getattr(self, name) >= 0, "0 or more")
-        self._need("repeat_s", self.repeat_s is None or self.repeat_s > 0, "positive, or none")
-
-    def _need(self, name, holds, what):
-        if not holds:
-            raise ValueError(f"{name} of the head is {getattr(self, name)!r}: it must be {what}")
+        if low >= high:
+            raise ValueError(f"head.pitch_limits_deg is {low:g} to {high:g}: the lower one comes first")
 
     @property
     def speeds_deg(self):

@@ -275,15 +275,15 @@ class Link:
             window = next(windows)
             if any(self._answers(rate, window, end) for rate in rates):
                 return
-        tried = ", ".join(map(str, rates))
+        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}" + " (any)" * (self.address == 0)
         if self.heard > heard:
             raise WrongDevice(
-                f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried} Bd: "
+                f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
                 "another device, wires that echo, or a line that damages everything"
             )
         raise NoReply(
-            f"{self.path}: no reply at {tried} Bd: check power (ready up to 60 s after switching on), "
-            "whether RX and TX are crossed, and the jumper for RS-422 in the plug"
+            f"{self.path}: no reply at {tried}: check power (ready up to 60 s after switching on), "
+            "the address, whether RX and TX are crossed, and the jumper for RS-422 in the plug"
         )
 
     def _answers(self, rate, window, end):

@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 INSTALLATION = b"\x00"  # data of MODE
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
+CONFIGURED = ("unit", "measuring_mode", "realtime_indices")
 COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
 
 
@@ -48,8 +49,9 @@ class LMS2xxSetup:
 
     @classmethod
     def open(
-        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=logger, host=REAL
-    ):
+        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=logger, host=REAL,
+        **configuration,
+    ):  # fmt: skip
         """Find the device at a port whatever it is doing, stop its stream, and read what it is.
 
         Parameters
@@ -68,6 +70,8 @@ class LMS2xxSetup:
         log : logging.Logger
         host : Host
             Machine that the driver runs on; tests have a VirtualHost.
+        **configuration
+            Of :meth:`configure`.
 
         Returns
         -------
@@ -78,7 +82,7 @@ class LMS2xxSetup:
         PortError
             If the port is missing, forbidden, busy, or no serial line.
         NoReply, WrongDevice
-            If nothing, or something else answers.
+            If nothing, or something else answers, or a device in a measuring mode without ranges.
         ValueError
             For a rate or an address that no LMS2xx has, or a password of another length.
         """
@@ -91,7 +95,7 @@ class LMS2xxSetup:
             device._connect(baudrate or 38400, host.now() + find_s)
             if baudrate is not None and baudrate != device.baudrate:
                 device._set_rate(baudrate)
-            device._prepare()
+            device.configure(**configuration) if configuration else device._prepare()
         except BaseException:
             device._release()
             raise
@@ -145,6 +149,9 @@ class LMS2xxSetup:
         """Expect scans as the device is set now; these settings are those to come back to."""
         if self.variant not in VALUES:
             raise WrongDevice(f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does")
+        if (mode := self.configuration.measuring_mode) not in MODES:
+            text = f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are no ranges"
+            raise WrongDevice(f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set")
         self._settled = (self.baudrate, self.variant, self.configuration)
         told = self.variant, self.configuration, self.baudrate
         self._assembler = Assembler(*told, interlaced, self._counts, self._scan_clock)

@@ -37,21 +37,24 @@ class MjpegStream:
     Raises
     ------
     OSError
-        If nothing answers.
+        If nothing answers, or the URL names no host.
     """
 
     def __init__(self, url, timeout):
-        parts = urlsplit(url)
-        kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-        self._connection = kind(parts.hostname, parts.port, timeout=timeout)
         self._buffer, self._image, self._held, self.waited = b"", None, False, False
+        try:
+            parts = urlsplit(url)
+            kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+            self._connection = kind(parts.hostname or "", parts.port, timeout=timeout)
+        except (ValueError, http.client.HTTPException) as error:
+            raise OSError(f"no address of a stream: {error}") from error
         try:
             self._connection.connect()
             self._socket = self._connection.sock
             target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
             self._connection.request("GET", target, headers=_authorisation(parts))
             self._answer = self._connection.getresponse()
-        except (OSError, http.client.HTTPException) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:  # ValueError: names that no host can have
             self._connection.close()
             raise OSError(f"no answer: {error}") from error
         self.status = self._answer.status

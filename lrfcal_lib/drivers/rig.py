@@ -13,6 +13,7 @@ import numpy as np
 from lrfcal_lib.drivers.control import ask
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.host import REAL
+from lrfcal_lib.drivers.lms2xx import METRES, mode_of
 from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
 from lrfcal_lib.drivers.rig_events import Moved, Photographed, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import RigFileError
@@ -25,6 +26,8 @@ IMAGE_S = 30.0  # wait for one fresh image, a camera that comes back included
 BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
 GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
+FEWEST_SCANS, LEAST_SWEEP = 8, math.radians(10)  # of which can be told whether the view changed, even of a bare wall
+STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
 
 
 def host_clock():
@@ -96,12 +99,14 @@ class Rig:
 
     @property
     def lrf_info(self):
-        """The stated LrfInfo with the field of view, step and unit that the device has now."""
+        """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
         view, step = (180, 0.25) if self.stated.lrf_device.get("interlaced") else self.lrf.variant
-        unit = {"mm": 0.001, "cm": 0.01}[self.lrf.configuration.unit]
+        unit = METRES[self.lrf.configuration.unit]
+        longest = mode_of(self.lrf.configuration.measuring_mode).largest * unit
         ends = tuple(math.radians(90 + side * view / 2) for side in (-1, 1))
         model = self.stated.lrf.model or self.lrf.type
-        found = {"field_of_view": ends, "bearing_step": math.radians(step), "range_resolution": unit, "model": model}
+        found = {"field_of_view": ends, "bearing_step": math.radians(step), "range_resolution": unit, "model": model,
+                 "max_range": longest}  # fmt: skip
         return replace(self.stated.lrf, **found)
 
     def begin_telegrams(self):
@@ -156,11 +161,21 @@ class Rig:
         Raises
         ------
         DeviceError
-            Whatever happens, also when the generator is closed: the head is stopped, and the scans are.
+            Whatever happens, also when the generator is closed: the head is stopped, and the scans are. After a sweep
+            with a head that tells nothing, if the scans are all alike: it did not move.
         """
-        sweep = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go
+        sweep, seen = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go, []
         try:
-            yield from sweep(placement)
+            for event in sweep(placement):
+                if isinstance(event, Scanned) and not self.head.has_feedback:
+                    seen += [one.ranges for one in event.readings]
+                yield event
+            if len(seen) >= FEWEST_SCANS and np.ptp(placement.pitch) >= LEAST_SWEEP and unchanged(seen):
+                head = self.stated.head_settings
+                raise NoReply(
+                    f"the head did not move: all {len(seen)} scans of the sweep show the same; check its power, the "
+                    f"wires A and B, address {head.address} and {head.baudrate} Bd at {self.stated.head_device}"
+                )
         except BaseException:
             self.halt()
             raise
@@ -285,6 +300,29 @@ class Rig:
         return (tuple(readings[i] for i in inside), np.interp(instants[inside], times, pitch)), later
 
 
+def unchanged(scans):
+    """Whether scans differ by noise alone, as those of a head at rest do.
+
+    Parameters
+    ----------
+    scans : sequence of array_like, shape (B,)
+        Ranges in the order in which they were taken, metres; beams without a range in one of them do not count.
+
+    Returns
+    -------
+    bool
+        By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
+        something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same
+        wall at any pitch: a head that moves is never accused, one that does not is believed where much else moves.
+        False where no beam has a range in all scans.
+    """
+    ranges = np.array(scans)
+    ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
+    steps, spread = (np.diff(ranges, axis=0) ** 2).sum(axis=0), ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
+    ratio = np.divide(steps, spread, out=np.full(len(steps), 2.0), where=steps > 0)
+    return ratio.size > 0 and bool(ratio.mean() > STILL)
+
+
 def _stops(placement):
     """Stops of a sweep in the order of motion: pitch, whether scans are taken there, whether images."""
     scans, images = list(placement.pitch), list(placement.image_pitch)
@@ -322,16 +360,16 @@ def _open_head(stated, log, clock):
 
 def _open_lrf(stated, log, clock):
     from lrfcal_lib.drivers.lms2xx_device import LMS2xx
+    from lrfcal_lib.drivers.lms2xx_setup import CONFIGURED
 
     asked = stated.lrf_device
-    options = {key: asked[key] for key in ("baudrate", "address") if key in asked}
+    options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
     if "password" in asked:
         options["password"] = asked["password"].encode()
     lrf = LMS2xx.open(asked["port"], **options, log=log, clock=clock)
     try:
         if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
             lrf.set_variant(*asked["variant"])
-        lrf.configure(**{key: asked.get(key) for key in ("unit", "measuring_mode", "realtime_indices")})
     except BaseException:
         lrf.close()
         raise

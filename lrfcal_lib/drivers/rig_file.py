@@ -4,24 +4,40 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.board import Board
-from lrfcal_lib.drivers.head_settings import HeadSettings
+from lrfcal_lib.drivers.head_settings import ANGLE, HEAD, HeadSettings
+from lrfcal_lib.drivers.stated import FLAG, OBJECT, TEXT, Kind, check, either, listed, need, number, one_of, whole
 from lrfcal_lib.session import CameraInfo, LrfInfo
 from lrfcal_lib.session.stated import parse_session
 
 MODES = ("stop-and-go", "continuous")
 PURPOSES = ("board", "scene")
-LRF_KEYS = ("port", "baudrate", "address", "password", "variant", "unit", "measuring_mode", "realtime_indices",
-            "interlaced")  # fmt: skip
-CAMERA_KEYS = ("source", "size", "exposure", "fps", "silence_s")
-DEVICE_KEYS = ("lrf", "head", "cameras", "control")
-MOST_STOPS = 5000
+MOST_STOPS, FINEST_DEG, MOST_BYTES = 5000, 1e-3, 10_000_000
+DEVICES = {"lrf": OBJECT, "head": OBJECT, "cameras": OBJECT, "control": TEXT}
+LRF = {
+    "port": TEXT, "baudrate": one_of(9600, 19200, 38400, 500000), "address": whole(0, 127),
+    "password": Kind("a text of 8 ASCII characters", lambda v: TEXT.fits(v) and v.isascii() and len(v) == 8),
+    "variant": listed(number(0.25, 180, "deg"), 2), "unit": one_of("mm", "cm"), "measuring_mode": whole(0, 6),
+    "realtime_indices": FLAG, "interlaced": FLAG,
+}  # fmt: skip
+CAMERA = {
+    "source": either(TEXT, whole(0, 255)), "size": listed(whole(1, 100_000), 2), "exposure": number(1e-6, 60, "s"),
+    "fps": number(0.01, 10_000, "Hz"), "silence_s": number(0.1, 3600, "s"),
+}  # fmt: skip
+SWEEP, IMAGES, NUMBER = listed(ANGLE, 3), listed(ANGLE), whole(0, 999_999)
+PLACEMENT = {"number": NUMBER, "pitch_deg": SWEEP, "image_pitch_deg": IMAGES, "board": FLAG}
+PLAN = {
+    "pitch_deg": SWEEP, "image_pitch_deg": IMAGES, "mode": one_of(*MODES), "scans_per_stop": whole(1, 1000),
+    "sweep_speed": HEAD["tilt_speed"], "count": whole(1, 1000), "intrinsics_images": whole(0, 1000),
+    "placements": Kind("a list of at most 1000 objects", lambda v: isinstance(v, list | tuple) and len(v) <= 1000),
+}  # fmt: skip
 
 
 class RigFileError(ValueError):
@@ -85,12 +101,7 @@ class Plan:
     placements: tuple[dict, ...] = ()
 
     def __post_init__(self):
-        if self.mode not in MODES:
-            raise ValueError(f"plan.mode is {self.mode!r}: it is {' or '.join(MODES)}")
-        for name, least in (("scans_per_stop", 1), ("count", 1), ("intrinsics_images", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"plan.{name} is {value!r}: a whole number of {least} or more is needed")
+        check(vars(self), PLAN, "plan")
         self.to_do()
 
     def to_do(self, count=None):
@@ -110,18 +121,16 @@ class Plan:
             if len({one.number for one in listed}) < len(listed):
                 raise ValueError(f"plan.placements: numbers must differ, got {[one.number for one in listed]}")
             return listed[:count]
-        stops, images = _stops(self.pitch_deg, "plan.pitch_deg"), _angles(self.image_pitch_deg, "plan.image_pitch_deg")
+        stops, images = _stops(self.pitch_deg, "plan.pitch_deg"), _angles(self.image_pitch_deg)
         way = {0: slice(None, None, -1), 1: slice(None)}
         return [Placement(n, stops[way[n % 2]], images) for n in range(1, 1 + (count or self.count))]
 
     def _listed(self, one, i):
         where = f"plan.placements[{i}]"
-        _known(one, ("number", "pitch_deg", "image_pitch_deg", "board"), where)
-        number = one.get("number", i + 1)
-        if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-            raise ValueError(f"{where}.number is {number!r}: a whole number of 0 or more is needed")
+        one = check(one, PLACEMENT, where)
         stops = _stops(one.get("pitch_deg", self.pitch_deg), f"{where}.pitch_deg")
-        images = _angles(one.get("image_pitch_deg", self.image_pitch_deg), f"{where}.image_pitch_deg")
+        images = _angles(one.get("image_pitch_deg", self.image_pitch_deg))
+        number = one.get("number", i + 1)
         return Placement(number, stops, images, PURPOSES[not one.get("board", True)])
 
 
@@ -141,12 +150,12 @@ class RigFile:
         How well it is known: direction (radians) and offset (metres).
     cameras : dict of str to CameraInfo
     lrf_device : dict
-        Keys of `LRF_KEYS`.
+        Keys of `LRF`.
     head_device : str
         Its port.
     head_settings : HeadSettings
     camera_devices : dict of str to dict
-        Keys of `CAMERA_KEYS`, by camera.
+        Keys of `CAMERA`, by camera.
     control : str or None
         Control socket of an emulated rig.
     plan : Plan
@@ -189,22 +198,22 @@ def read_rig_file(path):
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text())
+        if path.stat().st_size > MOST_BYTES or not path.is_file():
+            raise RigFileError(f"{path}: no file, or one of more than {MOST_BYTES} bytes: name a rig file")
+        data = json.loads(path.read_bytes())
     except OSError as error:
         hint = "'python -m lrfcal_lib emulate --rig-file' writes an example"
         raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: not JSON ({error})") from error
     try:
         return checked(rig_of(data, path))
-    except KeyError as error:
-        raise RigFileError(f"{path}: key {error} is missing") from error
-    except (TypeError, AttributeError, ValueError) as error:
+    except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error
 
 
 def rig_of(data, path=Path("rig.json")):
-    """A RigFile of parsed JSON; KeyError, TypeError or ValueError for a wrong one.
+    """A RigFile of parsed JSON; TypeError, ValueError or ArithmeticError for a wrong one.
 
     Parameters
     ----------
@@ -216,28 +225,30 @@ def rig_of(data, path=Path("rig.json")):
     -------
     RigFile
     """
-    _object(data, "the file")
+    need(OBJECT, data, "the file")
     about = {"name": "rig", "licence": "", "source": "", "simulated": False, "placements": ()}
-    stated = parse_session({**about, **data})
-    devices = _known(_member(data, "devices", "the file"), DEVICE_KEYS, "devices")
-    lrf = _known(_member(devices, "lrf", "devices"), LRF_KEYS, "devices.lrf")
-    head = dict(_object(_member(devices, "head", "devices"), "devices.head"))
-    if lrf.get("port") is not None and lrf["port"] == head.get("port"):
+    data = _named({**about, **data})
+    for where in ("board", "rig", "rig.lrf", "rig.platform", "rig.cameras"):
+        need(OBJECT, reduce(lambda at, key: at[key], where.split("."), data), where)
+    stated = parse_session(data)
+    devices = check(data["devices"], DEVICES, "devices", ("lrf", "head"))
+    lrf = check(devices["lrf"], LRF, "devices.lrf", ("port",))
+    head = check(devices["head"], {"port": TEXT, **HEAD}, "devices.head", ("port",))
+    if lrf["port"] == head["port"]:
         raise ValueError(f"devices.lrf.port and devices.head.port are both {lrf['port']}: each device has its own")
-    cameras = _object(devices.get("cameras", {}), "devices.cameras")
-    for name, one in cameras.items():
-        _member(_known(one, CAMERA_KEYS, f"devices.cameras.{name}"), "source", f"devices.cameras.{name}")
+    cameras = {name: check(one, CAMERA, f"devices.cameras.{name}", ("source",))
+               for name, one in devices.get("cameras", {}).items()}  # fmt: skip
     _same_cameras(cameras, stated["cameras"])
     return RigFile(
         path=Path(path),
         about={key: stated[key] for key in ("licence", "source", "simulated")},
         **{key: stated[key] for key in ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras")},
-        lrf_device=_lrf_device(lrf),
-        head_device=_member(head, "port", "devices.head"),
-        head_settings=_head_settings(head),
+        lrf_device=lrf,
+        head_device=head.pop("port"),
+        head_settings=HeadSettings(**_tuples({"feedback": True, **head})),
         camera_devices=cameras,
         control=devices.get("control"),
-        plan=_plan(data.get("plan", {})),
+        plan=Plan(**_tuples(check(data.get("plan") or {}, PLAN, "plan"))),
     )
 
 
@@ -259,29 +270,26 @@ def checked(rig):
     return rig
 
 
-def _lrf_device(lrf):
-    _member(lrf, "port", "devices.lrf")
-    if lrf.get("unit", "mm") not in ("mm", "cm"):
-        raise ValueError(f"devices.lrf.unit is {lrf['unit']!r}: it is 'mm' or 'cm'")
-    variant = lrf.get("variant")
-    if variant is not None and (not isinstance(variant, list) or len(variant) != 2):
-        raise ValueError(f"devices.lrf.variant is {variant!r}: field of view and resolution, such as [180, 0.5]")
-    return lrf
+class _Named(dict):
+    """An object of a file that says where it stands when a key is missing."""
+
+    def __missing__(self, key):
+        raise ValueError(f"{self.where}{key} is missing")
 
 
-def _head_settings(head):
-    names = [f.name for f in fields(HeadSettings)]
-    _known(head, ("port", *names), "devices.head")
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in head.items() if k != "port"}
-    try:
-        return HeadSettings(**values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"devices.head: {error}") from error
+def _named(value, where=""):
+    """Parsed JSON whose objects know where they stand."""
+    if isinstance(value, list):
+        return [_named(one, f"{where[:-1]}[{i}].") for i, one in enumerate(value)]
+    if not isinstance(value, dict):
+        return value
+    named = _Named((key, _named(one, f"{where}{key}.")) for key, one in value.items())
+    named.where = where
+    return named
 
 
-def _plan(plan):
-    _known(plan, [f.name for f in fields(Plan)], "plan")
-    return Plan(**{k: tuple(v) if isinstance(v, list) else v for k, v in plan.items()})
+def _tuples(values):
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
 
 
 def _same_cameras(devices, stated):
@@ -298,40 +306,14 @@ def _same_cameras(devices, stated):
 
 def _stops(values, where):
     """Pitch angles of a sweep, radians: its ends are met, its step is not exceeded."""
-    first, last, step = _numbers(values, where, 3)
-    count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step > 0 else 0
+    first, last, step = values
+    count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step >= FINEST_DEG else 0
     if not 1 < count <= MOST_STOPS:
-        raise ValueError(f"{where} is {list(values)}: first, last, and a positive step for 2 to {MOST_STOPS} stops")
+        raise ValueError(
+            f"{where} is {list(values)}: first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops"
+        )
     return np.radians(np.linspace(first, last, count))
 
 
-def _angles(values, where):
-    return tuple(math.radians(v) for v in _numbers(values, where))
-
-
-def _numbers(values, where, count=None):
-    good = isinstance(values, list | tuple) and all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= 180 for v in values
-    )
-    if not good or len(values) != (len(values) if count is None else count):
-        raise ValueError(f"{where} is {values!r}: a list of {count or 'finite'} numbers in degrees is needed")
-    return values
-
-
-def _object(value, where):
-    if not isinstance(value, dict):
-        raise ValueError(f"{where} is {value!r}: an object with keys is needed")
-    return value
-
-
-def _known(value, keys, where):
-    for key in _object(value, where):
-        if key not in keys:
-            raise ValueError(f"{where}.{key} is not known; known are {', '.join(keys)}")
-    return value
-
-
-def _member(value, key, where):
-    if key not in _object(value, where):
-        raise ValueError(f"{where}.{key} is missing")
-    return value[key]
+def _angles(values):
+    return tuple(math.radians(v) for v in values)

@@ -204,7 +204,7 @@ class EmulatedRig:
             "lrf": {"port": self.lrf_port, "baudrate": 500000, "variant": [beam.field_of_view, beam.resolution / 100],
                     "unit": "mm" if beam.unit < 0.005 else "cm", "interlaced": False},
             "head": {"port": self.head_port, "address": self.pan_tilt.address, "baudrate": self.pan_tilt.baudrate,
-                     "pitch_limits_deg": low_high.round(6).tolist()},
+                     "feedback": self.pan_tilt.reply_kind != "none", "pitch_limits_deg": low_high.round(6).tolist()},
             "cameras": {name: {"source": url, "size": size[name], "silence_s": SILENCE_S}
                         for name, url in self.camera_urls.items()},
             "control": self.control,
@@ -401,7 +401,7 @@ def parser():
 
 
 def main(argv=None):
-    """Emulate a rig until Ctrl-C or SIGTERM.
+    """Emulate a rig until Ctrl-C, SIGTERM or SIGHUP.
 
     Parameters
     ----------
@@ -418,8 +418,9 @@ def main(argv=None):
         For options that no rig has.
     """
     args, quit_ = parser().parse_args(argv), threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: quit_.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
+            signal.signal(number, lambda *_: quit_.set())
     head = {"feedback": args.feedback, "reply": args.reply, "echo": args.echo, "baudrate": args.head_baudrate}
     with EmulatedRig(
         args.setup, folder=args.folder, seed=args.seed, time_scale=args.time_scale, cameras=not args.no_cameras,
