@@ -138,7 +138,7 @@ def test_one_image_and_wrong_names(rig):
 
 def test_no_image_while_the_head_moves(rig):
     """A new one afterwards, which shows the new pitch."""
-    cameras, head = rig._cameras, rig.world.head
+    cameras, head = rig.camera_server, rig.world.head
     until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
     before = cameras.image("left", timeout=DEADLINE)[0]
     head.move(rig.clock.now(), head.measured(rig.clock.now()) + 0.2, 0.2)
@@ -180,11 +180,11 @@ def test_an_image_is_drawn_only_where_the_head_rests_long_enough(setup, placemen
 def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
     small = replace(setup, rig=scaled(setup.rig, 64))
     with EmulatedRig(small, placements=placements) as rig:
-        until(lambda: rig._cameras.image("left")[0] is not None, "an image")
-        for process in rig._cameras._pool._processes.values():
+        until(lambda: rig.camera_server.image("left")[0] is not None, "an image")
+        for process in rig.camera_server._pool._processes.values():
             process.kill()
         rig.place(2)
-        until(lambda: rig._cameras.image("left") == (None, None) and rig.error() is not None, "the error")
+        until(lambda: rig.camera_server.image("left") == (None, None) and rig.error() is not None, "the error")
     assert "the process that draws the images ended" in caplog.text
 
 

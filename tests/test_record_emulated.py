@@ -1,16 +1,18 @@
 """From the emulated devices to a calibration: the same as the simulator's own session of the same placements gives."""
 
 import json
-import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from lrfcal_lib.acquisition import Terminal, check_placement, record
+from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators import EmulatedRig
 from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.evaluate import trusted_sigma
@@ -22,9 +24,8 @@ from lrfcal_lib.simulate import record as simulated
 from lrfcal_lib.simulate.placements import pairs
 from lrfcal_lib.simulate.setups import sim_quick
 
-METHOD = "line"
+METHOD, DEADLINE = "line", 180.0  # s, against hanging
 STEP = np.radians(1.25)
-QUICKLY = 5.0  # times as fast as real devices
 
 
 def small_setup():
@@ -59,19 +60,36 @@ def simulated_session(setup, tmp_path_factory):
     return open_session(path)
 
 
+class Still:
+    """A camera in virtual time, which stands still while an image is drawn."""
+
+    def __init__(self, rig, name):
+        self.rig, self.name, self.settings, self.count = rig, name, {"warnings": []}, 0
+
+    def newest(self, after=None, timeout=None):
+        self.rig.clock.machine.sleep(0.5)
+        _, data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
+        self.count += 1
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        return Frame(image, self.rig.clock.machine.time(), self.count)
+
+    def close(self):
+        pass
+
+
 @pytest.fixture(scope="module")
 def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
-    folder, begun = tmp_path_factory.mktemp("recorded"), time.monotonic()
+    folder, host = tmp_path_factory.mktemp("recorded"), VirtualHost()
     with EmulatedRig(
-        setup[0], placements=setup[1], time_scale=QUICKLY, platform={"settle": 0.2}, rest_s=2.0,
+        setup[0], placements=setup[1], machine=host, platform={"settle": 0.2}, rest_s=0.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
         data = state_intrinsics(emulated.rig_file(), setup[0])
-        data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
+        data["devices"]["head"] |= {"settle_s": 0.25, "poll_s": 0.05, "gap_s": 0.025}  # the head wobbles for 0.2 s
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
-        with Rig.open(stated, clock=lambda: begun + QUICKLY * (time.monotonic() - begun)) as rig:
+        with Rig.open(stated, clock=host.time, host=host, camera=lambda name: Still(emulated, name)) as rig:
             record(rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself")))
     return open_session(folder / "s")
 

@@ -56,7 +56,7 @@ class Rig:
         self._closing, self._now = contextlib.ExitStack(), host.now
 
     @classmethod
-    def open(cls, stated, *, log=LOG, clock=None):
+    def open(cls, stated, *, log=LOG, clock=None, host=REAL, camera=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
         Parameters
@@ -65,6 +65,10 @@ class Rig:
         log : logging.Logger
         clock : callable, optional
             :func:`host_clock` by default.
+        host : Host
+            Machine that the drivers run on; tests have a VirtualHost.
+        camera : callable, optional
+            Opens a camera by its name, for images that come from elsewhere than the source stated.
 
         Returns
         -------
@@ -77,13 +81,14 @@ class Rig:
         """
         clock = clock or host_clock()
         with contextlib.ExitStack() as stack:
-            head = stack.enter_context(_named("head", _open_head, stated, log, clock))
-            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, log, clock))
-            cameras = {}
+            options = {"log": log, "clock": clock}
+            head = stack.enter_context(_named("head", _open_head, stated, host=host, **options))
+            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, host=host, **options))
+            cameras, opener = {}, _open_camera if camera is None else lambda _, name, **options: camera(name)
             for name in stated.cameras:
-                cameras[name] = _named(f"camera '{name}'", _open_camera, stated, name, log, clock)
+                cameras[name] = _named(f"camera '{name}'", opener, stated, name, **options)
                 stack.callback(cameras[name].close)
-            rig = cls(stated, lrf, head, cameras, clock=clock)
+            rig = cls(stated, lrf, head, cameras, clock=clock, host=host)
             rig._closing = stack.pop_all()
         return rig
 
@@ -341,10 +346,10 @@ def _share(pitch, first, last):
     return float(np.clip((pitch - first) / (last - first), 0, 1))
 
 
-def _named(device, opener, *arguments):
+def _named(device, opener, *arguments, **options):
     """Open a device; its name stands before the message of whatever goes wrong."""
     try:
-        return opener(*arguments)
+        return opener(*arguments, **options)
     except DeviceError as error:
         error.args = (f"{device}: {error}", *error.args[1:])
         raise
@@ -352,13 +357,13 @@ def _named(device, opener, *arguments):
         raise RigFileError(f"{arguments[0].path}: {device}: {error}") from error
 
 
-def _open_head(stated, log, clock):
+def _open_head(stated, **options):
     from lrfcal_lib.drivers.pan_tilt import PanTilt
 
-    return PanTilt.open(stated.head_device, stated.head_settings, log=log, clock=clock)
+    return PanTilt.open(stated.head_device, stated.head_settings, **options)
 
 
-def _open_lrf(stated, log, clock):
+def _open_lrf(stated, **given):
     from lrfcal_lib.drivers.lms2xx_device import LMS2xx
     from lrfcal_lib.drivers.lms2xx_setup import CONFIGURED
 
@@ -366,7 +371,7 @@ def _open_lrf(stated, log, clock):
     options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
     if "password" in asked:
         options["password"] = asked["password"].encode()
-    lrf = LMS2xx.open(asked["port"], **options, log=log, clock=clock)
+    lrf = LMS2xx.open(asked["port"], **options, **given)
     try:
         if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
             lrf.set_variant(*asked["variant"])
@@ -376,13 +381,13 @@ def _open_lrf(stated, log, clock):
     return lrf
 
 
-def _open_camera(stated, name, log, clock):
+def _open_camera(stated, name, **given):
     from lrfcal_lib.drivers.video import Camera
 
     asked, info = stated.camera_devices[name], stated.cameras[name]
     options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
     size = (info.width, info.height)
-    camera = Camera.open(asked["source"], name=name, size=size, **options, log=log, clock=clock)
+    camera = Camera.open(asked["source"], name=name, size=size, **options, **given)
     got = camera.settings["size"]["got"]
     if got is not None and tuple(got) != (info.width, info.height):
         camera.close()

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.rig import host_clock
 from lrfcal_lib.emulators.head import FEEDBACK, REPLIES, EmulatedHead
 from lrfcal_lib.emulators.line import FAULTS, Clock
@@ -72,6 +73,8 @@ class EmulatedRig:
         Pixels; the field of view stays.
     quality, fps, rest_s
         Of :class:`CameraServer`.
+    machine : Host
+        On a VirtualHost the ports are in memory.
 
     Attributes
     ----------
@@ -80,6 +83,7 @@ class EmulatedRig:
     world : EmulatedWorld
     lrf_port, head_port, control : str
         Paths.
+    camera_server : CameraServer or None
     camera_urls : dict of str to str
     faults : dict of str to Faults
         'lrf' and 'head'.
@@ -93,12 +97,12 @@ class EmulatedRig:
 
     def __init__(self, setup="sim_quick", *, folder=None, seed=0, placements=None, time_scale=1.0, lrf_options=None,
                  head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0,
-                 rest_s=0.5):  # fmt: skip
+                 rest_s=0.5, machine=REAL):  # fmt: skip
         if isinstance(setup, str) and setup not in SETUPS:
             raise ValueError(f"no set-up '{setup}'; there are {', '.join(SETUPS)}")
         setup = SETUPS[setup]() if isinstance(setup, str) else setup
         rig = replace(setup.rig, platform=replace(setup.rig.platform, **(platform or {})))
-        setup, self.clock = replace(setup, rig=rig), Clock(time_scale)
+        setup, self.clock = replace(setup, rig=rig), Clock(time_scale, machine)
         self.setup = setup if image_width is None else replace(setup, rig=scaled(rig, image_width))
         self._own = None if folder else tempfile.mkdtemp(prefix="lrfcal-")
         self.folder = Path(folder or self._own)
@@ -111,9 +115,9 @@ class EmulatedRig:
         self.faults, self.scans = {"lrf": self.lrf.faults, "head": self.pan_tilt.faults}, self.lrf.scans
         self.lrf_port, self.head_port, self.control = self.lrf.path, self.pan_tilt.path, str(self.folder / "control")
         shown = {"quality": quality, "fps": fps, "seed": seed, "rest_s": rest_s}
-        self._cameras = CameraServer(self.world, self.setup, **shown) if cameras else None
-        self.camera_urls = self._cameras.urls if cameras else {}
-        parts = (self.lrf, self.pan_tilt, self._cameras, ControlSocket(self.control, self))
+        self.camera_server = CameraServer(self.world, self.setup, **shown) if cameras else None
+        self.camera_urls = self.camera_server.urls if cameras else {}
+        parts = (self.lrf, self.pan_tilt, self.camera_server, ControlSocket(self.control, self))
         self._parts = [part for part in parts if part is not None]
 
     def start(self):
@@ -152,7 +156,7 @@ class EmulatedRig:
 
     def error(self):
         """What ended a device by itself, None while all live."""
-        return self.lrf.error or self.pan_tilt.error or (self._cameras and self._cameras.error)
+        return self.lrf.error or self.pan_tilt.error or (self.camera_server and self.camera_server.error)
 
     def status(self):
         """The devices now, as JSON."""
