@@ -125,10 +125,22 @@ class FakeHead(SerialDevice):
         self.port.plug()
 
 
-def opened(settings=FAST, **habits):
-    """A head and its driver."""
-    device = FakeHead(**habits)
-    return device, PanTilt.open(device.path, settings, host=device.host)
+HEADS = []
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    """Close what a test opened."""
+    yield
+    while HEADS:
+        HEADS.pop().close()
+
+
+def opened(settings=FAST, device=None, **habits):
+    """A head and its driver, which is closed at the end of the test."""
+    device = device or FakeHead(**habits)
+    HEADS.append(PanTilt.open(device.path, settings, host=device.clock.machine))
+    return device, HEADS[-1]
 
 
 def near(degrees, tolerance=0.6):
@@ -646,8 +658,7 @@ KINDS = {
 
 
 def emulated(settings=QUICK, settle=0.1, **options):
-    device = virtual.head(head=Head(Platform(settle=settle)), **options)
-    return device, PanTilt.open(device.path, settings, host=device.clock.machine)
+    return opened(settings, virtual.head(head=Head(Platform(settle=settle)), **options))
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
