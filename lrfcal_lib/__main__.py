@@ -58,7 +58,7 @@ def _record(args):
 
 
 def _emulate(args):
-    from lrfcal_lib.drivers.emulators.run import main
+    from lrfcal_lib.emulators.rig import main
 
     return main(args.rest)
 

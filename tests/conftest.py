@@ -74,9 +74,7 @@ LONGEST = (
     "test_record_emulated",
     "test_image",
     "test_panel_browser",
-    "test_lms2xx_device",
     "test_record_bad_input",
-    "test_pan_tilt",
     "test_real_lms400",
 )
 
@@ -84,13 +82,3 @@ LONGEST = (
 def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that test runners side by side finish together."""
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
-
-
-REAL_TIME = ("test_record", "test_video")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_itemcollected(item):
-    """Devices are emulated in real time: a machine that is busy for a second gets a second chance."""
-    if item.path.stem.startswith(REAL_TIME):
-        item.add_marker(pytest.mark.flaky(reruns=2))

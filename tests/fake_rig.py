@@ -2,7 +2,6 @@
 
 import json
 import math
-import time
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -154,7 +153,6 @@ class Lrf(Device):
         pitch = self.head.at if self.head.sweep is None else float(self.head.true(instant))
         if self.head.sweep is not None:
             self.head.note()
-            time.sleep(0.01)  # a batch of a sweep ends by the real time
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
         reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times)
         self.readings.append(reading)
@@ -190,7 +188,7 @@ class Lrf(Device):
                 raise NoReply("no new scan: the stream is silent")
             instant = (self.clock() if after is None else max(after, self.clock())) + LAZY_S - self.stale
             out.append(self._scan(instant))
-            self.clock.now = max(self.clock.now, instant + SCAN_S)
+            self.clock.now = max(self.clock.now, instant) + SCAN_S
         return out
 
 
@@ -235,7 +233,7 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
     stated = checked(rig_of(json.loads(json.dumps(data or rig_data()))))
     head = Head(clock, feedback, silent_moving)
     cameras = {name: Camera(name, head, clock) for name in stated.cameras}
-    rig = Rig(stated, Lrf(head, clock), head, cameras, clock=clock)
+    rig = Rig(stated, Lrf(head, clock), head, cameras, clock=clock, host=SimpleNamespace(now=clock))
     rig._closing.callback(head.close)
     return rig
 

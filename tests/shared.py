@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
+STRINGS = int(os.environ.get("LRFCAL_FUZZ", 20_000))  # random byte strings for each parser; a million in make fuzz
 
 
 def shared_folder():

@@ -15,13 +15,11 @@ import pytest
 import serial
 
 from lrfcal_lib.drivers.control import ask
-from lrfcal_lib.drivers.emulators import EmulatedRig, Head
-from lrfcal_lib.drivers.emulators.camera import CameraServer, scaled
-from lrfcal_lib.drivers.emulators.line import Clock
-from lrfcal_lib.drivers.emulators.run import main, summary
-from lrfcal_lib.drivers.emulators.world import EmulatedWorld
 from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.emulators import Clock, EmulatedRig, Head
+from lrfcal_lib.emulators.rig import main, summary
+from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import world_of
@@ -139,7 +137,7 @@ def test_one_image_and_wrong_names(rig):
 
 def test_no_image_while_the_head_moves(rig):
     """A new one afterwards, which shows the new pitch."""
-    cameras, head = rig._cameras, rig.world.head
+    cameras, head = rig.camera_server, rig.world.head
     until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
     before = cameras.image("left", timeout=DEADLINE)[0]
     head.move(rig.clock.now(), head.measured(rig.clock.now()) + 0.2, 0.2)
@@ -181,11 +179,11 @@ def test_an_image_is_drawn_only_where_the_head_rests_long_enough(setup, placemen
 def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
     small = replace(setup, rig=scaled(setup.rig, 64))
     with EmulatedRig(small, placements=placements) as rig:
-        until(lambda: rig._cameras.image("left")[0] is not None, "an image")
-        for process in rig._cameras._pool._processes.values():
+        until(lambda: rig.camera_server.image("left")[0] is not None, "an image")
+        for process in rig.camera_server._pool._processes.values():
             process.kill()
         rig.place(2)
-        until(lambda: rig._cameras.image("left") == (None, None) and rig.error() is not None, "the error")
+        until(lambda: rig.camera_server.image("left") == (None, None) and rig.error() is not None, "the error")
     assert "the process that draws the images ended" in caplog.text
 
 
@@ -279,7 +277,7 @@ def test_a_rig_that_is_sped_up_says_what_it_is_for(setup):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_command_line_cleans_up(tmp_path, number):
     file, folder = tmp_path / "rig.json", tmp_path / "ports"
-    code = "import sys; from lrfcal_lib.drivers.emulators.run import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from lrfcal_lib.emulators.rig import main; sys.exit(main(sys.argv[1:]))"
     call = [sys.executable, "-c", code, "--no-cameras", "--rig-file", str(file), "--folder", str(folder)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
     until(lambda: file.exists() or run.poll() is not None, "the rig file")

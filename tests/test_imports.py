@@ -37,11 +37,8 @@ MODULES = sorted(LIBRARY.rglob("*.py"))
 
 
 def part_of(names):
-    """First name below the library; of the drivers, codecs (sessions are read with them) and emulators count apart."""
-    second = names[1] if names[0] == "drivers" and len(names) > 1 else None
-    if second in CODECS:
-        return "codecs"
-    return "emulators" if second == "emulators" else names[0]
+    """First name below the library; of the drivers, codecs (sessions are read with them) count apart."""
+    return "codecs" if names[0] == "drivers" and CODECS.intersection(names[1:2]) else names[0]
 
 
 def imported_parts(path):

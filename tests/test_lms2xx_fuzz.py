@@ -1,4 +1,4 @@
-"""A million random and damaged byte strings through the parsers of the LMS2xx: values, or TelegramError, nothing else.
+"""Random and damaged byte strings through the parsers of the LMS2xx: values, or TelegramError, nothing else.
 
 Strings are put side by side into streams where the parser takes streams. Because hardly any damaged string has a sound
 checksum, those for the contents of telegrams get theirs after the damage.
@@ -9,6 +9,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from shared import STRINGS
 
 from lrfcal_lib.drivers import lms2xx_replies
 from lrfcal_lib.drivers.lms2xx import (
@@ -23,8 +24,7 @@ from lrfcal_lib.drivers.lms2xx import (
     split_stream,
 )
 
-STREAMED, CONTENTS, SINGLE = 480_000, 500_000, 20_000  # strings, a million in all
-TRACED = 0.8  # share of the strings after which every byte is traced, which takes time; before, objects are counted
+ROUNDS, TRACED = 10, 3  # in the last rounds every byte is traced, which takes time; in all of them objects are counted
 MEMORY, OBJECTS = 200_000, 2000  # bytes and objects that may stay allocated
 
 
@@ -63,7 +63,7 @@ def _sound(strings):
 
 
 def _parse_streams(rng, seeds, count):
-    """Strings in streams; returns how many, and how many of their places were telegrams."""
+    """Strings in streams; returns how many of their places were telegrams."""
     found = 0
     for seed in seeds:
         strings, lengths = _strings(rng, seed, count)
@@ -75,21 +75,20 @@ def _parse_streams(rng, seeds, count):
         for group in decode_scans(data, stream.offset, stream.length, int(rng.choice(list(MODES)))):
             assert group.words.shape == group.ranges.shape == group.reasons.shape
         found += len(stream.offset)
-    return count * len(seeds), found
+    return found
 
 
 def _parse_contents(rng, seeds, count):
     """Scans with damaged contents and sound checksums, many at once."""
-    scans = [seed for seed in seeds if seed[4] == 0xB0]
     values = 0
-    for seed in scans:
+    for seed in seeds:
         strings, _ = _strings(rng, seed, count)
         strings[:, 4] = 0xB0
         data, offset, length = _sound(strings)
         for group in decode_scans(data, offset, length, int(rng.choice(list(MODES)))):
             assert np.all(np.isfinite(group.ranges) == (group.reasons == 0))
             values += group.words.size
-    return count * len(scans), values
+    return values
 
 
 def _parse_single(rng, seeds, count):
@@ -111,7 +110,7 @@ def _parse_single(rng, seeds, count):
                 outcomes[True] += 1
             except TelegramError:
                 outcomes[False] += 1
-    return count * len(seeds), outcomes
+    return outcomes
 
 
 @pytest.fixture(scope="module")
@@ -119,36 +118,31 @@ def seeds():
     return _seeds(np.random.default_rng(0))
 
 
-def _rounds(parse, seeds, total, size):
-    """Run a parser until `total` strings are parsed; its results, and how many bytes stayed allocated."""
-    rng, done, results, objects, kept = np.random.default_rng(20091001), 0, [], [], []
+def _rounds(parse, seeds, total):
+    """Run a parser on so many strings; its results. Nothing may stay allocated."""
+    rng, results, objects, kept = np.random.default_rng(20091001), [], [], []
     try:
-        while done < total or len(kept) < 3:
-            if done >= TRACED * total and not tracemalloc.is_tracing():
+        for number in range(ROUNDS):
+            if number == ROUNDS - TRACED:
                 tracemalloc.start()
-            count, result = parse(rng, seeds, size)
-            done += count
-            results.append(result)
+            results.append(parse(rng, seeds, -(-int(total) // (ROUNDS * len(seeds)))))
             objects.append(sys.getallocatedblocks())
             kept += [tracemalloc.get_traced_memory()[0]] if tracemalloc.is_tracing() else []
     finally:
         tracemalloc.stop()
-    assert objects[-1] - objects[0] < OBJECTS
-    return results, kept[-1] - kept[0]
+    assert objects[-1] - objects[ROUNDS // 2] < OBJECTS and kept[-1] - kept[0] < MEMORY
+    return results
 
 
 def test_streams_of_damaged_strings(seeds):
-    found, growth = _rounds(_parse_streams, seeds, STREAMED, 2000)
-    assert sum(found) > STREAMED / 20  # those that were not hit, or not hit hard enough
-    assert growth < MEMORY
+    found = sum(_rounds(_parse_streams, seeds, 0.48 * STRINGS))
+    assert found > 0.02 * STRINGS  # those that were not hit, or not hit hard enough
 
 
 def test_scans_with_damaged_contents(seeds):
-    values, growth = _rounds(_parse_contents, seeds, CONTENTS, 2000)
-    assert sum(values) > 0 and growth < MEMORY
+    assert sum(_rounds(_parse_contents, [seed for seed in seeds if seed[4] == 0xB0], 0.5 * STRINGS)) > 0
 
 
 def test_damaged_replies_one_by_one(seeds):
-    outcomes, growth = _rounds(_parse_single, seeds, SINGLE, 100)
-    assert min(sum(one[way] for one in outcomes) for way in (True, False)) > SINGLE / 20
-    assert growth < MEMORY
+    outcomes = _rounds(_parse_single, seeds, 0.02 * STRINGS)
+    assert min(sum(one[way] for one in outcomes) for way in (True, False)) > 0.001 * STRINGS

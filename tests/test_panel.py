@@ -9,9 +9,9 @@ import pytest
 from fake_rig import SIZE, make_rig, opened, rig_data
 
 from lrfcal_lib.acquisition import Light, RecordingError
-from lrfcal_lib.drivers.emulators import practice
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.emulators import rig as practice
 from lrfcal_lib.panel import Busy, Collector, Interrupted, Panel, collector, result, widgets, words
 from lrfcal_lib.panel.pictures import SweepPicture, TopView, jpeg, png, reach_of
 from lrfcal_lib.session import SessionError, open_session, validate

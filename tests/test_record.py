@@ -288,14 +288,21 @@ def in_child(work, *arguments):
     os._exit(1)
 
 
-def record_slowly(data, path, told):
-    """What the child does; `told` is a pipe that hears of every finished placement."""
-    rig, recording = make_rig(data), None
-    rig.lrf.wait = lambda: time.sleep(0.001)
-    while recording is None:  # while somebody else records
+def record_and_die(data, path, told, writes):
+    """What a child does; `told` is a pipe that hears of every finished placement, `writes` how many are safe."""
+    rig, fsync, left, recording = make_rig(data), os.fsync, iter(range(writes)), None
+
+    def dying(handle):
+        if next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        fsync(handle)
+
+    until = time.monotonic() + 60.0  # against hanging
+    while recording is None and time.monotonic() < until:  # while somebody else records
         with contextlib.suppress(SessionError):
             recording = Recording(rig, path, resume=True)
-        rig.lrf.wait()
+        time.sleep(0.001)
+    os.fsync = dying
     for placement in recording.to_do():
         for _ in recording.run(placement):
             pass
@@ -308,13 +315,9 @@ def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(tmp_path):
     plan = {placement.number: placement for placement in rig.stated.plan.to_do()}
     for _ in range(20):
         read_end, write_end = os.pipe()
-        children = [in_child(record_slowly, data, path, write_end) for _ in range(2)]
+        children = [in_child(record_and_die, data, path, write_end, int(n)) for n in rng.integers(60, size=2)]
         os.close(write_end)
         with os.fdopen(read_end, "rb", buffering=0) as stream:
-            known |= set(stream.read(rng.integers(3)))  # waits for none to two placements
-            time.sleep(rng.uniform(0.0, 0.1))
-            for child in children:
-                os.kill(child, signal.SIGKILL)
             known |= set(stream.read())
         ends = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
         assert ends == {-signal.SIGKILL}, "one ended before it was killed"
@@ -658,7 +661,7 @@ def test_the_command_line_passes_everything_on(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         command_line.main(["record", "rig.json", "s", "--placements", "0"])
     assert "1 or more are needed" in capsys.readouterr().err
-    monkeypatch.setattr("lrfcal_lib.drivers.emulators.run.main", lambda rest: got.update(rest=rest) or 0)
+    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda rest: got.update(rest=rest) or 0)
     assert command_line.main(["emulate", "sim_quick", "--rig-file", "x.json"]) == 0
     assert got["rest"] == ["sim_quick", "--rig-file", "x.json"]
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lrfcal_lib.drivers.emulators import EmulatedRig
-from lrfcal_lib.drivers.emulators.practice import practice_setup
-from lrfcal_lib.session import model_to_json, open_session, validate
+from lrfcal_lib.emulators import EmulatedRig
+from lrfcal_lib.emulators.rig import practice_setup, quick_file
+from lrfcal_lib.session import open_session, validate
 
 DEADLINE = 120.0  # s, against hanging
 FORBIDDEN = """
@@ -62,14 +62,7 @@ def rig():
 @pytest.fixture
 def stated(rig):
     """Its rig file, to be spoilt."""
-    return rig_file(rig)
-
-
-def rig_file(rig):
-    data = rig.rig_file()
-    data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.02, "gap_s": 0.005}
-    data["rig"]["cameras"]["left"]["intrinsics"] = model_to_json(rig.setup.rig.cameras[0].model)
-    return data
+    return quick_file(rig)
 
 
 class Program:
@@ -199,7 +192,7 @@ def contents(path, number):
 
 def test_a_disk_that_is_full_in_a_sweep(tmp_path, two):
     """The second placement breaks off between its stops; the first one stays, and --resume repeats the second."""
-    path, data = tmp_path / "s", rig_file(two)
+    path, data = tmp_path / "s", quick_file(two)
     code, _, err = Program(tmp_path, data, code=FULL).end()
     assert code == 2 and "Traceback" not in err and "\n" not in err
     assert "cannot be written (No space left on device): free some space; placements 1 are safe" in err

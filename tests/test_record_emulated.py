@@ -1,18 +1,20 @@
 """From the emulated devices to a calibration: the same as the simulator's own session of the same placements gives."""
 
 import json
-import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from lrfcal_lib.acquisition import Terminal, check_placement, record
-from lrfcal_lib.drivers.emulators import EmulatedRig
-from lrfcal_lib.drivers.emulators import camera as emulated_camera
+from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.drivers.video import Frame
+from lrfcal_lib.emulators import EmulatedRig
+from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.joint_calibration import calibrate_jointly
 from lrfcal_lib.pairing import observe_all
 from lrfcal_lib.pipeline import calibrate_cameras, calibrate_platform, prepare
@@ -20,14 +22,13 @@ from lrfcal_lib.session import model_to_json, open_session, validate
 from lrfcal_lib.simulate import record as simulated
 from lrfcal_lib.simulate.rig import PLACES, pairs, random, sim_quick
 
-METHOD = "line"
+METHOD, DEADLINE = "line", 180.0  # s, against hanging
 STEP = np.radians(1.25)
-QUICKLY = 5.0  # times as fast as real devices
 
 
 def small_setup():
     """Six placements, coarse sweeps, one camera with known intrinsics and one small image a placement."""
-    rig = emulated_camera.scaled(sim_quick().rig, 480)
+    rig = scaled(sim_quick().rig, 480)
     setup = replace(sim_quick(), rig=replace(rig, cameras=rig.cameras[:1]), pairs=3, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0))
@@ -57,19 +58,36 @@ def simulated_session(setup, tmp_path_factory):
     return open_session(path)
 
 
+class Still:
+    """A camera in virtual time, which stands still while an image is drawn."""
+
+    def __init__(self, rig, name):
+        self.rig, self.name, self.settings, self.count = rig, name, {"warnings": []}, 0
+
+    def newest(self, after=None, timeout=None):
+        self.rig.clock.machine.sleep(0.5)
+        _, data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
+        self.count += 1
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        return Frame(image, self.rig.clock.machine.time(), self.count)
+
+    def close(self):
+        pass
+
+
 @pytest.fixture(scope="module")
 def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
-    folder, begun = tmp_path_factory.mktemp("recorded"), time.monotonic()
+    folder, host = tmp_path_factory.mktemp("recorded"), VirtualHost()
     with EmulatedRig(
-        setup[0], placements=setup[1], time_scale=QUICKLY, platform={"settle": 0.2}, rest_s=2.0,
+        setup[0], placements=setup[1], machine=host, platform={"settle": 0.2}, rest_s=0.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
         data = state_intrinsics(emulated.rig_file(), setup[0])
-        data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
+        data["devices"]["head"] |= {"settle_s": 0.25, "poll_s": 0.05, "gap_s": 0.025}  # the head wobbles for 0.2 s
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
-        with Rig.open(stated, clock=lambda: begun + QUICKLY * (time.monotonic() - begun)) as rig:
+        with Rig.open(stated, clock=host.time, host=host, camera=lambda name: Still(emulated, name)) as rig:
             record(rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself")))
     return open_session(folder / "s")
 

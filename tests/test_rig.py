@@ -444,7 +444,7 @@ def fake_openers(monkeypatch, **instead):
     head = Head(clock)
 
     def opener(name, device):
-        def make(*arguments):
+        def make(*arguments, **options):
             if name in instead:
                 raise instead[name]
             made.append(name)
@@ -543,8 +543,8 @@ def test_a_camera_of_another_size_is_refused(monkeypatch):
             closed.append(self)
 
     monkeypatch.setattr("lrfcal_lib.drivers.video.Camera.open", lambda *args, **options: Small())
-    monkeypatch.setattr(rig_module, "_open_head", lambda *args: Head(Clock()))
-    monkeypatch.setattr(rig_module, "_open_lrf", lambda *args: Lrf(None, None))
+    monkeypatch.setattr(rig_module, "_open_head", lambda *args, **_: Head(Clock()))
+    monkeypatch.setattr(rig_module, "_open_lrf", lambda *args, **_: Lrf(None, None))
     with pytest.raises(RigFileError, match=r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"):
         Rig.open(stated_rig())
     assert len(closed) == 1

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.errors import LineLost, PortError
-from lrfcal_lib.drivers.serial_port import line_lost, open_port
+from lrfcal_lib.drivers.host import REAL
+from lrfcal_lib.drivers.serial_port import line_lost
 
 READ_S = 0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
 MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is another device
@@ -22,6 +21,7 @@ class HeadLine:
     path : str or Path
     settings : HeadSettings
     log : logging.Logger
+    host : Host
 
     Attributes
     ----------
@@ -29,13 +29,13 @@ class HeadLine:
         'frames' sent, 'replies', 'echoed' and 'skipped' bytes, 'timeouts' of queries, 'reconnects'.
     """
 
-    def __init__(self, path, settings, log):
-        self.path, self.settings, self.log = path, settings, log
+    def __init__(self, path, settings, log, host=REAL):
+        self.path, self.settings, self.log, self.host = path, settings, log, host
         self.counts = dict.fromkeys(("frames", "replies", "echoed", "skipped", "timeouts", "reconnects"), 0)
-        self.lock = threading.RLock()
+        self.lock = host.lock()
         self.acknowledges = False  # until a stop was acknowledged
         self._free, self._sent, self._late = 0.0, 0.0, False
-        self._port = open_port(path, settings.baudrate, timeout=READ_S)
+        self._port = host.port(path, settings.baudrate, timeout=READ_S)
 
     def wire_s(self, count=pelco_d.FRAME):
         """Seconds that bytes take on the line."""
@@ -59,7 +59,7 @@ class HeadLine:
         Returns
         -------
         (float, float) or None
-            time.monotonic() of the reading and elevation, rad; None if no reply came.
+            Instant of the host of the reading and elevation, rad; None if no reply came.
 
         Raises
         ------
@@ -80,11 +80,11 @@ class HeadLine:
         return None
 
     def _ask_tilt(self):
-        frame, begun = pelco_d.encode_extended(self.settings.address, pelco_d.QUERY_TILT), time.monotonic()
+        frame, begun = pelco_d.encode_extended(self.settings.address, pelco_d.QUERY_TILT), self.host.now()
         value = self._tilt_of(self.exchange(frame, self._answered, self.settings.reply_s, again=True))
         self._late = value is None
         self.counts["timeouts"] += self._late
-        return None if self._late else ((begun + time.monotonic()) / 2, pelco_d.decode_tilt(value))
+        return None if self._late else ((begun + self.host.now()) / 2, pelco_d.decode_tilt(value))
 
     def _answered(self, received):
         return self._tilt_of(received) is not None
@@ -101,7 +101,7 @@ class HeadLine:
         Returns
         -------
         (float, bool)
-            time.monotonic() at which it was sent, and whether it was acknowledged.
+            Instant of the host at which it was sent, and whether it was acknowledged.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class HeadLine:
         Returns
         -------
         float
-            time.monotonic() at which it was first sent.
+            Instant of the host at which it was first sent.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class HeadLine:
             with line_lost(self.path):
                 for _ in range(2):
                     self._open().write(pelco_d.encode_stop(self.settings.address))
-                    time.sleep(self.wire_s() + self.settings.gap_s)
+                    self.host.sleep(self.wire_s() + self.settings.gap_s)
         except Exception as error:  # on the way out nothing else can be done
             self.log.error("the head could not be stopped (%s): cut its power if it moves", error)
         finally:
@@ -182,26 +182,25 @@ class HeadLine:
                 return self._exchange(frame, found, wait_s)
 
     def _exchange(self, frame, found, wait_s):
-        time.sleep(max(0.0, self._free - time.monotonic()))
+        self.host.sleep(max(0.0, self._free - self.host.now()))
         with line_lost(self.path):
             port = self._open()
             port.reset_input_buffer()
             port.write(frame)
-            self._sent = time.monotonic()
+            self._sent = self.host.now()
             deadline = self._sent + self.wire_s(len(frame) + pelco_d.FRAME) + wait_s
             received = self._collect(port, frame[: pelco_d.FRAME], found, deadline)
-        self._free = max(time.monotonic(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
+        self._free = max(self.host.now(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
         self.counts["frames"] += 1
         self.counts["replies"] += len(received.replies)
         self.counts["echoed"] += received.echoed
         self.counts["skipped"] += received.skipped
         return received
 
-    @staticmethod
-    def _collect(port, sent, found, deadline):
+    def _collect(self, port, sent, found, deadline):
         data = b""
         while True:
-            over = time.monotonic() >= deadline or len(data) >= MOST
+            over = self.host.now() >= deadline or len(data) >= MOST
             received = pelco_d.split_replies(data, sent, complete=over)
             if over or found(received):
                 return received
@@ -232,19 +231,19 @@ class HeadLine:
         """
         with self.lock:
             self._drop()
-            deadline = time.monotonic() + self.settings.reconnect_s
+            deadline = self.host.now() + self.settings.reconnect_s
             while self._port is None:
                 try:
-                    self._port = open_port(self.path, self.settings.baudrate, timeout=READ_S)
+                    self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
                 except PortError as error:
-                    if time.monotonic() >= deadline:
+                    if self.host.now() >= deadline:
                         raise LineLost(f"the head's line is lost: {error}") from error
-                    time.sleep(0.05)
+                    self.host.sleep(0.05)
             self.counts["reconnects"] += 1
             self.log.warning("the line %s to the head is back", self.path)
             with line_lost(self.path):
                 self._port.write(pelco_d.encode_stop(self.settings.address) * 2)
-            self._free = time.monotonic() + self.wire_s(2 * pelco_d.FRAME) + self.settings.gap_s
+            self._free = self.host.now() + self.wire_s(2 * pelco_d.FRAME) + self.settings.gap_s
 
     def close(self):
         """Close the port; nothing is sent."""

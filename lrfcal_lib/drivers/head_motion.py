@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
-import time
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, Refused
@@ -42,7 +40,7 @@ class Motion:
 
     def __init__(self, line, settings):
         self.line, self.settings = line, settings
-        self.abort, self.absolute = threading.Event(), None
+        self.abort, self.absolute, self._now = line.host.event(), None, line.host.now
         self.calibrated, self.delay = settings.degrees_per_second is not None, settings.start_delay_s
         self._speeds = {settings.tilt_speed: dict(zip((1, -1), map(math.radians, settings.speeds_deg), strict=True))}
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
@@ -66,22 +64,22 @@ class Motion:
         self.calibrated = True
 
     def know(self, pitch, instant=None):
-        """The head was at a pitch, rad, at an instant of time.monotonic()."""
-        self._pitch, self._seen = pitch, time.monotonic() if instant is None else instant
+        """The head was at a pitch, rad, at an instant of the host."""
+        self._pitch, self._seen = pitch, self._now() if instant is None else instant
 
     def forget(self):
         """Where a head without feedback stands is not known any more."""
         self._pitch = None
 
     def estimate(self, instant=None):
-        """Dead reckoning at an instant of time.monotonic(), by default now, rad.
+        """Dead reckoning at an instant of the host, by default now, rad.
 
         Raises
         ------
         DeviceError
             If nothing is known.
         """
-        return self.reckoning()(time.monotonic() if instant is None else instant)
+        return self.reckoning()(self._now() if instant is None else instant)
 
     def reckoning(self):
         """Dead reckoning from what is known now: a function of the instant."""
@@ -95,7 +93,7 @@ class Motion:
         return lambda instant: pitch + rate * max(0.0, instant - since)
 
     def read(self, retries=0):
-        """Pitch that the head tells, rad, with its instant of time.monotonic(); None without a reply.
+        """Pitch that the head tells, rad, with its instant of the host; None without a reply.
 
         Notes
         -----
@@ -116,7 +114,7 @@ class Motion:
     # ------------------------------------------------------------------------------------------ start and stop
 
     def start(self, way, step):
-        """Begin to move up (`way` > 0) or down; returns time.monotonic() at which it was sent."""
+        """Begin to move up (`way` > 0) or down; returns the host's instant at which it was sent."""
         up = way if not self.settings.invert else -way
         self._frame = pelco_d.encode_motion(self.settings.address, tilt=up, tilt_speed=step)
         begun, _ = self.line.command(self._frame)
@@ -124,7 +122,7 @@ class Motion:
         return begun
 
     def stop(self):
-        """Stop; returns time.monotonic() at which it was sent."""
+        """Stop; returns the host's instant at which it was sent."""
         ended = self.line.stop()
         if self._going is not None and self._pitch is not None:
             self.know(self.estimate(ended), ended)
@@ -139,28 +137,28 @@ class Motion:
         Stopped
             If the motion was ended meanwhile.
         """
-        end, every = time.monotonic() + seconds, self.settings.repeat_s
+        end, every = self._now() + seconds, self.settings.repeat_s
         while True:
-            now = time.monotonic()
+            now = self._now()
             repeat = every is not None and self._going is not None
             if repeat and now >= self._repeated + every:
                 self._repeated, _ = self.line.command(self._frame)
                 continue
             if self.abort.wait(max(0.0, min(end, self._repeated + every if repeat else end) - now)):
                 raise Stopped("the head was stopped before it arrived")
-            if time.monotonic() >= end:
+            if self._now() >= end:
                 return
 
     def run(self, way, step, seconds, until=None):
         """Move for a time, or past a pitch if the head tells it meanwhile; returns the seconds it took."""
         begun = self.start(way, step)
         try:
-            while (left := begun + seconds - time.monotonic()) > 0:
+            while (left := begun + seconds - self._now()) > 0:
                 if until is not None and left > self.line.round_trip_s:
                     reading = self.read()
                     if reading and (until - reading[1]) * way <= 0:
                         break
-                    left = min(self.settings.poll_s, max(0.0, begun + seconds - time.monotonic()))
+                    left = min(self.settings.poll_s, max(0.0, begun + seconds - self._now()))
                 self.pause(left)
         finally:
             ended = self.stop()
@@ -172,7 +170,7 @@ class Motion:
         Parameters
         ----------
         deadline : float
-            time.monotonic().
+            Instant of the host.
         target : float, optional
             Where set-tilt sent it: rest elsewhere counts after `stall_s` only, because it may not have begun.
 
@@ -190,7 +188,7 @@ class Motion:
         """
         first, since = None, 0.0
         while True:
-            reading, now = self.read(), time.monotonic()
+            reading, now = self.read(), self._now()
             if reading is None:
                 first = None
             elif first is None or abs(reading[1] - first) > self.tolerance:
@@ -295,7 +293,7 @@ class Motion:
         seconds = abs(target - start) / self.speed(target - start) + self.delay
         if seconds - self.delay < (2 * self.line.wire_s() + self.settings.gap_s) / 2:
             return start  # the shortest motion would lead further away
-        if time.monotonic() + seconds > deadline:
+        if self._now() + seconds > deadline:
             raise Refused(f"the move takes {seconds:.1f} s: give it a longer timeout")
         try:
             self.run(target - start, self.settings.tilt_speed, seconds)
@@ -351,7 +349,7 @@ class Motion:
 
     def _at_rest(self, reading):
         if reading is None:
-            return self.settle(time.monotonic() + 10)
+            return self.settle(self._now() + 10)
         self.pause(self.settings.settle_s)
         self.know(float(reading()))
         return self.estimate()

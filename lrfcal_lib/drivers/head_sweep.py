@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
-import time
 
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, Refused
 from lrfcal_lib.drivers.head_motion import Stopped
@@ -13,7 +11,7 @@ from lrfcal_lib.drivers.head_motion import Stopped
 MISSES = 3  # queries without a reply, after which a moving head is not asked any more
 
 
-class Sweep(threading.Thread):
+class Sweep:
     """One sweep from where the head is to a pitch.
 
     Parameters
@@ -34,25 +32,26 @@ class Sweep(threading.Thread):
         Host time, pitch in rad, measured.
     error : DeviceError or None
         Why it ended too early.
+    thread : threading.Thread
     """
 
     def __init__(self, motion, stop_at, step, feedback, clock):
-        super().__init__(name="sweep", daemon=True)
         self.motion, self.stop_at, self.step, self.feedback = motion, stop_at, step, feedback
         self.track, self.error = [], None
         self._clock, self._misses, self._reckoned = clock, 0, []
+        self._now, self.thread = motion.line.host.now, motion.line.host.thread(self._run, "sweep")
 
     def begin(self):
         """Note where the head is, set it in motion and start the thread."""
         pitch = self._note()
         self._way = math.copysign(1, self.stop_at - pitch)
         seconds = abs(self.stop_at - pitch) / self.motion.speed(self._way, self.step)
-        self._first, self._deadline = pitch, time.monotonic() + 3 * seconds + 10
+        self._first, self._deadline = pitch, self._now() + 3 * seconds + 10
         self._reconnects = self.motion.line.counts["reconnects"]
         self.motion.start(self._way, self.step)
-        self.start()
+        self.thread.start()
 
-    def run(self):
+    def _run(self):
         """Follow the head until it is there, stop it, and note where it rests."""
         try:
             try:
@@ -60,7 +59,7 @@ class Sweep(threading.Thread):
             finally:
                 self.motion.stop()
                 self._note()
-            self.motion.settle(time.monotonic() + 5) if self.feedback else self.motion.pause(0)
+            self.motion.settle(self._now() + 5) if self.feedback else self.motion.pause(0)
             self._note()
         except Stopped:
             pass
@@ -84,7 +83,7 @@ class Sweep(threading.Thread):
     def _check(self):
         if self.motion.line.counts["reconnects"] != self._reconnects:
             raise LineLost("the line was lost in the sweep, and the head stopped when it came back: sweep again")
-        if time.monotonic() > self._deadline:
+        if self._now() > self._deadline:
             raise Refused("the sweep does not get to its end: look for an end stop, or calibrate the speed")
         if (self.track[-1][1] - self._first) * self._way < -math.radians(2):
             raise Refused("the head moves the other way: set invert to the contrary")
@@ -107,7 +106,7 @@ class Sweep(threading.Thread):
         reading = self.motion.read(0 if brief else self.motion.settings.retries) if asked else None
         if asked:
             self._misses = 0 if reading else self._misses + 1
-        now = time.monotonic()
+        now = self._now()
         instant, pitch = reading or (now, self.motion.estimate(now))
         self.track.append((self._clock() - (now - instant), pitch, reading is not None))
         self._reckoned.append(before(instant) if before else pitch)

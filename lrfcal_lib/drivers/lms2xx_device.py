@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.lms2xx import SCAN
 from lrfcal_lib.drivers.lms2xx_link import TRIES, VALUES
@@ -67,9 +65,9 @@ class LMS2xx(LMS2xxSetup):
         Reading
         """
         self._idle()
-        end = time.monotonic() + (self._patience() if timeout is None else timeout)
+        end = self._host.now() + (self._patience() if timeout is None else timeout)
         for _ in range(TRIES):
-            left = max(0.0, end - time.monotonic())
+            left = max(0.0, end - self._host.now())
             arrival = self._ask(VALUES, ALL_VALUES, limit_s=left)
             late = arrival.time_s - self._link.asked_s > REPLY_S + self._assembler.duration_s
             reading = None if late else self._scan(arrival)  # nobody knows the instant of a scan that came late
@@ -97,7 +95,7 @@ class LMS2xx(LMS2xxSetup):
             self.set_variant(100, 0.25)
         self._stream()
         interval_s = (4 if interlaced else 1) * self._assembler.interval_s
-        self._reader = ScanReader(self._receive, self._resume, self._clock, interval_s, self._log)
+        self._reader = ScanReader(self._receive, self._resume, self._clock, interval_s, self._log, self._host)
         self._reader.start()
 
     def _stream(self):
@@ -150,9 +148,9 @@ class LMS2xx(LMS2xxSetup):
         """
         reader, after = self._streaming(), self._clock() if after is None else after
         limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout
-        end, found = time.monotonic() + limit, []
+        end, found = self._host.now() + limit, []
         while len(found) < count:
-            found.append(reader.next(after, max(0.0, end - time.monotonic())))
+            found.append(reader.next(after, max(0.0, end - self._host.now())))
             after = found[-1].time_s
         return found
 

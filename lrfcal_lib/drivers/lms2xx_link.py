@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
-import time
 from dataclasses import dataclass
 
 from lrfcal_lib.drivers.errors import NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx import OVERHEAD, encode_telegram, split_stream
-from lrfcal_lib.drivers.serial_port import line_lost, open_port, set_rate
+from lrfcal_lib.drivers.serial_port import line_lost
 
 ACK, NAK = 0x06, 0x15
 MODE, VALUES, STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURE = 0x20, 0x30, 0x31, 0x32, 0x3A, 0x3B, 0x74, 0x77
@@ -70,16 +69,18 @@ class Link:
         Numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up.
     address : int
         Of the device; 0 reaches any.
-    clock : callable
+    clock : callable, optional
+        ``host.time`` by default.
     interrupted : threading.Event, optional
         Once set, whoever waits here gets NoReply.
+    host : Host
 
     Attributes
     ----------
     senders : set of int or None
         Address bytes that replies may have; None for any.
     deadline : float
-        By time.monotonic(); no request lasts longer.
+        By ``host.now()``; no request lasts longer.
     asked_s : float
         By the clock, when the last request was sent for the first time.
     heard : int
@@ -91,11 +92,11 @@ class Link:
         See :func:`serial_port.open_port`.
     """
 
-    def __init__(self, path, baudrate, counts, *, address=0, clock=time.time, interrupted=None):
-        self.path, self.counts, self.address, self.clock = path, counts, address, clock
-        self.interrupted = interrupted or threading.Event()
+    def __init__(self, path, baudrate, counts, *, address=0, clock=None, interrupted=None, host=REAL):
+        self.path, self.counts, self.address, self.host = path, counts, address, host
+        self.clock, self.interrupted = clock or host.time, interrupted or host.event()
         self.senders, self.deadline, self.asked_s, self.heard = None, math.inf, 0.0, 0
-        self._port = open_port(path, baudrate, timeout=READ_S)
+        self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
 
     @property
@@ -105,7 +106,7 @@ class Link:
 
     def set_rate(self, baudrate):
         """Change this end's rate; raises PortError where the line cannot."""
-        set_rate(self._port, baudrate)
+        self.host.set_rate(self._port, baudrate)
         self._forget()
 
     def close(self):
@@ -113,7 +114,7 @@ class Link:
         self._port.close()
 
     def _forget(self):
-        self._rest, self._stray, self._last, self._kept = b"", None, time.monotonic(), []
+        self._rest, self._stray, self._last, self._kept = b"", None, self.host.now(), []
 
     def send(self, code, data=b""):
         """Send a request; what arrived before it is thrown away."""
@@ -126,7 +127,7 @@ class Link:
                 return
             for at in range(len(raw)):
                 self._port.write(raw[at : at + 1])
-                time.sleep(PACE_S)
+                self.host.sleep(PACE_S)
 
     def receive(self):
         """Telegrams that came in; waits 20 ms at most, longer only while more bytes keep coming.
@@ -161,7 +162,7 @@ class Link:
 
     def _cut(self, data, now):
         """Take the telegrams out of what is there; the bytes after a telegram tell how much earlier it came."""
-        self._last = time.monotonic()
+        self._last = self.host.now()
         self.heard += len(data)
         data = self._rest + data
         stream = split_stream(data)
@@ -180,7 +181,7 @@ class Link:
     @property
     def silent_s(self):
         """Seconds since the last byte, or since the last request."""
-        return time.monotonic() - self._last
+        return self.host.now() - self._last
 
     @property
     def acknowledged(self):
@@ -215,7 +216,7 @@ class Link:
         NoReply, Refused, LineLost
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
-        end = min(time.monotonic() + min(longest_s, limit_s), self.deadline)
+        end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
         said, self.asked_s = None, self.clock()
         for _ in range(TRIES):
             self.send(code, data)
@@ -224,18 +225,18 @@ class Link:
                 self._kept.insert(0, reply)
             if reply is not None:
                 return reply
-            if time.monotonic() > end - NAK_PAUSE_S:
+            if self.host.now() > end - NAK_PAUSE_S:
                 break
             if said:
-                time.sleep(NAK_PAUSE_S)
+                self.host.sleep(NAK_PAUSE_S)
         if said:
             raise Refused(f"{self.path}: the device refuses command {code:02X}: {said}")
         raise NoReply(f"{self.path}: no reply to command {code:02X} at {self.baudrate} Bd; is the device on?")
 
     def _await(self, codes, again_s, end):
         """The reply, or None and why the device declined (None if it said nothing until it is time to ask again)."""
-        begin, acknowledged = time.monotonic(), False
-        while (now := time.monotonic()) < end:
+        begin, acknowledged = self.host.now(), False
+        while (now := self.host.now()) < end:
             found = self.receive()
             for at, one in enumerate(found):
                 if one.code in codes:
@@ -269,8 +270,8 @@ class Link:
         WrongDevice
             If only bytes that make no telegram were heard.
         """
-        end, heard, windows = time.monotonic() + limit_s, self.heard, itertools.cycle(WINDOWS_S)
-        while time.monotonic() < end:
+        end, heard, windows = self.host.now() + limit_s, self.heard, itertools.cycle(WINDOWS_S)
+        while self.host.now() < end:
             window = next(windows)
             if any(self._answers(rate, window, end) for rate in rates):
                 return
@@ -291,9 +292,9 @@ class Link:
             self.set_rate(rate)
         except PortError:  # most RS-232 ports lack 500000 Bd
             return False
-        begin, sent = time.monotonic(), -math.inf
+        begin, sent = self.host.now(), -math.inf
         until = begin + window
-        while (now := time.monotonic()) < min(until, end):
+        while (now := self.host.now()) < min(until, end):
             if now - sent > (NAK_PAUSE_S if self.declined else 1.0):
                 sent = now
                 self.send(MODE, ON_REQUEST)
@@ -317,8 +318,8 @@ class Link:
         NoReply, Refused, LineLost
         """
         for _ in range(TRIES):
-            begin, heard = time.monotonic(), self.heard
-            while time.monotonic() < begin + 5 * SILENCE_S and self.heard == heard:
+            begin, heard = self.host.now(), self.heard
+            while self.host.now() < begin + 5 * SILENCE_S and self.heard == heard:
                 self.receive()
             if self.heard == heard:
                 return

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-import time
 
 from lrfcal_lib.drivers.errors import LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx import MODES, UNITS, TelegramError
 from lrfcal_lib.drivers.lms2xx_link import (
     CONFIGURATION,
@@ -40,16 +39,17 @@ COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects"
 class LMS2xxSetup:
     """An LMS2xx that waits for requests; `LMS2xx` adds scans and streaming and is what programs use."""
 
-    def __init__(self, port, *, address=0, password=b"SICK_LMS", clock=time.time, log=logger):
+    def __init__(self, port, *, address=0, password=b"SICK_LMS", clock=None, log=logger, host=REAL):
         self.port, self.type, self.firmware = port, "", ""
         self.status = self.configuration = self.variant = None
-        self._address, self._password, self._clock, self._log = address, bytes(password), clock, log
-        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), threading.Event()
+        self._address, self._password, self._host, self._log = address, bytes(password), host, log
+        self._clock = clock or host.time
+        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
         self._link = self._assembler = self._settled = self._scan_clock = None
 
     @classmethod
     def open(
-        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=time.time, log=logger,
+        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=logger, host=REAL,
         **configuration,
     ):  # fmt: skip
         """Find the device at a port whatever it is doing, stop its stream, and read what it is.
@@ -65,9 +65,11 @@ class LMS2xxSetup:
             Eight characters, of the installation mode; the factory's by default.
         find_s : float
             Longest time to find the rate.
-        clock : callable
-            Seconds, for the instants of scans.
+        clock : callable, optional
+            Seconds, for the instants of scans; time.time() of the host by default.
         log : logging.Logger
+        host : Host
+            Machine that the driver runs on; tests have a VirtualHost.
         **configuration
             Of :meth:`configure`.
 
@@ -88,9 +90,9 @@ class LMS2xxSetup:
             _code_of(baudrate)
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
-        device = cls(str(port), address=address, password=password, clock=clock, log=log)
+        device = cls(str(port), address=address, password=password, clock=clock, log=log, host=host)
         try:
-            device._connect(baudrate or 38400, time.monotonic() + find_s)
+            device._connect(baudrate or 38400, host.now() + find_s)
             if baudrate is not None and baudrate != device.baudrate:
                 device._set_rate(baudrate)
             device.configure(**configuration) if configuration else device._prepare()
@@ -128,10 +130,10 @@ class LMS2xxSetup:
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
-        options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted}
+        options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted, "host": self._host}
         self._link, self._scan_clock = Link(self.port, first, self._counts, **options), ScanClock()
         self._link.deadline = deadline
-        self._link.find([first, *(rate for rate in RATES if rate != first)], end - time.monotonic())
+        self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
         self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
@@ -193,7 +195,7 @@ class LMS2xxSetup:
         self._mend(deadline)
 
     def _mend(self, deadline):
-        end = time.monotonic() + deadline
+        end = self._host.now() + deadline
         rate, variant, configuration = self._settled
         self._release()
         self._reopen(rate, end)
@@ -212,10 +214,10 @@ class LMS2xxSetup:
         """Wait for the port and connect."""
         while True:
             try:
-                return self._connect(rate, min(end, time.monotonic() + FIND_S), end)
+                return self._connect(rate, min(end, self._host.now() + FIND_S), end)
             except (PortError, LineLost) as error:
                 self._release()
-                if self._interrupted.wait(AGAIN_S) or time.monotonic() > end - AGAIN_S:
+                if self._interrupted.wait(AGAIN_S) or self._host.now() > end - AGAIN_S:
                     raise LineLost(f"the line did not come back: {error}") from error
 
     def _release(self):

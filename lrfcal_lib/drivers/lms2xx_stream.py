@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import deque
 
 from lrfcal_lib.drivers.errors import DeviceError, NoReply
@@ -14,7 +12,7 @@ LEAST_QUIET_S = 0.6
 RECOVERY_S = 8.0  # one attempt; there are more until the stream is stopped
 
 
-class ScanReader(threading.Thread):
+class ScanReader:
     """Reads scans until `quit`.
 
     Parameters
@@ -27,15 +25,20 @@ class ScanReader(threading.Thread):
     interval_s : float
         Between two readings.
     log : logging.Logger
+    host : Host
     """
 
-    def __init__(self, receive, recover, clock, interval_s, log):
-        super().__init__(name="LMS2xx reader", daemon=True)
+    def __init__(self, receive, recover, clock, interval_s, log, host):
+        self._host, self._thread = host, host.thread(self._run, "LMS2xx reader")
         self._receive, self._recover, self._clock, self.interval_s, self._log = receive, recover, clock, interval_s, log
-        self._readings, self._handed_s, self._news = deque(maxlen=KEPT), -float("inf"), threading.Condition()
-        self._leave, self._trouble = threading.Event(), None
+        self._readings, self._handed_s, self._news = deque(maxlen=KEPT), -float("inf"), host.condition()
+        self._leave, self._trouble = host.event(), None
 
     # ---------------------------------------------------------------------------------------------- for the caller
+
+    def start(self):
+        """Begin to read."""
+        self._thread.start()
 
     def newest(self, after, timeout):
         """See :meth:`LMS2xx.newest`."""
@@ -46,12 +49,12 @@ class ScanReader(threading.Thread):
         return self._wait(lambda: next((r for r in self._readings if r.time_s > after), None), timeout)
 
     def _wait(self, find, timeout):
-        end = time.monotonic() + timeout
+        end = self._host.now() + timeout
         with self._news:
             while (found := find()) is None:
-                left = end - time.monotonic()
-                if left <= 0 or not self.is_alive():
-                    state = "the reader thread ended" if not self.is_alive() else "the stream is silent"
+                left = end - self._host.now()
+                if left <= 0 or not self._thread.is_alive():
+                    state = "the reader thread ended" if not self._thread.is_alive() else "the stream is silent"
                     raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
                 self._news.wait(min(left, 0.2))
             self._handed_s = max(self._handed_s, found.time_s)
@@ -68,12 +71,12 @@ class ScanReader(threading.Thread):
     def quit(self):
         """End the thread."""
         self._leave.set()
-        if self.is_alive():
-            self.join()
+        if self._thread.is_alive():
+            self._thread.join()
 
     # ---------------------------------------------------------------------------------------------- the thread
 
-    def run(self):
+    def _run(self):
         """Read; whatever goes wrong with the line, find the device again."""
         while not self._leave.is_set():
             try:
@@ -87,7 +90,7 @@ class ScanReader(threading.Thread):
 
     def _read(self):
         """Post readings until the stream falls silent, or until `quit`."""
-        last = time.monotonic()
+        last = self._host.now()
         while not self._leave.is_set():
             found = self._receive()
             if any(code == POWER_ON for code, _ in found):
@@ -98,8 +101,8 @@ class ScanReader(threading.Thread):
                     self._readings.extend(fresh)
                     self._trouble = None
                     self._news.notify_all()
-                last = time.monotonic()
-            if time.monotonic() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
+                last = self._host.now()
+            if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
                 raise NoReply("the stream fell silent")
 
     def _mend(self, error):

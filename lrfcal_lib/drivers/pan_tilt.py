@@ -10,7 +10,6 @@ import contextlib
 import logging
 import math
 import threading
-import time
 
 from lrfcal_lib.drivers import emergency, pelco_d
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
@@ -18,6 +17,7 @@ from lrfcal_lib.drivers.head_line import HeadLine
 from lrfcal_lib.drivers.head_motion import Motion
 from lrfcal_lib.drivers.head_settings import HeadSettings
 from lrfcal_lib.drivers.head_sweep import Sweep
+from lrfcal_lib.drivers.host import REAL
 
 LOG = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ class PanTilt:
     # --------------------------------------------------------------------------------------------- open and close
 
     @classmethod
-    def open(cls, port, settings=None, *, log=LOG, clock=time.time):
+    def open(cls, port, settings=None, *, log=LOG, clock=None, host=REAL):
         """Open the port, stop the head, and ask whether it tells its tilt.
 
         Parameters
@@ -51,8 +51,10 @@ class PanTilt:
         port : str or Path
         settings : HeadSettings, optional
         log : logging.Logger
-        clock : callable
-            Host clock, s.
+        clock : callable, optional
+            Host clock, s; time.time() of the host by default.
+        host : Host
+            Machine that the driver runs on; tests have a VirtualHost.
 
         Returns
         -------
@@ -68,8 +70,8 @@ class PanTilt:
             If something else answers.
         """
         settings = settings or HeadSettings()
-        line = HeadLine(port, settings, log)
-        head = cls(line, settings, log, clock)
+        line = HeadLine(port, settings, log, host)
+        head = cls(line, settings, log, clock or host.time)
         try:
             head._probe()
         except BaseException:
@@ -173,7 +175,7 @@ class PanTilt:
 
     def moving(self):
         """Whether a move or sweep of this object is under way."""
-        return self._busy or self._sweep is not None and self._sweep.is_alive()
+        return self._busy or self._sweep is not None and self._sweep.thread.is_alive()
 
     def _need_open(self):
         if self._line is None:
@@ -198,8 +200,8 @@ class PanTilt:
         self._need_open()
         self._motion.abort.set()
         self._motion.stop()
-        if self._sweep is not None and self._sweep is not threading.current_thread():
-            self._sweep.join()
+        if self._sweep is not None and self._sweep.thread is not threading.current_thread():
+            self._sweep.thread.join()
 
     @contextlib.contextmanager
     def _motion_of_its_own(self):
@@ -251,14 +253,14 @@ class PanTilt:
         start, _ = self.pitch()
         with self._motion_of_its_own() as motion:
             seconds = abs(pitch - start) / motion.speed(pitch - start)
-            deadline = time.monotonic() + (2 * seconds + 10 if timeout is None else timeout)
+            deadline = self._line.host.now() + (2 * seconds + 10 if timeout is None else timeout)
             if not self.has_feedback:
                 return motion.timed(pitch, deadline)
             while True:
                 try:
                     return self._measured_move(pitch, deadline)
                 except LineLost:
-                    if time.monotonic() >= deadline:
+                    if self._line.host.now() >= deadline:
                         raise
                     self._line.reopen()
 
@@ -323,11 +325,11 @@ class PanTilt:
         if self._sweep is None:
             raise DeviceError("there was no sweep: start one")
         try:
-            self._sweep.join(timeout)
+            self._sweep.thread.join(timeout)
         except BaseException:
             self.emergency_stop()
             raise
-        if self._sweep.is_alive():
+        if self._sweep.thread.is_alive():
             self.stop()
             raise NoReply(f"the sweep was not over after {timeout:g} s: the head was stopped")
         if self._sweep.error is not None:

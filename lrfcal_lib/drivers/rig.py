@@ -12,6 +12,7 @@ import numpy as np
 
 from lrfcal_lib.drivers.control import ask
 from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
+from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx import METRES, mode_of
 from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
 from lrfcal_lib.drivers.rig_events import Moved, Photographed, Scanned, Tracked
@@ -46,14 +47,16 @@ class Rig:
     cameras : dict of str to Camera
     clock : callable
         Host clock, s, of all of them.
+    host : Host
+        Machine that the drivers run on.
     """
 
-    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time):
+    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time, host=REAL):
         self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras or {}, clock
-        self._closing = contextlib.ExitStack()
+        self._closing, self._now = contextlib.ExitStack(), host.now
 
     @classmethod
-    def open(cls, stated, *, log=LOG, clock=None):
+    def open(cls, stated, *, log=LOG, clock=None, host=REAL, camera=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
         Parameters
@@ -62,6 +65,10 @@ class Rig:
         log : logging.Logger
         clock : callable, optional
             :func:`host_clock` by default.
+        host : Host
+            Machine that the drivers run on; tests have a VirtualHost.
+        camera : callable, optional
+            Opens a camera by its name, for images that come from elsewhere than the source stated.
 
         Returns
         -------
@@ -74,13 +81,14 @@ class Rig:
         """
         clock = clock or host_clock()
         with contextlib.ExitStack() as stack:
-            head = stack.enter_context(_named("head", _open_head, stated, log, clock))
-            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, log, clock))
-            cameras = {}
+            options = {"log": log, "clock": clock}
+            head = stack.enter_context(_named("head", _open_head, stated, host=host, **options))
+            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, host=host, **options))
+            cameras, opener = {}, _open_camera if camera is None else lambda _, name, **options: camera(name)
             for name in stated.cameras:
-                cameras[name] = _named(f"camera '{name}'", _open_camera, stated, name, log, clock)
+                cameras[name] = _named(f"camera '{name}'", opener, stated, name, **options)
                 stack.callback(cameras[name].close)
-            rig = cls(stated, lrf, head, cameras, clock=clock)
+            rig = cls(stated, lrf, head, cameras, clock=clock, host=host)
             rig._closing = stack.pop_all()
         return rig
 
@@ -215,7 +223,7 @@ class Rig:
 
     def _request(self, after):
         """Scans one by one, all later than an instant; a line that was lost is given one chance to come back."""
-        found, mended, end = [], False, time.monotonic() + SCAN_S
+        found, mended, end = [], False, self._now() + SCAN_S
         while len(found) < self.stated.plan.scans_per_stop:
             try:
                 reading = self.lrf.request()
@@ -227,8 +235,8 @@ class Rig:
                 mended = True
                 continue
             if reading.time_s > after:
-                found, after, end = [*found, reading], reading.time_s, time.monotonic() + SCAN_S
-            elif time.monotonic() > end:
+                found, after, end = [*found, reading], reading.time_s, self._now() + SCAN_S
+            elif self._now() > end:
                 raise NoReply(f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s")
         return found
 
@@ -252,13 +260,13 @@ class Rig:
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
         self.lrf.start()
         held = [self.lrf.newest(timeout=SCAN_S)]
-        heard, newest = time.monotonic(), held[-1].time_s
+        heard, newest = self._now(), held[-1].time_s
         self.head.start_sweep(float(last), self.stated.plan.sweep_speed)
         while self.head.moving():
             fresh = self._since(newest)
             if fresh:
-                heard, newest = time.monotonic(), fresh[-1].time_s
-            elif time.monotonic() - heard > GAP_S:
+                heard, newest = self._now(), fresh[-1].time_s
+            elif self._now() - heard > GAP_S:
                 raise NoReply(f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder")
             known, held = self._placed(held + fresh, self._usable(self.head.track))
             if known:
@@ -272,9 +280,9 @@ class Rig:
 
     def _since(self, instant):
         """All scans after an instant that come within the time of a batch."""
-        end, found = time.monotonic() + BATCH_S, []
+        end, found = self._now() + BATCH_S, []
         with contextlib.suppress(NoReply):
-            while time.monotonic() < end:
+            while self._now() < end:
                 found += self.lrf.take(1, after=instant, timeout=BATCH_S)
                 instant = found[-1].time_s
         return found
@@ -338,10 +346,10 @@ def _share(pitch, first, last):
     return float(np.clip((pitch - first) / (last - first), 0, 1))
 
 
-def _named(device, opener, *arguments):
+def _named(device, opener, *arguments, **options):
     """Open a device; its name stands before the message of whatever goes wrong."""
     try:
-        return opener(*arguments)
+        return opener(*arguments, **options)
     except DeviceError as error:
         error.args = (f"{device}: {error}", *error.args[1:])
         raise
@@ -349,13 +357,13 @@ def _named(device, opener, *arguments):
         raise RigFileError(f"{arguments[0].path}: {device}: {error}") from error
 
 
-def _open_head(stated, log, clock):
+def _open_head(stated, **options):
     from lrfcal_lib.drivers.pan_tilt import PanTilt
 
-    return PanTilt.open(stated.head_device, stated.head_settings, log=log, clock=clock)
+    return PanTilt.open(stated.head_device, stated.head_settings, **options)
 
 
-def _open_lrf(stated, log, clock):
+def _open_lrf(stated, **given):
     from lrfcal_lib.drivers.lms2xx_device import LMS2xx
     from lrfcal_lib.drivers.lms2xx_setup import CONFIGURED
 
@@ -363,7 +371,7 @@ def _open_lrf(stated, log, clock):
     options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
     if "password" in asked:
         options["password"] = asked["password"].encode()
-    lrf = LMS2xx.open(asked["port"], **options, log=log, clock=clock)
+    lrf = LMS2xx.open(asked["port"], **options, **given)
     try:
         if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
             lrf.set_variant(*asked["variant"])
@@ -373,13 +381,13 @@ def _open_lrf(stated, log, clock):
     return lrf
 
 
-def _open_camera(stated, name, log, clock):
+def _open_camera(stated, name, **given):
     from lrfcal_lib.drivers.video import Camera
 
     asked, info = stated.camera_devices[name], stated.cameras[name]
     options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
     size = (info.width, info.height)
-    camera = Camera.open(asked["source"], name=name, size=size, **options, log=log, clock=clock)
+    camera = Camera.open(asked["source"], name=name, size=size, **options, **given)
     got = camera.settings["size"]["got"]
     if got is not None and tuple(got) != (info.width, info.height):
         camera.close()

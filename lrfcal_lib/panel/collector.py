@@ -369,7 +369,7 @@ def _stated(rig, stack):
         if not Path(rig).suffix and not Path(rig).exists():
             raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {', '.join(PRACTICE_RIGS)}")
         return read_rig_file(rig), time.time
-    from lrfcal_lib.drivers.emulators.practice import emulated
+    from lrfcal_lib.emulators.rig import emulated
 
     rig, data, clock = emulated(str(rig))
     stack.enter_context(rig)

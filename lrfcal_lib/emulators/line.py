@@ -1,0 +1,614 @@
+"""A device at the end of a serial line: its clock, the times of its bytes, what can go wrong, and the port it is at.
+
+The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong one garbles bytes as
+on a real line; or, on a VirtualHost, a buffer in memory, and the device goes on while the driver waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import math
+import os
+import select
+import termios
+import threading
+import tty
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lrfcal_lib.drivers.errors import PortError
+from lrfcal_lib.drivers.host import REAL, VirtualHost
+
+RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+CHUNK_S = 0.005  # bytes that are due within this time are written at once
+LONGEST_WAIT_S = 0.25
+CLOSED_LOOK_S = 0.02  # how often to see whether somebody opened the port
+FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
+DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
+ROOM = 4095  # bytes that a port keeps until they are read
+SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
+
+
+class Clock:
+    """Time of the emulated devices.
+
+    Parameters
+    ----------
+    scale : float
+        Seconds of the devices in a second of the host, 8 at most.
+    machine : Host
+        Whose time that is.
+
+    Raises
+    ------
+    ValueError
+        For a scale that no rig can be run at.
+    """
+
+    def __init__(self, scale=1.0, machine=REAL):
+        if not 0 < scale <= FASTEST:
+            raise ValueError(f"time_scale is {scale}: it must be positive, 1 for real time, and at most {FASTEST:g}")
+        self.scale, self.machine, self._zero, self._host_zero = scale, machine, machine.now(), machine.time()
+
+    def now(self):
+        """Seconds of the devices since the clock was made."""
+        return (self.machine.now() - self._zero) * self.scale
+
+    def host(self, instant):
+        """Instant of the devices as time() of the host."""
+        return self._host_zero + np.asarray(instant) / self.scale
+
+    def device(self, time_s):
+        """Inverse of :meth:`host`."""
+        return (np.asarray(time_s) - self._host_zero) * self.scale
+
+
+# ------------------------------------------------------------------------------------------------------ faults
+
+
+class Fault(NamedTuple):
+    """What can go wrong: 'lrf' or 'head' or both, what happens, and to bytes: (data, place, rng) -> data."""
+
+    devices: tuple
+    text: str
+    change: object = None
+
+
+BOTH, LMS, HEAD = ("lrf", "head"), ("lrf",), ("head",)
+FAULTS = {
+    # on the bytes of a reply
+    "drop": Fault(BOTH, "a byte of a reply is lost", lambda d, i, rng: d[:i] + d[i + 1 :]),
+    "flip": Fault(BOTH, "a bit of a reply is inverted",
+                  lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
+    "duplicate": Fault(BOTH, "a byte of a reply comes twice", lambda d, i, rng: d[: i + 1] + d[i:]),
+    "insert": Fault(BOTH, "a byte appears within a reply", lambda d, i, rng: d[: i + 1] + rng.bytes(1) + d[i + 1 :]),
+    "swap": Fault(BOTH, "two neighbouring, different bytes of a reply change places",
+                  lambda d, i, rng: d[:i] + d[i + 1 : i + 2] + d[i : i + 1] + d[i + 2 :]),
+    "blank": Fault(BOTH, "up to four bytes of a reply arrive as zero",
+                   lambda d, i, rng: d[:i] + bytes(len(d[i : i + 4])) + d[i + 4 :]),
+    "cut": Fault(BOTH, "a reply ends early", lambda d, i, rng: d[:i]),
+    "headless": Fault(BOTH, "a reply lacks its beginning", lambda d, i, rng: d[i + 1 :]),
+    "noise": Fault(BOTH, "1 to 20 bytes of noise come before a reply",
+                   lambda d, i, rng: rng.bytes(int(rng.integers(1, 21))) + d),
+    "checksum": Fault(BOTH, "a reply has the wrong checksum",
+                      lambda d, i, rng: d[:-1] + bytes([d[-1] ^ int(rng.integers(1, 256))])),
+    "address": Fault(BOTH, "a reply with a sound checksum comes from another address"),
+    "foreign": Fault(BOTH, "a sound reply that nobody asked for comes first"),
+    "length": Fault(LMS, "a telegram states another length; its checksum fits the bytes"),
+    # on when and whether a reply comes
+    "silence": Fault(BOTH, "a reply is not sent"),
+    "delay": Fault(BOTH, "a reply comes 0.7 s late"),
+    "pause": Fault(BOTH, "a reply stops for 80 ms in the middle"),
+    "twice": Fault(BOTH, "a reply is sent twice"),
+    "stale": Fault(BOTH, "the previous reply of the same kind is sent in place of the present one"),
+    # on the line
+    "request_drop": Fault(BOTH, "a byte that the host sends is lost", lambda d, i, rng: d[:i] + d[i + 1 :]),
+    "request_flip": Fault(BOTH, "a bit that the host sends is inverted",
+                          lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
+    "deaf": Fault(BOTH, "what the host sends does not arrive", lambda d, i, rng: b""),
+    "echo": Fault(BOTH, "what the host sends comes back to it first, as on two-wire RS-485"),
+    "unplug": Fault(BOTH, "the port vanishes and comes back at the same path (after 0.5 s unless told otherwise)"),
+    # in the laser range finder
+    "nak": Fault(LMS, "a sound request is answered NAK"),
+    "no_ack": Fault(LMS, "the reply comes without ACK"),
+    "refused": Fault(LMS, "a request is answered ACK and 0x92"),
+    "reboot": Fault(LMS, "the device restarts: silence, 9600 Bd, the power-on string, settings of the factory"),
+    "rate": Fault(LMS, "the device falls to another baud rate without a word"),
+    "stuck": Fault(LMS, "the command to stop streaming is confirmed, and streaming goes on"),
+    "slow_mode": Fault(LMS, "a change of the operating mode takes 2.8 s, as long as the manual allows"),
+    "skip": Fault(LMS, "a scan of the stream is not sent; the indices go on"),
+    "status": Fault(LMS, "the status byte says error, dirty window, implausible values"),
+    # in the head
+    "mute": Fault(HEAD, "a query is not answered, though the head obeys"),
+    "stall": Fault(HEAD, "a motion command does not move the head"),
+    "slip": Fault(HEAD, "the head runs on for 0.3 s after a stop"),
+    "jump": Fault(HEAD, "a position reply with a sound checksum is wrong by 10 deg"),
+}  # fmt: skip
+REQUEST = ("request_drop", "request_flip", "deaf")
+REPLY = tuple(name for name, fault in FAULTS.items() if fault.change and name not in REQUEST)
+
+
+class Faults:
+    """Switches of one device; all that is random follows from the seed.
+
+    Parameters
+    ----------
+    device : {'lrf', 'head'}
+    seed : int
+    machine : Host
+    changed : callable
+        Told when a fault was injected.
+
+    Attributes
+    ----------
+    counts : collections.Counter
+        How often each kind was injected.
+    """
+
+    def __init__(self, device, seed=0, machine=REAL, changed=lambda: None):
+        self.device, self.counts, self.changed, self._now = device, Counter(), changed, machine.now
+        self.rng = np.random.default_rng([seed, *device.encode()])
+        self._lock, self._armed, self._until, self._chance, self._seconds = threading.Lock(), Counter(), {}, {}, {}
+
+    def inject(self, name, count=1, *, seconds=None):
+        """Arm a fault.
+
+        Parameters
+        ----------
+        name : str
+            Key of `FAULTS`.
+        count : int
+            It happens at that many opportunities (replies, requests, ...) from now on.
+        seconds : float, optional
+            At every opportunity for so long instead; for 'unplug' how long the port is away.
+
+        Raises
+        ------
+        ValueError
+            For a fault that this device does not know.
+        """
+        self._known(name)
+        with self._lock:
+            if seconds is None or name == "unplug":
+                self._armed[name] += count
+                self._seconds[name] = seconds
+            else:
+                self._until[name] = self._now() + seconds
+        self.changed()
+
+    def chance(self, name, probability):
+        """Let a fault happen with a probability at every opportunity; 0 ends that."""
+        self._known(name)
+        self._chance[name] = probability
+
+    def clear(self, name=None):
+        """Disarm one fault, or all."""
+        with self._lock:
+            for board in (self._armed, self._until, self._chance):
+                board.clear() if name is None else board.pop(name, None)
+
+    @property
+    def armed(self):
+        """Names of the faults that can still happen, a set."""
+        with self._lock:
+            left = {**self._armed, **{k: v for k, v in self._chance.items() if v}}
+            return {k for k, v in left.items() if v > 0} | {k for k, end in self._until.items() if end > self._now()}
+
+    def hit(self, name):
+        """Whether the fault happens at this opportunity, which is then counted."""
+        with self._lock:
+            armed, chance = self._armed[name] > 0, self._chance.get(name, 0)
+            hit = armed or self._now() < self._until.get(name, 0) or bool(chance) and self.rng.random() < chance
+            self._armed[name] -= armed
+            if hit:
+                self.counts[name] += 1
+            return hit
+
+    def seconds(self, name, default):
+        """How long the fault that was armed last is to take."""
+        seconds = self._seconds.get(name)
+        return default if seconds is None else seconds
+
+    def mangle(self, data, names=REPLY):
+        """Bytes as they are after those of the faults that hit them; each changes something where it can."""
+        for name in names:
+            if data and self.hit(name):
+                tries = (FAULTS[name].change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
+                data = next((changed for changed in tries if changed != data), data)
+        return data
+
+    def _known(self, name):
+        if name not in FAULTS or self.device not in FAULTS[name].devices:
+            known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
+            raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
+
+
+# ------------------------------------------------------------------------------------------------------ the device
+
+
+def resample(data, sent, read):
+    """What a receiver set to one rate makes of bytes sent at another, without pauses, 8N1; 0 Bd reads nothing.
+
+    Frames without a stop bit read as zero, as Linux hands them over.
+    """
+    if sent == read or not data or not sent or not read:
+        return data if sent == read else b""
+    frames = np.ones((len(data), 10), np.uint8)
+    frames[:, 0] = 0
+    frames[:, 1:9] = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")
+    level, ratio, out, at = frames.tobytes(), sent / read, bytearray(), 0.0
+
+    def sample(bits):
+        place = int(start + bits * ratio)
+        return level[place] if place < len(level) else 1
+
+    while (low := level.find(0, int(at))) >= 0:
+        start = max(low, at)
+        at = start + 9.5 * ratio
+        if sample(0.5):  # too short for a start bit
+            at = start + max(0.5 * ratio, 1)
+        elif sample(9.5):
+            out.append(sum(sample(k + 1.5) << k for k in range(8)))
+        else:
+            out.append(0)
+            at = max(level.find(1, min(int(at), len(level))), 0) or len(level)
+    return bytes(out)
+
+
+class _Part:
+    """Bytes on their way out: not before `start`; `then` is called with the time at which the last is out."""
+
+    def __init__(self, start, data, then=None):
+        self.start, self.data, self.then, self.begun, self.sent = start, data, then, None, 0
+
+
+class SerialDevice:
+    """What all devices on a line have in common; a context manager, or `start` and `close`.
+
+    A subclass has ``baudrate``, ``receive(data, at)`` and ``prepare(data)`` (a reply with faults of its own).
+
+    Parameters
+    ----------
+    kind : {'lrf', 'head'}
+    path : path-like
+        Where the port appears, a symbolic link that stays the same when the port comes back.
+    clock : Clock
+    seed : int
+
+    Attributes
+    ----------
+    faults : Faults
+    counts : dict
+        Bytes 'received', 'sent', 'lost' (buffer full), 'unheard' (port not open), 'garbled' (rates differ).
+    error : Exception or None
+        What ended the device by itself.
+    """
+
+    def __init__(self, kind, path, clock, seed=0):
+        self.path, self.clock, self.error = str(path), clock, None
+        self.port = (_Memory if isinstance(clock.machine, VirtualHost) else _Terminal)(self)
+        self.faults = Faults(kind, seed, clock.machine, self.port.wake)
+        self.counts = dict.fromkeys(("received", "sent", "lost", "unheard", "garbled"), 0)
+        self._agenda, self._order, self._parts, self._last = [], itertools.count(), [], {}
+        self._free, self._heard, self._back = 0.0, 0.0, None
+
+    def start(self):
+        """Let the port appear."""
+        self.port.plug()
+        self.port.start()
+        return self
+
+    def close(self):
+        """Remove the port."""
+        self.port.close()
+
+    __enter__ = start
+
+    def __exit__(self, *_):
+        self.close()
+
+    def at(self, instant, action, tag=None):
+        """Call ``action(instant)`` when its time has come."""
+        heapq.heappush(self._agenda, (instant, next(self._order), action, tag))
+
+    def cancel(self, *tags):
+        """Forget what was planned under tags."""
+        self._agenda = [item for item in self._agenda if item[3] not in tags]
+        heapq.heapify(self._agenda)
+
+    def abort(self):
+        """Stop sending at once, in the middle of a reply if need be."""
+        self._parts, self._free = [], 0.0
+
+    @property
+    def busy_until(self):
+        """When everything given so far has left."""
+        end = self._free
+        for part in self._parts:
+            end = (max(part.start, end) if part.begun is None else part.begun) + len(part.data) * self.byte_s
+        return end
+
+    @property
+    def byte_s(self):
+        """Seconds a byte takes."""
+        return 10 / self.baudrate
+
+    def write(self, data, at, then=None):
+        """Send bytes as they are, after those given before."""
+        self._parts.append(_Part(at, data, then))
+
+    def reply(self, kind, data, at, then=None, burst=None, gap=0.0):
+        """Send a reply, subject to faults.
+
+        Parameters
+        ----------
+        kind : hashable
+            Replies of one kind replace each other for the fault 'stale'.
+        data : bytes
+        at : float
+            When the first byte leaves.
+        then : callable, optional
+            Called with the instant at which the last byte is out, also when a fault swallowed the reply.
+        burst : int, optional
+            At most so many bytes leave at once; the next follow `gap` seconds after the first of them.
+        """
+        hit = self.faults.hit
+        old, self._last[kind] = self._last.get(kind), data
+        data = old if old is not None and hit("stale") else data
+        data = self.faults.mangle(self.prepare(data))
+        at += DELAY_S * hit("delay")
+        if hit("silence"):
+            data = b""
+        for _ in range(1 + hit("twice")):
+            if burst is None and len(data) > 1 and hit("pause"):
+                burst, gap = len(data) // 2, len(data) // 2 * self.byte_s + PAUSE_S
+            for first in range(0, max(1, len(data)), burst or max(1, len(data))):
+                self.write(data[first : first + (burst or len(data))], at + (first // burst * gap if burst else 0))
+        self._parts[-1].then = then
+
+    # -------------------------------------------------------------------------------------------- for the port
+
+    def wait_s(self):
+        """Seconds of the host until something is due."""
+        now, scale = self.clock.now(), self.clock.scale
+        due = self._agenda[0][0] if self._agenda else math.inf
+        if self._parts:
+            part = self._parts[0]
+            begun = part.begun if part.begun is not None else max(part.start, self._free)
+            due = min(due, begun + len(part.data) * self.byte_s, max(begun, now) + max(CHUNK_S * scale, self.byte_s))
+        back = math.inf if self._back is None else self._back - self.clock.machine.now()
+        return max(0.0, min((due - now) / scale, back))
+
+    def due(self):
+        """The same as an instant of the host."""
+        return self.clock.machine.now() + self.wait_s()
+
+    def advance(self):
+        """Do all that is due by now."""
+        if self.port.there and self.faults.hit("unplug"):
+            self.port.unplug()
+            self._back = self.clock.machine.now() + self.faults.seconds("unplug", AWAY_S)
+        if self._back is not None and self.clock.machine.now() >= self._back - SOON:
+            self._back = None
+            self.port.plug()
+        now = self.clock.now() + SOON
+        while self._agenda and self._agenda[0][0] <= now:
+            instant, _, action, _ = heapq.heappop(self._agenda)
+            action(instant)
+        self._send(now)
+
+    def hear(self, data):
+        """Bytes that the host sends."""
+        self.counts["received"] += len(data)
+        if self.faults.hit("echo"):
+            self._put(data)
+        data = self.faults.mangle(self._through(data, self.port.rate, self.baudrate), REQUEST)
+        self._heard = max(self._heard, self.clock.now()) + len(data) * self.byte_s
+        if data:
+            self.receive(data, self._heard)
+
+    def _through(self, data, sent, read):
+        """Bytes after the line, garbled where the two ends are set to different rates."""
+        self.counts["garbled"] += len(data) * (sent != read)
+        return resample(data, sent, read)
+
+    def _send(self, now):
+        """Write the bytes that have left the device by now."""
+        while self._parts:
+            part = self._parts[0]
+            if part.begun is None:
+                part.begun = max(part.start, self._free)
+            end = part.begun + len(part.data) * self.byte_s
+            due = len(part.data) if now >= end else max(0, int((now - part.begun) / self.byte_s))
+            self._put(part.data[part.sent : due])
+            part.sent = max(due, part.sent)
+            if now < end:
+                return
+            self._free = end
+            self._parts.pop(0)
+            if part.then is not None:
+                part.then(end)
+
+    def _put(self, data):
+        if not data or not self.port.open:
+            self.counts["unheard"] += len(data)
+            return
+        data = self._through(data, self.baudrate, self.port.rate)
+        done = self.port.put(data)
+        self.counts["sent"] += done
+        self.counts["lost"] += len(data) - done
+
+
+class _Memory:
+    """The port of a device on a VirtualHost."""
+
+    def __init__(self, device):
+        self._device, self._machine, self.handle = device, device.clock.machine, None
+        self.wake = device.advance
+
+    there = property(lambda self: self._device.path in self._machine.ports)
+    open = property(lambda self: self.handle is not None)
+    rate = property(lambda self: self.handle.baudrate if self.open else 0)
+
+    def start(self):
+        self._machine.devices.append(self._device)
+
+    def close(self):
+        if self._device in self._machine.devices:
+            self._machine.devices.remove(self._device)
+        self.unplug()
+
+    def plug(self):
+        self._machine.ports[self._device.path] = self._connect
+
+    def unplug(self):
+        self._machine.ports.pop(self._device.path, None)
+        if self.open:
+            self.handle.lost = True
+        self.handle = None
+
+    def put(self, data):
+        data = data[: ROOM - len(self.handle.data)]
+        self.handle.data += data
+        return len(data)
+
+    def _connect(self, baudrate, timeout):
+        if self.open:
+            raise PortError(f"the port {self._device.path} is busy, held by another program: close that program")
+        self.handle = _Handle(self._device, baudrate, timeout)
+        return self.handle
+
+
+class _Handle:
+    """What is used of a serial.Serial."""
+
+    def __init__(self, device, baudrate, timeout):
+        self._device, self.port, self.baudrate, self.timeout = device, device.path, baudrate, timeout
+        self.data, self.lost = b"", False
+
+    def _here(self):
+        if self.lost:
+            raise OSError(f"{self.port} was unplugged")
+
+    @property
+    def in_waiting(self):
+        self._here()
+        return len(self.data)
+
+    def read(self, size=1):
+        self._device.clock.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
+        self._here()
+        found, self.data = self.data[:size], self.data[size:]
+        return found
+
+    def write(self, data):
+        self._here()
+        self._device.hear(bytes(data))
+
+    def reset_input_buffer(self):
+        self._here()
+        self.data = b""
+
+    def close(self):
+        if self._device.port.handle is self:
+            self._device.port.handle = None
+
+
+class _Terminal(threading.Thread):
+    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come or something is due."""
+
+    def __init__(self, device):
+        super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
+        self._device, self._quit, self._master, self.open = device, False, None, False
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_write, False)
+
+    there = property(lambda self: self._master is not None)
+    rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
+
+    def wake(self):
+        with contextlib.suppress(OSError):
+            os.write(self._wake_write, b"x")
+
+    def close(self):
+        self._quit = True
+        self.wake()
+        if self.is_alive():
+            self.join(5)
+        for fd in (self._wake_read, self._wake_write):
+            with contextlib.suppress(OSError):
+                os.close(fd)
+
+    def run(self):
+        try:
+            while not self._quit:
+                self._listen(min(self._device.wait_s(), LONGEST_WAIT_S))
+                self._device.advance()
+        except Exception as error:  # a device that dies must say so: the next look at `error` shows it
+            self._device.error = error
+            raise
+        finally:
+            self.unplug()
+
+    def _listen(self, wait):
+        """Wait for bytes of the host, a wake-up, or the time; see whether the host holds the port open."""
+        watch = select.poll()
+        watch.register(self._wake_read, select.POLLIN)
+        if self.open:
+            watch.register(self._master, select.POLLIN)
+        elif self.there:  # a port that nobody holds reports so at once: look now and then
+            wait = min(wait, CLOSED_LOOK_S)
+        found = dict(watch.poll(wait * 1000))
+        if self._wake_read in found:
+            os.read(self._wake_read, 4096)
+        if self.there and (self._master in found or not self.open):
+            watch = select.poll()
+            watch.register(self._master, select.POLLIN)
+            event = dict(watch.poll(0)).get(self._master, 0)
+            if event & select.POLLIN:
+                with contextlib.suppress(OSError):
+                    self._device.hear(os.read(self._master, 4096))
+            if self.open and event & select.POLLHUP:
+                self._flush()
+            self.open = not event & select.POLLHUP
+
+    def _flush(self):
+        """A port forgets what nobody read when it is closed."""
+        with contextlib.suppress(OSError, termios.error):
+            slave = os.open(os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            termios.tcflush(slave, termios.TCIFLUSH)
+            os.close(slave)
+
+    def put(self, data):
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0
+        except OSError:  # closed at this moment
+            self.open = False
+            return len(data)
+
+    def plug(self):
+        """Make the pseudo-terminal and let its path point to it."""
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        path = Path(self._device.path)
+        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(os.ttyname(slave))
+        beside.replace(path)
+        os.close(slave)
+        self.open = False
+
+    def unplug(self):
+        """Take the pseudo-terminal away; whoever holds it gets an error."""
+        if self.there:
+            Path(self._device.path).unlink(missing_ok=True)
+            os.close(self._master)
+            self._master, self.open = None, False

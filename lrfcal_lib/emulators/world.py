@@ -1,0 +1,373 @@
+"""The one simulated world that all emulated devices look at, and its cameras as MJPEG over HTTP on this machine.
+
+A process of its own draws the images, so that the serial devices keep their times. No image shows a head that moves:
+while it does none is sent, and one that was begun before a move is not sent after it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import math
+import os
+import signal
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.session import board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.simulate import beam as lrf
+from lrfcal_lib.simulate.record import VIEWS, world_of
+from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
+from lrfcal_lib.simulate.scene import Imager
+
+LOG = logging.getLogger(__name__)
+DAZZLED, NOT_VALID, WEAK = 2, 1, 4  # index into lms2xx.REASONS
+STILL = 1e-7  # radians within which a scan at rest is cast once
+LOOK_S = 0.05
+CACHED = 64  # images
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the board is.
+
+    Attributes
+    ----------
+    key : tuple
+        Tells places apart.
+    T_platform_board : RigidTransform or None
+        None where there is no board but a table with things.
+    stand : bool
+        On its stand, or held by nothing close to a camera.
+    """
+
+    key: tuple
+    T_platform_board: RigidTransform | None = field(default=None, compare=False)
+    stand: bool = field(default=True, compare=False)
+
+
+class EmulatedWorld:
+    """The world of a simulated setup at the present; the source of the scans of :class:`EmulatedLms`.
+
+    Parameters
+    ----------
+    setup : Setup
+    clock : Clock
+    seed : int
+    placements : sequence of Placement, optional
+        Where the board can be put; those of the setup by default, with the sweep of the room last.
+
+    Attributes
+    ----------
+    head : Head
+    place : Place
+    placements : dict of int to Placement
+    """
+
+    def __init__(self, setup, clock, seed=0, placements=None):
+        self.setup, self.clock = setup, clock
+        if placements is None:
+            bare = room_placement(setup)
+            placements = [*placements_of(setup), *([] if bare is None else [bare])]
+        self.placements = {p.number: p for p in placements}
+        self.head = Head(setup.rig.platform, seed)
+        self._rng, self._still, self._close = np.random.default_rng([seed, 3]), (None, None), {}
+        self.put(None)
+
+    def put(self, number):
+        """Put the board at a placement; None takes it away.
+
+        Raises
+        ------
+        ValueError
+            For a placement that the setup does not have.
+        """
+        if number is not None and number not in self.placements:
+            known = ", ".join(map(str, self.placements))
+            raise ValueError(f"no placement {number}; there are {known}, and none")
+        pose = None if number is None else self.placements[number].T_platform_board
+        self._set(Place(("placement", number), pose))
+
+    def hold_close(self, camera, view):
+        """Hold the board close to a camera, in one of the views for its intrinsics, counted from 0.
+
+        Raises
+        ------
+        ValueError
+            For a camera or a view that the setup does not have.
+        """
+        rig, names, count = self.setup.rig, [c.name for c in self.setup.rig.cameras], self.setup.intrinsics_views
+        if camera not in names or not 0 <= view < count:
+            raise ValueError(f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of {', '.join(names)}")
+        if camera not in self._close:  # as the simulator takes them, the head at pitch 0
+            number = names.index(camera)
+            poses = held_close(rig, rig.cameras[number], count, random(self.setup, VIEWS, number))
+            still = rig.camera_pose(rig.cameras[number], 0.0).inv()
+            self._close[camera] = [still * pose for pose in poses]
+        self._set(Place(("close", camera, view), self._close[camera][view], stand=False))
+
+    def _set(self, place):
+        self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
+
+    @property
+    def place(self):
+        """Where the board is."""
+        return self._scene[0]
+
+    def scan(self, turn, quarters, times):
+        """Readings of the laser range finder; see :meth:`SyntheticSource.scan`."""
+        beam, pitch = self.setup.rig.beam, np.broadcast_to(self.head.pitch(times), times.shape)
+        reading, total, dazzled = self._readings(np.radians(quarters / 4), pitch)
+        ranges = reading + beam.systematic + beam.sigma_range * self._rng.standard_normal(len(reading))
+        reasons = np.where(np.isfinite(reading), 0, np.where(total > 0, WEAK, NOT_VALID))
+        ends = pitch[[np.argmin(times), np.argmax(times)]]
+        return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons), ends
+
+    def _readings(self, bearings, pitch):
+        """Readings without noise; a head at rest sees the same again and again."""
+        (place, world), rig, still = self._scene, self.setup.rig, np.ptp(pitch) < STILL
+        key = place.key, len(bearings), bearings[0], round(float(pitch[0]) / STILL)
+        if still and self._still[0] == key:
+            return self._still[1]
+        found = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
+        self._still = (key, found) if still else self._still
+        return found
+
+    def truth(self):
+        """What only the simulator knows, as JSON."""
+        rig, cameras = self.setup.rig, {}
+        for c in rig.cameras:
+            key = "T_camera_lrf" if c.mount == "head" else "T_camera_platform"
+            cameras[c.name] = {key: transform_to_json(c.mounting), "intrinsics": model_to_json(c.model)}
+        return {
+            "setup": self.setup.name,
+            "T_head_lrf": transform_to_json(rig.T_head_lrf),
+            "cameras": cameras,
+            "board": board_to_json(rig.board),
+            "boards": {n: transform_to_json(p.T_platform_board) for n, p in self.placements.items()},
+            "place": list(self.place.key),
+            "pitch_deg": math.degrees(float(self.head.pitch(self.clock.now()))),
+        }
+
+
+# ------------------------------------------------------------------------------------------------------ cameras
+
+
+def scaled(rig, width):
+    """The rig with images of another width, the same field of view.
+
+    Raises
+    ------
+    ValueError
+        If that makes an odd number of pixels.
+    """
+    cameras = []
+    for camera in rig.cameras:
+        m, scale = camera.model, width / camera.model.width
+        height = m.height * scale
+        if width % 2 or abs(height - 2 * round(height / 2)) > 1e-6:
+            raise ValueError(f"an image width of {width} makes {height:g} lines: both must be even whole numbers")
+        changed = {"width": width, "height": round(height), "fx": m.fx * scale, "fy": m.fy * scale}
+        changed |= {"cx": (m.cx + 0.5) * scale - 0.5, "cy": (m.cy + 0.5) * scale - 0.5}
+        cameras.append(replace(camera, model=replace(m, **changed)))
+    return replace(rig, cameras=tuple(cameras))
+
+
+_setup = None  # of the drawing process
+
+
+def _begin(setup):
+    """Furnish the drawing process."""
+    global _setup
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this process
+    threading.Thread(target=_outlive_nobody, daemon=True).start()
+    _setup = setup
+    cv2.setNumThreads(1)
+
+
+def _outlive_nobody():
+    """End with a parent that was killed."""
+    wait([parent_process().sentinel])
+    os._exit(1)
+
+
+@lru_cache
+def _imager(index):
+    camera = _setup.rig.cameras[index]
+    return Imager(camera.model, camera.exposure)
+
+
+@lru_cache(2)
+def _world(place):
+    return world_of(_setup, place.T_platform_board, stand=place.stand)
+
+
+def _draw(index, place, pitch, seed, quality):
+    """JPEG of what a camera sees; runs in the drawing process."""
+    pose = _setup.rig.camera_pose(_setup.rig.cameras[index], pitch)
+    image = _imager(index).render(_world(place), pose, np.random.default_rng(seed))
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+class CameraServer:
+    """The cameras of a world.
+
+    Parameters
+    ----------
+    world : EmulatedWorld
+    setup : Setup, optional
+        Whose cameras to show, such as smaller ones; the world's by default.
+    quality : int
+        Of JPEG.
+    fps : float
+        Most images a second of a camera.
+    seed : int
+    rest_s : float
+        Seconds of the devices that the head must rest before an image is drawn. Nobody tells a camera whether its
+        image is wanted; most stops of a sweep need none and are shorter.
+
+    Attributes
+    ----------
+    urls : dict of str to str
+    error : Exception or None
+        What ended the drawing process; there are no more images.
+    """
+
+    def __init__(self, world, setup=None, *, quality=97, fps=8.0, seed=0, rest_s=0.5):
+        self.world, self.quality, self.fps, self.seed, self.rest_s = world, quality, fps, seed, rest_s
+        self.names, self.error = [c.name for c in (setup or world.setup).rig.cameras], None
+        self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
+        self._quit, self._serving = threading.Event(), None
+        options = {"mp_context": get_context("spawn"), "initializer": _begin, "initargs": (setup or world.setup,)}
+        self._pool = ProcessPoolExecutor(1, **options)
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
+        self._server.daemon_threads = True
+        self.urls = {name: f"http://127.0.0.1:{self._server.server_address[1]}/{name}.mjpg" for name in self.names}
+
+    def start(self):
+        """Serve, and draw the first images ahead."""
+        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        self._serving.start()
+        for name in self.names:
+            self._drawn(self._key(name))
+
+    def close(self):
+        """End the server and the drawing process."""
+        self._quit.set()
+        if self._serving is not None:
+            self._server.shutdown()
+        self._server.server_close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def serving(self):
+        """Whether there are images to come."""
+        return not self._quit.is_set() and self.error is None
+
+    def image(self, name, timeout=1.0):
+        """The image of a camera that shows the rig as it stands now.
+
+        Parameters
+        ----------
+        name : str
+        timeout : float
+            Seconds to wait for the head to rest and the image to be drawn.
+
+        Returns
+        -------
+        key, bytes
+            What it shows, and a JPEG file; (None, None) where there is none in time.
+        """
+        end = time.monotonic() + timeout
+        while self.serving:
+            key = self._key(name)
+            data = self._drawn(key)
+            if data is not None and self._key(name) == key:
+                return key, data
+            if time.monotonic() > end:
+                break
+            self._quit.wait(LOOK_S)
+        return None, None
+
+    def _key(self, name):
+        """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
+        head, now = self.world.head, self.world.clock.now()
+        if not head.settled(now) or head.tilt.resting(now)[0] < self.rest_s + head.platform.settle:
+            return None
+        return name, self.world.place, round(float(head.pitch(now)), 7)
+
+    def _drawn(self, key):
+        """JPEG of a key; asked for where it is not there yet, and older ones that nobody waits for are dropped."""
+        if key is None:
+            return None
+        try:
+            with self._lock:
+                if key not in self._images:
+                    for old in [k for k, one in self._images.items() if k[0] == key[0] and one.cancel()]:
+                        del self._images[old]
+                    for old in list(self._images)[:-CACHED]:
+                        del self._images[old]
+                    index = self.names.index(key[0])
+                    seed = [self.seed, index, next(self._count)]
+                    self._images[key] = self._pool.submit(_draw, index, *key[1:], seed, self.quality)
+                image = self._images[key]
+            return image.result() if image.done() else None
+        except BrokenProcessPool as error:
+            if self.serving:
+                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
+                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
+            self.error = error
+        except RuntimeError:  # a pool that was shut down is no news
+            if self.serving:
+                raise
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Sends images as a stream, NAME.mjpg, or one of them, NAME.jpg."""
+
+    def do_GET(self):
+        name, _, kind = self.path.strip("/").rpartition(".")
+        if name not in self.cameras.names or kind not in ("mjpg", "jpg"):
+            return self.send_error(404, f"cameras are {', '.join(self.cameras.urls.values())}")
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self._stream(name) if kind == "mjpg" else self._single(name)
+
+    def _begin(self, **headers):
+        self.send_response(200)
+        for key, value in headers.items():
+            self.send_header(key.replace("_", "-"), value)
+        self.end_headers()
+
+    def _single(self, name):
+        _, data = self.cameras.image(name, timeout=20.0)
+        if data is None:
+            return self.send_error(503, "the head moves")
+        self._begin(Content_Type="image/jpeg", Content_Length=len(data))
+        self.wfile.write(data)
+
+    def _stream(self, name):
+        self._begin(Content_Type="multipart/x-mixed-replace; boundary=frame", Cache_Control="no-cache")
+        while self.cameras.serving:
+            _, data = self.cameras.image(name)
+            if data is None:
+                self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
+            else:
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                self.wfile.write(head.encode() + data + b"\r\n")
+                self.cameras._quit.wait(1 / self.cameras.fps)
+
+    def log_message(self, *_):
+        pass
