@@ -19,7 +19,7 @@ help:
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
 	@echo "make bench                   compare speed with scipy and OpenCV"
-	@echo "make fuzz                    200 000 damaged sessions and rig files: only our own errors, within bounds"
+	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
 	@echo "make clean                   remove the environment, reports and caches"
@@ -53,6 +53,7 @@ bench: setup
 
 fuzz: setup
 	@PYTHONPATH=tests $(RUN) tests/fuzz.py
+	LRFCAL_FUZZ=1000000 $(RUN) -m pytest -q tests/test_lms2xx_fuzz.py tests/test_pelco_d.py -k fuzz
 
 data: setup
 	rm -rf data/.new

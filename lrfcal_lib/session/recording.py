@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.board import Board
 from lrfcal_lib.session.common import SessionError, naming, read_bytes, read_json, read_table, reading, short
 from lrfcal_lib.session.files import (
+    DROPPED,
     EDGE_COLUMNS,
     IMAGE_COLUMNS,
     EdgePick,
@@ -290,7 +291,7 @@ def _disorder(session):
                 yield f"{where}: {', '.join(what)} stands in line {seen[what]} already; remove one of them"
             seen.setdefault(what, line)
             key = tuple(row[key] for key in group)
-            if row.get("t_s") and row["placement"]:
+            if row.get("t_s") and row["placement"] and row.get("purpose") != DROPPED:
                 time = float(row["t_s"])
                 if time < last.get(key, -math.inf):
                     back = f"t_s runs back from {last[key]:.9g} to {time:.9g}"
