@@ -424,19 +424,19 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     DegenerateGeometry
         When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
     """
-    data, best, least, rough = gather(obs), None, np.inf, np.inf
+    data, best, least = gather(obs), None, np.inf
     for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
             state = replace(state, head=pose_array(known))
-        rough = min(rough, np.median(rough_misses(state, data)))
+        rough = np.median(rough_misses(state, data))
         kept, state, bad, cost = agreeing_start(obs, state, data, unknowns, tuple(sweep_sigma))
         badness = cost + LEFT_OUT * max(left_out_shares(obs, bad))
         if best is None or badness < least:
-            best, least = (kept, state, bad), badness
+            best, least = (kept, state, bad, rough), badness
         if least < GOOD_START and (T0 is None or number):
             break
-    kept, state, bad = best
+    kept, state, bad, rough = best
     miss = np.median(view_misses(state, gather(kept)))
     if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
@@ -449,7 +449,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return best
+    return kept, state, bad
 
 
 def left_out_shares(obs, bad):
