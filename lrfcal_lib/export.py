@@ -73,10 +73,10 @@ def calibration_record(calibration, method, judged=None):
 
 
 def _sensor(solution):
-    """What the joint estimate says about range finder and pitch; None where it was not estimated."""
+    """What the joint estimate says about range finder and pitch, and what it left out in words."""
     sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
     named = {name: {"value": solution.sensor[name], "sigma": sigma[name]} for name in solution.sensor if name in sigma}
-    return named | {"noise": solution.noise, "excluded_placements": solution.excluded}
+    return named | {"noise": solution.noise, "excluded": list(solution.excluded.values())}
 
 
 AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]

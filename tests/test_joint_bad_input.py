@@ -187,6 +187,19 @@ def test_one_wrong_image_of_several_costs_the_image_not_the_placement(mount, num
     assert worst(found, truth) < 4.5
 
 
+@MOUNTS
+@pytest.mark.parametrize("shift", [0.02, 0.1])
+def test_an_image_that_is_off_within_the_boards_plane_is_left_out(mount, shift):
+    """No range tells; held, it would raise the noise level of all images thirty times."""
+    obs, truth, _ = draw(rng(), mount=mount)
+    pose, row = obs.view_pose.copy(), np.flatnonzero(obs.view_placement == 2)[1]
+    pose[row, :3, 3] += shift * pose[row, :3, 0]
+    found = solve_joint(replace(obs, view_pose=pose), noise="estimate")
+    (words,) = found.excluded.values()
+    assert f"image of 'left' at {np.degrees(obs.view_pitch[row]):.1f} deg" in words
+    assert found.noise["view_scale"] < 1.5 and worst(found, truth) < 4.5
+
+
 def test_an_edge_bias_that_nothing_bounds_leaves_cameras_that_planes_fix():
     obs, _, rig = draw(rng())
     found = solve_joint(obs.keep(beam=~obs.beam_hit), required=False)
@@ -213,4 +226,4 @@ def test_a_scale_of_the_pitch_that_nothing_shows_stays_within_what_is_usual(moun
     sensor = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
     found = solve_joint(obs, sensor=sensor, required=False)
     assert not any("scale of the pitch" in words for words in found.unobservable)
-    assert abs(found.sensor["pitch_scale"]) < 0.15 and found.covariance("pitch_scale")[0, 0] ** 0.5 < 0.051
+    assert abs(found.sensor["pitch_scale"]) < 0.15 and found.solution.sigma[found.columns("pitch_scale")] < 0.051

@@ -5,14 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib import evaluate, joint_calibration, pipeline
+from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.export import calibration_record
 from lrfcal_lib.fused_outline import edge_on_plane, fused_outline_of
 from lrfcal_lib.geometry import transform_difference
 from lrfcal_lib.session import open_session
-from lrfcal_lib.solvers.joint import solve_again
+from lrfcal_lib.simulate.observe import board_poses
+from lrfcal_lib.solvers.joint import solve_again, solve_joint
 
 QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 
@@ -44,6 +47,23 @@ def test_the_scale_of_the_pitch_is_free_with_the_axis_whatever_the_images(joint)
     views = {name: found[:1] for name, found in joint_calibration.all_views(joint.prepared).items()}
     seen = joint_calibration.observe_joint(joint.prepared, views)
     assert "pitch_scale" in joint_calibration.joint_settings(joint.prepared, seen)["sensor"]
+
+
+def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
+    """Cameras on the base, boards up to 17 degrees above and below; chance alone exceeds 1.75 once in a thousand."""
+
+    def high(rng, count):
+        turns = [Rotation.from_rotvec([angle, 0, 0]) for angle in rng.uniform(-0.3, 0.3, count)]
+        return [RigidTransform.from_rotation(R) * T for R, T in zip(turns, board_poses(rng, count), strict=True)]
+
+    fine, square = {"pitch_step": np.radians(0.5), "sigma_range": 0.003, "sigma_px": 0.1}, 0.0
+    for seed in range(3):
+        obs, truth, _ = draw(np.random.default_rng(seed), 20, mount="platform", stretch=0.002, lean=high, **fine)
+        sensor = joint_calibration.joint_settings(joint.prepared, obs)["sensor"]
+        found = solve_joint(obs, sensor=sensor)
+        error, k = state_errors(found.state, truth, found.unknowns)[:16], found.solution.covariance[:16, :16]
+        square += error @ np.linalg.solve(k, error) / 48
+    assert square < 1.75
 
 
 def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
@@ -95,6 +115,7 @@ def test_it_is_handed_over_with_its_platform_and_sensor(found):
     np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
     assert set(record["cameras"]) == set(found.joint.observations.cameras)
     assert record["sensor"]["range_offset"]["sigma"] > 0
+    assert record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
     assert min(edges) <= evaluate.joint_fit(found.joint)["edge_rms_px"] <= max(edges)

@@ -1,4 +1,4 @@
-"""Outlines by likelihood: exact widths of drawn boards, the edge model they give, statistics, bad input."""
+"""Outlines by likelihood: exact widths of drawn boards, statistics, bad input."""
 
 from dataclasses import replace
 
@@ -12,7 +12,6 @@ from lrfcal_lib.geometry import DegenerateGeometry, lrf_to_platform, polar_to_po
 from lrfcal_lib.preprocess.edge_cells import EdgeCells
 from lrfcal_lib.solvers.edge_likelihood import edge_shift
 from lrfcal_lib.solvers.outline_ml import EdgeModel, face_surface, measure_outline
-from lrfcal_lib.solvers.outlines import fit_edge_model, measure_outlines
 
 HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
 BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))
@@ -110,41 +109,7 @@ def test_sides_that_were_not_seen_have_no_length():
     assert set(measured.lengths) == {"right"} and set(measured.corners) == {"right", "bottom"}
 
 
-def test_a_known_board_tells_how_large_edges_look():
-    rng = np.random.default_rng(6)
-    made = [sweep(pose, rng) for pose in poses(8, 1)]
-    found = fit_edge_model(made, BOARD, replace(MODEL, log_odds=0.0, softness=0.2))
-    assert found.log_odds == pytest.approx(-0.8, abs=4 * found.log_odds_sigma + 0.01)
-    assert found.log_odds_sigma < 0.15 and found.softness < 0.1  # below the steps of the beams there is no telling
-
-
-def test_a_few_dark_backgrounds_do_not_spoil_the_odds():
-    rng = np.random.default_rng(7)
-    made = [sweep(pose, rng, deviation=np.array([0, 0, 0, -1.5]) * (i < 2)) for i, pose in enumerate(poses(9, 2))]
-    found = fit_edge_model(made, BOARD, replace(MODEL, log_odds=0.0))
-    assert found.log_odds == pytest.approx(-0.8, abs=0.2)
-
-
-def test_many_sweeps_measure_better_than_one():
-    rng = np.random.default_rng(8)
-    made = [sweep(pose, rng, deviation=rng.normal(0, 0.1, 4)) for pose in poses(8, 3)]
-    model = replace(MODEL, spread=0.1, log_odds_sigma=0.02)
-    start = np.array([[0, 0], [0.49, 0], [0.51, 0.41], [0, 0.395]])
-    lengths, sigma = measure_outlines(made, start, BOARD.edges, model)
-    alone = [np.abs(errors(measure_outline(*s, BOARD.edges, model))[0]).mean() for s in made]
-    together = np.array([lengths[n] - v for n, v in BOARD.lengths().items()])
-    assert np.abs(together).mean() < np.mean(alone)
-    assert (np.abs(together) < 4 * np.array(list(sigma.values())) + 2e-4).all()
-
-
 def test_what_nothing_was_seen_of_is_named():
     cells, face, names = sweep(poses(1)[0], np.random.default_rng(9))
     with pytest.raises(DegenerateGeometry, match="no side has 8 beams"):
         measure_outline(cells.select(np.arange(6)), face, names, BOARD.edges, MODEL)
-    part = {k: v for k, v in names.items() if v in ("top", "right")}
-    with pytest.raises(DegenerateGeometry, match="no sweep crosses bottom, left"):
-        measure_outlines([(cells, face, part)], BOARD.corners, BOARD.edges, MODEL)
-    with pytest.raises(DegenerateGeometry, match="too few sides"):
-        fit_edge_model([(cells, face, part)], BOARD, MODEL)
-    with pytest.raises(DegenerateGeometry, match="no side has 8 beams about it in any"):
-        fit_edge_model([(cells.select(np.arange(6)), face, names)], BOARD, MODEL)

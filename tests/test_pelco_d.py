@@ -1,4 +1,4 @@
-"""Pelco-D and Pelco-P frames: verified bytes, round trips, every kind of reply, echoes, and garbage."""
+"""Pelco-D frames: verified bytes, round trips, every kind of reply, echoes, and garbage."""
 
 import math
 import sys
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from shared import STRINGS
 
-from lrfcal_lib.drivers import pelco_d, pelco_p
+from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import (
     Frame,
     FrameError,
@@ -220,25 +220,6 @@ def test_reply_after_every_kind_of_noise():
         lost += LEVEL not in [one.raw for one in received.replies]
         assert received.echoed + received.skipped + sum(len(one.raw) for one in received.replies) == 7 + 2 * len(noise)
     assert lost < 20  # one in 256 of the places where noise and reply look like another reply
-
-
-# ----------------------------------------------------------------------------------------------------- Pelco-P
-
-
-def test_pelco_p():
-    for raw, frame in {
-        "A0 01 00 00 00 00 AF 0E": Frame(1),
-        "A0 01 00 04 20 00 AF 2A": Frame(1, 0, pelco_d.LEFT, 0x20),
-        "A0 01 00 08 00 20 AF 26": Frame(1, 0, pelco_d.UP, 0, 0x20),
-    }.items():
-        assert pelco_p.parse_frame(bytes.fromhex(raw)) == frame
-        assert pelco_p.encode_frame(1, 0, frame.command2, frame.data1, frame.data2) == bytes.fromhex(raw)
-    with pytest.raises(FrameError, match="0 to 31"):
-        pelco_p.encode_frame(32)
-    with pytest.raises(FrameError, match="checksum 0F sent, 0E computed"):
-        pelco_p.parse_frame(bytes.fromhex("A0 01 00 00 00 00 AF 0F"))
-    with pytest.raises(FrameError, match="A0, 5 bytes, AF"):
-        pelco_p.parse_frame(STOP)
 
 
 # -------------------------------------------------------------------------------------------------------- fuzz

@@ -259,11 +259,13 @@ def test_lines_in_another_common_plane_of_the_source():
     assert transform_difference(found.transform * OFF, rig.T_camera_lrf)[1] < 1e-9
 
 
+@pytest.mark.parametrize("source", ["lrf", "platform"])
 @pytest.mark.parametrize("seed", range(6))
-def test_weights_never_hold_a_bad_start(seed):
-    rig, obs = camera_case(seed, noise=1.0)
+def test_weights_never_hold_a_bad_start(seed, source):
+    """Renewed at the pose of a start that is 80 degrees off, they would call it converged at half a metre."""
+    rig, obs = camera_case(seed, noise=1.0, source=source)
     rng = np.random.default_rng(seed)
-    bad = RigidTransform.from_components(rng.normal(0, 0.3, 3), Rotation.from_rotvec(rng.normal(0, 0.6, 3)))
+    bad = RigidTransform.from_components(rng.normal(0, 0.5, 3), Rotation.from_rotvec(rng.normal(0, 0.9, 3)))
     weighted, plain = (solve_zhang_pless(obs, rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False))
     rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in (weighted, plain)]
     assert rms[0] < 1.3 * rms[1]

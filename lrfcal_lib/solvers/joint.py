@@ -23,6 +23,7 @@ from lrfcal_lib.solvers.joint_lens import lens_covariance
 from lrfcal_lib.solvers.joint_noise import (
     CONTRADICTION,
     LARGEST_SHARE,
+    LEAST_MISFIT,
     ROUGH_MISS,
     estimate_noise,
     image_misses,
@@ -302,24 +303,33 @@ def settle(state, data, unknowns, iterations):
 
 def drop_contradictions(obs, state, data, unknowns):
     """Leave out placements whose residuals are far larger than the others', or the one image that makes them so."""
-    found = misfits(named_blocks(state, data, unknowns), data)
-    level = np.median(found)
-    limit, rows, words = CONTRADICTION * max(level, 1.0), [], {}
-    bad = np.flatnonzero(found > limit)
-    for i in bad:
-        row, board = wrong_image(obs, state, data, unknowns, i, limit)
-        why = f"residuals are {np.sqrt(found[i] / level):.0f} times those of the others"
-        if row is None:
-            words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
-        else:
+    found, usual = contradictions(state, data, unknowns)
+    limits, rows, out, words = CONTRADICTION * usual, [], [], {}
+    for i in np.flatnonzero((found > limits).any(axis=1)):
+        row, board = wrong_image(obs, state, data, unknowns, i, limits)
+        why = f"residuals are {np.sqrt(np.max(found[i] / usual)):.0f} times those of the others"
+        if row is not None:
             rows, state.boards[i] = [*rows, row], board
             words[image_name(obs, row)] = f"{image_name(obs, row)}: with it {why}; the image is left out"
-    if len(bad) == 0:
+        elif found[i, 0] > limits[0]:
+            out.append(i)
+            words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
+    if not words:
         return obs, state, data, {}
-    kept = ~np.isin(obs.placements, list(words))
-    obs = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), rows)).select(obs.placements[kept])
-    own = {key: getattr(state, key)[kept] for key in OWN}
+    obs = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), rows)).select(np.delete(obs.placements, out))
+    own = {key: np.delete(getattr(state, key), out, axis=0) for key in OWN}
     return obs, replace(state, **own), with_levels(gather(obs), data), words
+
+
+def contradictions(state, data, unknowns):
+    """Misfits of placements, and of their images alone, shape (p, 2), and what is usual of both, shape (2,).
+
+    A wrong image raises the noise level of all images until ranges outvote it: images are compared with images.
+    """
+    blocks, several = named_blocks(state, data, unknowns), data.view["used"].sum(axis=1) > 1
+    found = np.stack([misfits(blocks, data), misfits(blocks, data, ("view",))], axis=1)
+    images = np.median(found[several, 1]) if several.any() else np.inf
+    return found, np.array([max(np.median(found[:, 0]), 1.0), max(images, LEAST_MISFIT)])
 
 
 def image_name(obs, row):
@@ -328,7 +338,7 @@ def image_name(obs, row):
     return f"placement {obs.placements[obs.view_placement[row]]}, image of '{camera}' at {pitch:.1f} deg"
 
 
-def wrong_image(obs, state, data, unknowns, i, limit):
+def wrong_image(obs, state, data, unknowns, i, limits):
     """The view without which placement i agrees with the others (None where there is none), and its board then.
 
     Every view is left out once, in copies of the placement, with all that the placements share held.
@@ -345,9 +355,9 @@ def wrong_image(obs, state, data, unknowns, i, limit):
     data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
     lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
     state = _converge(replace(state, **own), data, lone, START_STEPS)
-    found = misfits(named_blocks(state, data, lone), data)
+    found = np.max(contradictions(state, data, lone)[0] / limits, axis=1)
     best = int(np.argmin(found))
-    return (rows[best], state.boards[best]) if found[best] <= limit else (None, None)
+    return (rows[best], state.boards[best]) if found[best] <= 1 else (None, None)
 
 
 def with_levels(data, like):
@@ -414,19 +424,19 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     DegenerateGeometry
         When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
     """
-    data, best, least, rough = gather(obs), None, np.inf, np.inf
+    data, best, least = gather(obs), None, np.inf
     for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
             state = replace(state, head=pose_array(known))
-        rough = min(rough, np.median(rough_misses(state, data)))
+        rough = np.median(rough_misses(state, data))
         kept, state, bad, cost = agreeing_start(obs, state, data, unknowns, tuple(sweep_sigma))
         badness = cost + LEFT_OUT * max(left_out_shares(obs, bad))
         if best is None or badness < least:
-            best, least = (kept, state, bad), badness
+            best, least = (kept, state, bad, rough), badness
         if least < GOOD_START and (T0 is None or number):
             break
-    kept, state, bad = best
+    kept, state, bad, rough = best
     miss = np.median(view_misses(state, gather(kept)))
     if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
@@ -439,7 +449,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return best
+    return kept, state, bad
 
 
 def left_out_shares(obs, bad):

@@ -28,6 +28,7 @@ PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 
 LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
 SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
+LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
 SETTLED = 0.02  # change of the logarithm of a noise level
 ROUGH_MISS = 0.08  # metres, of a board's face from where the first image of it puts it
@@ -170,14 +171,13 @@ def side_level(sides, variance, sigma):
     return float(np.clip(sigma, 0.01, 2.0))
 
 
-def misfits(blocks, data):
+def misfits(blocks, data, groups=("face", "view")):
     """Normalised mean squared residual of ranges and views of each placement; 1 is what the noise explains, (p,)."""
     total, count = np.zeros(len(data.middle)), np.zeros(len(data.middle))
-    for name, numbers in (("face", 1), ("view", 6)):
-        if name in blocks:
-            share = data.face_share if name == "face" else 1.0
-            total += np.sum(whiten(blocks[name], False)[0] ** 2, axis=1) / share
-            count += numbers * getattr(data, name)["used"].sum(axis=1)
+    for name in set(groups) & set(blocks):
+        share, numbers = (data.face_share, 1) if name == "face" else (1.0, 6)
+        total += np.sum(whiten(blocks[name], False)[0] ** 2, axis=1) / share
+        count += numbers * getattr(data, name)["used"].sum(axis=1)
     return total / np.maximum(count - 6, 1)
 
 

@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.board import outline_lines
 
 GROUPS = ("face", "beam", "view")
-SAME_BEARING = 1e-5  # radians
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,8 @@ class JointObservations:
         Of the spot at the board, metres.
     beam_background : ndarray, shape (n,)
         See :mod:`lrfcal_lib.solvers.edge_likelihood`.
+    beam_step : ndarray, shape (n,)
+        Distance at the board to the next beam in the direction in which the edge was found, metres.
     beam_placement : ndarray of int, shape (n,)
     view_camera : ndarray of int, shape (v,)
         Index into `cameras`.
@@ -60,9 +61,6 @@ class JointObservations:
         Stated platform: one of the start values, and the rotation about the axis and shift along it that no data show.
     view_lens : ndarray, shape (v, 6, 9), optional
         Derivative of the view's pose by the intrinsics; see :mod:`lrfcal_lib.solvers.joint_lens`. Zeros by default.
-    beam_step : ndarray, shape (n,), optional
-        Distance at the board to the next beam in the direction in which the edge was found, metres. From the
-        median difference of neighbouring bearings by default.
     lens_covariance : ndarray, shape (c, 9, 9), optional
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
@@ -81,6 +79,7 @@ class JointObservations:
     beam_edge: np.ndarray
     beam_radius: np.ndarray
     beam_background: np.ndarray
+    beam_step: np.ndarray
     beam_placement: np.ndarray
     view_camera: np.ndarray
     view_pitch: np.ndarray
@@ -94,15 +93,12 @@ class JointObservations:
     T_head_lrf: RigidTransform | None = None
     view_lens: np.ndarray | None = None
     lens_covariance: np.ndarray | None = None
-    beam_step: np.ndarray | None = None
 
     def __post_init__(self):
         if self.view_lens is None:
             object.__setattr__(self, "view_lens", np.zeros((len(self.view_camera), 6, 9)))
         if self.lens_covariance is None:
             object.__setattr__(self, "lens_covariance", np.zeros((len(self.cameras), 9, 9)))
-        if self.beam_step is None:
-            object.__setattr__(self, "beam_step", self._steps())
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
@@ -114,17 +110,6 @@ class JointObservations:
                 raise ValueError(f"{group}_placement are indices below {len(self.placements)}, got up to {place.max()}")
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
-
-    def _steps(self):
-        """Distance of neighbouring beams of a scan line at the boards, metres, shape (n,)."""
-        out = np.zeros(len(self.beam_placement))
-        for placement in np.unique(self.beam_placement):
-            mine = self.beam_placement == placement
-            ranges = self.face_range[self.face_placement == placement]
-            apart = np.diff(np.unique(self.beam_bearing[mine]))
-            apart = apart[apart > SAME_BEARING]
-            out[mine] = np.median(apart) * np.median(ranges) if len(apart) and len(ranges) else 0.0
-        return out
 
     def lines(self):
         """Sides of the board, see :meth:`lrfcal_lib.board.Board.lines`."""

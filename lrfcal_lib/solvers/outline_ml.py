@@ -1,4 +1,4 @@
-"""Outlines of boards in sweeps by likelihood, their size unknown; and a sensor's edge model from boards that are known.
+"""Outlines of boards in sweeps by likelihood, their size unknown.
 
 Each side is the straight line in the board's plane that best parts the beams that read the board from those that did
 not, given by how much the sensor makes boards look larger.
