@@ -204,8 +204,8 @@ class PlatformCalibration:
         return "joint" if method == "joint" else "combined"
 
     def transform(self, method):
-        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint', which without an axis is 'combined')."""
-        special = {"stated": self.stated, "combined": self.T_head_lrf, "joint": self.T_head_lrf}
+        """``T_head_lrf`` of a method (also 'stated', 'combined' and 'joint')."""
+        special = {"stated": self.stated, "combined": self.T_head_lrf}
         if self.joint is not None:
             special["joint"] = self.joint[0]
         return special[method] if method in special else self.solutions[method].T_head_lrf
@@ -357,9 +357,9 @@ def with_joint(calibration):
     cameras = joint.observations.cameras
     seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
-    platform = calibration.platform
-    if joint.settings["axis"]:  # scan lines of one pitch say nothing about it
-        platform = replace(platform, joint=(joint.solution.T_head_lrf, joint.axis_parameters()[1]))
+    covariance = stated_covariance(calibration.platform.stated_sigma)  # scan lines of one pitch say nothing about it
+    covariance = joint.axis_parameters()[1] if joint.settings["axis"] else covariance
+    platform = replace(calibration.platform, joint=(joint.solution.T_head_lrf, covariance))
     found = {"observations": calibration.observations | seen, "solutions": calibration.solutions | solved}
     return replace(calibration, platform=platform, joint=joint, **found)
 
@@ -445,10 +445,9 @@ def _color_sweep(calibration, method, placement, mask, every):
 
 def _platform_and_corrections(calibration, method):
     """``T_head_lrf`` and the function that takes known errors out of a sweep, as a method has them."""
-    if method == "joint" and calibration.joint is not None:
-        solution = calibration.joint.solution
-        return solution.T_head_lrf, solution.correct
-    return calibration.platform.T_head_lrf, lambda placement, p_lrf, pitch: (p_lrf, pitch)
+    axis = calibration.platform.axis_with(method)
+    correct = calibration.joint.solution.correct if axis == "joint" else lambda placement, p_lrf, pitch: (p_lrf, pitch)
+    return calibration.platform.transform(axis), correct
 
 
 def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):

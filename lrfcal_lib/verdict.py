@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lrfcal_lib.advice import Suggestion, brief, group_sigma, suggest_placement
 from lrfcal_lib.candidates import outline
@@ -88,8 +89,8 @@ class Verdict:
     def record(self):
         """Answer, reasons and expected errors, ready for JSON."""
         errors = {f"{distance:g}": values for distance, values in self.errors.items()}
-        reasons = [asdict(reason) for reason in self.reasons]
-        return {"answer": self.answer, "reasons": reasons, "notes": list(self.notes), "expected_error_at_m": errors}
+        reasons = [vars(reason) for reason in self.reasons]
+        return {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
 
     def sentences(self):
         """For the first page: the warning before anything else, the errors, what to record next.
@@ -148,8 +149,7 @@ def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
     """
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     field = field_pitches(solution)
-    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
-    reasons = diagnose(solution) + error_reasons(expected_errors(chains, models, 2.0, field))
+    found = _expected(chains, models, distances, field, range_noise(solution), diagnose(solution))
     suggestion, problem = None, ""
     if suggest:
         try:
@@ -157,7 +157,14 @@ def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
         except DegenerateGeometry as error:
             problem = f"No placement can be suggested: {error}."
     sweep = 1000 * float(np.sqrt(np.mean(_cloud(chains[None], 2.0, field).parts["sweep"] ** 2)))
-    return _answered(Verdict(YES, (), errors, 1000 * range_noise(solution), sweep, suggestion, problem), reasons)
+    return replace(found, sweep_mm=sweep, suggestion=suggestion, no_suggestion=problem)
+
+
+def _expected(chains, models, distances, field, noise, reasons):
+    """A verdict by reasons and by the errors that are to be expected."""
+    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
+    large = error_reasons(expected_errors(chains, models, 2.0, field))
+    return _answered(Verdict(YES, (), errors, 1000 * float(noise), 0.0, None), reasons + large)
 
 
 def _answered(found, reasons):
@@ -211,43 +218,35 @@ def sight_of(prepared):
 
 def _without_joint(calibration, method, distances):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
-    prepared, problems = calibration.prepared, calibration.problems
-    cameras = {camera: s for (camera, name), s in calibration.solutions.items() if name == method}
+    prepared, problems, joint = calibration.prepared, calibration.problems, calibration.joint
+    solved = {camera: found for (camera, name), found in calibration.solutions.items() if name == method}
+    bad = [] if joint is None else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
+    why = "; ".join(bad) or problems.get(("rig", "joint"), "another method was asked for")
+    answer = NO if joint is None or not joint.solution.converged else CARE
+    reasons = [Reason(answer, "handed over", f"the joint estimate is not handed over ({why})")]
+    fewest = min(len(calibration.observations[camera, "half_step"].all_placements) for camera in solved)
+    if fewest < FEW:
+        reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
+    for camera in (c for c in prepared.views if c not in solved):
+        words = f"camera '{camera}' is not handed over ({problems.get((camera, method), 'no result')})"
+        reasons.append(Reason(CARE, "cameras", words))
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
-    field, models = _wide(pitch.min(), pitch.max()), prepared.models
-    chains = {camera: _plain_chain(calibration, camera, cameras.get(camera)) for camera in (None, *cameras)}
-    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
-    joint = calibration.joint
-    why = problems.get(("rig", "joint"), "the session has no cameras") if joint is None else ""
-    why = why or "; ".join(("it has not converged",) * (not joint.solution.converged) + joint.solution.unobservable)
-    placements = min((len(calibration.observations[c, "half_step"].all_placements) for c in cameras), default=0)
-    lost = joint is None or not joint.solution.converged or placements < FEW
-    reasons = [Reason(NO if lost else CARE, "handed over", f"there is no joint estimate to hand over ({why})")]
-    if placements < FEW:
-        reasons.append(Reason(NO, "placements", f"{placements} placements only, {FEW} or more are needed"))
-    reasons += [
-        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({problems.get((c, method), 'no result')})")
-        for c in prepared.views
-        if c not in cameras
-    ]
-    reasons += error_reasons(expected_errors(chains, models, 2.0, field))
-    noise = float(np.median([board.sigma_range for board in prepared.scans.values()]))
-    return _answered(Verdict(YES, (), errors, 1000 * noise, 0.0, None), reasons)
+    noise = np.median([board.sigma_range for board in prepared.scans.values()])
+    field = _wide(pitch.min(), pitch.max())
+    return _expected(_plain_chains(calibration, solved), prepared.models, distances, field, noise, reasons)
 
 
-def _plain_chain(calibration, camera, solution):
-    """The chain of a camera calibrated by itself, or of the cloud, whose range offset may be what the maker admits."""
+def _plain_chains(calibration, solved):
+    """Chains of cameras calibrated one by one, and of the cloud, whose range offset may be what the maker admits."""
     platform, session, noise = calibration.platform, calibration.prepared.session, calibration.prepared.pitch_noise
-    covariance = np.zeros((len(COLUMNS),) * 2)
-    covariance[:4, :4] = platform.covariance
-    if solution is None:
-        covariance[10, 10] = session.lrf.admitted_offset ** 2
-    else:
-        covariance[4:10, 4:10] = solution.trusted[:6, :6]
-    pose = None if solution is None else pose_array(solution.transform)
-    mount = "head" if solution is None else session.cameras[camera].mount
-    head, unseen = pose_array(platform.T_head_lrf), np.zeros((0, len(COLUMNS)))
-    return Chain(head, pose, mount, (covariance,), unseen, (noise.offset, noise.stretch))
+    rest = np.zeros((0, len(COLUMNS))), (noise.offset, noise.stretch)
+    head, sigma = pose_array(platform.T_head_lrf), np.zeros((len(COLUMNS),) * 2)
+    sigma[:4, :4], sigma[10, 10] = platform.covariance, session.lrf.admitted_offset**2
+    chains = {None: Chain(head, None, "head", (sigma,), *rest)}
+    for camera, found in solved.items():
+        sigma = block_diag(platform.covariance, found.trusted[:6, :6], np.zeros((3, 3)))
+        chains[camera] = Chain(head, pose_array(found.transform), session.cameras[camera].mount, (sigma,), *rest)
+    return chains
 
 
 def _range_offset(joint):
@@ -257,8 +256,8 @@ def _range_offset(joint):
     margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
         words = (
-            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that the maker of the "
-            f"range finder admits: {SIZES}, and the unit of the ranges"
+            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
+            f"the range finder (session.json may state systematic_error_m): {SIZES}, and the unit of the ranges"
         )
         yield Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words)
 

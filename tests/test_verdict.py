@@ -7,11 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tiny_sessions import record, rectangle
 
 from lrfcal_lib import __main__, verdict
 from lrfcal_lib.export import UNTRUSTED, calibrate_session
+from lrfcal_lib.pipeline import calibrate
 from lrfcal_lib.session import LrfInfo, open_session
-from lrfcal_lib.session.stated import ASSUMED_SYSTEMATIC_ERROR, lrf_from_json, lrf_to_json
+from lrfcal_lib.session.stated import lrf_from_json, lrf_to_json
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -25,17 +27,17 @@ def joint_of(offset_mm, sigma_mm, **options):
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma_mm / 1000]))
     solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset_mm / 1000})
     board = SimpleNamespace(lengths=lambda: {"ab": 0.8, "bc": 0.8})
-    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(**options)), board=board)
+    stated = lrf(**{"systematic_error": 0.004} | options)
+    prepared = SimpleNamespace(session=SimpleNamespace(lrf=stated), board=board)
     return SimpleNamespace(solution=solution, prepared=prepared)
 
 
 @pytest.mark.parametrize(
     ("stated", "admitted"),
     [
-        ({}, 0.004),
         ({"model": "LMS221-30206 (simulated)"}, 0.035),
-        ({"model": "LMS221-30206", "range_resolution": 0.01}, ASSUMED_SYSTEMATIC_ERROR),
-        ({"model": "home-made"}, ASSUMED_SYSTEMATIC_ERROR),
+        ({"model": "LMS221-30206", "range_resolution": 0.01}, 0.05),
+        ({"model": "home-made"}, 0.025),
         ({"model": "SICK LMS400", "systematic_error": 0.012}, 0.012),
     ],
 )
@@ -63,6 +65,28 @@ def test_edges_that_contradict_the_stated_ones(monkeypatch, error, sigma, answer
     found = list(verdict._size(joint_of(0, 1)))
     assert [reason.answer for reason in found] == answers
     assert all("shorter in the cloud than stated" in reason.words for reason in found)
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory):
+    """Six placements of a board with a chessboard, and what the session states of it."""
+    folder = tmp_path_factory.mktemp("plate") / "plate"
+    record(folder, rectangle(0.03), seed=3, placements=6)
+    return folder, json.loads((folder / "session.json").read_text())
+
+
+@pytest.mark.parametrize(("size", "wrong"), [(1.0, False), (1.05, True)])
+def test_a_board_stated_too_large_is_no_better_and_named(plate, size, wrong):
+    folder, stated = plate
+    board = json.loads(json.dumps(stated["board"]))
+    board["corners_m"] = [[size * x for x in corner] for corner in board["corners_m"]]
+    board["pattern"]["square_m"] *= size
+    board["pattern"]["origin_m"] = [size * x for x in board["pattern"]["origin_m"]]
+    (folder / "session.json").write_text(json.dumps(stated | {"board": board}))
+    judged = verdict.judge(calibrate(open_session(folder), ["zhang_pless"]), suggest=False)
+    named = [reason.words for reason in judged.reasons if reason.kind in ("range offset", "size")]
+    assert judged.answer != "yes" and bool(named) == wrong
+    assert all("board" in words and "squares" in words for words in named)
 
 
 @pytest.fixture(scope="module")

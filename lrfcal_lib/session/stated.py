@@ -20,12 +20,12 @@ LARGEST_IMAGE = 30_000_000  # pixels
 MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
 LONGEST_LEVER = 10.0  # metres between the parts of a rig
-# metres, by part of the model's name: systematic error of a range according to the maker's data sheet
-SYSTEMATIC_ERROR = {
-    "LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS291": 0.035, "LMS400": 0.004, "LMS5": 0.035,
-    "TiM5": 0.060,
-}  # fmt: skip
-ASSUMED_SYSTEMATIC_ERROR = 0.050  # metres; where nobody stated it, and of an LMS2xx that counts centimetres
+# metres, by part of the model's name: systematic error of a range up to 10 m according to SICK (technical description
+# of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors LMSxxx"; data sheet of TiM55x and TiM56x)
+SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS5": 0.025, "TiM5": 0.060}
+# of other models (no sheet of the LMS291 and LMS400 was at hand), and of those that count centimetres: so many standard
+# deviations or steps of a range; the sheets above admit 2 to 4.2, and 4 to 5 steps of a centimetre
+ASSUMED_SYSTEMATIC_ERROR = 5.0
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
 
@@ -52,7 +52,8 @@ class LrfInfo:
         Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet;
         None where unknown.
     systematic_error : float or None
-        Largest offset of all ranges that the maker admits, metres; None where not stated: then the one of the model.
+        Largest offset of all ranges that the maker admits, metres; None where not stated: then the one of the model, or
+        five standard deviations of a range.
     """
 
     model: str
@@ -69,9 +70,9 @@ class LrfInfo:
     def admitted_offset(self):
         """The largest range offset that the maker admits, metres: stated, or known of the model, or assumed."""
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
-        if self.systematic_error is not None or not known or self.range_resolution > 0.005:
-            return self.systematic_error or ASSUMED_SYSTEMATIC_ERROR
-        return known[0]
+        if not known or self.range_resolution > 0.005:
+            known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
+        return self.systematic_error or known[0]
 
     def spot_radius(self, distance):
         """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not stated."""
