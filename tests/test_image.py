@@ -220,6 +220,31 @@ def test_no_pattern():
         image.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
 
 
+def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
+    """A dark plate with a chessboard of 9 x 5 inner corners on paper, seen straight on and turned (degrees)."""
+    x, y = np.meshgrid(np.arange(460) - middle[0], np.arange(330) - middle[1])
+    c, s = np.cos(np.radians(turn)) / square, np.sin(np.radians(turn)) / square
+    u, v = c * x + s * y, c * y - s * x
+    shade, squares = np.full(x.shape, 160.0), 25.0 + 200.0 * ((u // 1 + v // 1) % 2)
+    for half, value in (((6.4, 4.7), 70.0), ((5.25, 3.25), 225.0), ((5.0, 3.0), squares)):
+        shade = np.where((np.abs(u) < half[0]) & (np.abs(v) < half[1]), value, shade)
+    return cv2.GaussianBlur(shade, (0, 0), 0.8).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("turn", [100, 280])
+@pytest.mark.parametrize("beyond", [-5, 3, 20])
+def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
+    pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
+    whole = image.find_pattern(picture, pattern)
+    part = np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond])
+    try:
+        found = image.find_pattern(part, pattern)
+    except image.PatternNotFound:
+        assert beyond < 18  # where all squares are seen it is found
+    else:
+        assert min(np.abs(p - whole).max() for p in (found, turn_pattern(found))) < 0.3
+
+
 @pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3, 1), np.uint8), np.zeros((0, 0), np.uint8)])
 def test_what_is_no_image(bad):
     with pytest.raises(ValueError, match="must be uint8"):

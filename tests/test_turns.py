@@ -52,7 +52,9 @@ def test_the_evidence_of_all_images_decides():
     scores = rng.uniform(0, 1, (len(true), 4))  # no image tells on its own
     scores[np.arange(len(true)), true] += 0.45
     assert np.mean(np.argmax(scores, axis=1) == true) < 0.95
-    np.testing.assert_array_equal(decide(scores, *alike(rotations, placements, cameras)), true)
+    first, partner = alike(rotations, placements, cameras)
+    chosen = decide(np.take_along_axis(scores, partner, axis=1), first)
+    np.testing.assert_array_equal(partner[np.arange(len(true)), chosen], true)
 
 
 def test_an_image_of_no_placement_stands_alone():

@@ -241,20 +241,18 @@ def _intrinsics(camera, found, board, group, read):
 
 def _ordered_by_outline(cameras, read, board, models, found, settled):
     """Corners of every image in the order that the known outline asks for, the same at all images of a placement."""
-    at, ordered = _with_pattern(cameras, found), {c: list(f) for c, f in found.items()}
+    at = _with_pattern(cameras, found)
     orders = [pattern_orders(found[c][i], board, board.lines()) for c, i, _ in at]
-    rotations, scores = _rotations(at, orders, board, models), []
-    for (c, _, r), own, seen in zip(at, orders, rotations, strict=True):
+    first, orders = _alike(at, orders, board, models)
+    scores = []
+    for (c, _, r), own in zip(at, orders, strict=True):
         view = settled.get(c, {}).get(r.placement)
-        if view is None or view.T_camera_board is None:
+        if view is None or view.pixels is None:
             scores.append(order_scores(read(r), board, models[c], own))
         else:
-            off = (seen * view.T_camera_board.rotation.inv()).magnitude()
+            off = np.array([np.nanstd(pixels - view.pixels, axis=0).sum() for pixels in own])
             scores.append(SETTLED * (off == off.min()))
-    chosen = decide(scores, *_alike(at, rotations)) if at else ()
-    for (c, i, _), own, k in zip(at, orders, chosen, strict=True):
-        ordered[c][i] = own[k]
-    return ordered
+    return _in_order(found, at, orders, decide(scores, first))
 
 
 def _with_pattern(cameras, found):
@@ -263,19 +261,21 @@ def _with_pattern(cameras, found):
     return [(c, i, r) for c, i, r, p in pairs if not _is_reason(p)]
 
 
-def _rotations(at, orders, board, models):
-    """From the board to the camera for every order of the corners, a stack of Rotation for each image."""
-    points = board.pattern.points()
-    return [
-        Rotation.concatenate([first_pose(points, pixels, models[c]).rotation for pixels in own])
-        for (c, _, _), own in zip(at, orders, strict=True)
-    ]
-
-
-def _alike(at, rotations):
-    """Which orders of the corners belong together in the images of a placement, see :func:`.turns.alike`."""
+def _alike(at, orders, board, models):
+    """The first image of the same placement, and the orders of the corners, those that belong together side by side."""
+    points, rotations = board.pattern.points(), []
+    for (c, _, _), own in zip(at, orders, strict=True):
+        rotations.append(Rotation.concatenate([first_pose(points, pixels, models[c]).rotation for pixels in own]))
     placements = [-1 if r.purpose == "intrinsics" else r.placement for _, _, r in at]
-    return alike(rotations, placements, [c for c, _, _ in at])
+    first, partner = alike(rotations, placements, [c for c, _, _ in at])
+    return first, [[own[k] for k in mine] for own, mine in zip(orders, partner, strict=True)]
+
+
+def _in_order(found, at, orders, chosen):
+    ordered = {c: list(f) for c, f in found.items()}
+    for (c, i, _), own, k in zip(at, orders, chosen, strict=True):
+        ordered[c][i] = own[int(k)]
+    return ordered
 
 
 def _ordered_by_votes(cameras, read, board, models, found):
@@ -288,16 +288,12 @@ def _ordered_by_votes(cameras, read, board, models, found):
     at = _with_pattern(cameras, found)
     if not at:
         raise ValueError(f"none of {sum(map(len, cameras.values()))} images shows the pattern of board '{board.name}'")
-    poses = [board_pose(found[c][i], board.pattern, models[c])[0] for c, i, _ in at]
-    votes = [edge_votes(read(r), board, models[c], pose) for (c, _, r), pose in zip(at, poses, strict=True)]
-    up = [pose.rotation.as_matrix()[1, 1] for pose in poses]
-    orders = [(found[c][i], turn_pattern(found[c][i])) for c, i, _ in at]
-    turned = resolve_turns(votes, up, *_alike(at, _rotations(at, orders, board, models)))
-    ordered = {c: list(f) for c, f in found.items()}
-    for (c, i, _), own, turn in zip(at, orders, turned, strict=True):
-        ordered[c][i] = own[int(turn)]
-    votes = np.stack(votes)
+    first, orders = _alike(at, [(found[c][i], turn_pattern(found[c][i])) for c, i, _ in at], board, models)
+    poses = [board_pose(own[0], board.pattern, models[c])[0] for (c, _, _), own in zip(at, orders, strict=True)]
+    votes = np.stack([edge_votes(read(r), board, models[c], pose) for (c, _, r), pose in zip(at, poses, strict=True)])
+    turned = resolve_turns(votes, [pose.rotation.as_matrix()[1, 1] for pose in poses], first)
     votes[turned] = votes[turned][:, [2, 3, 0, 1]]
+    ordered = _in_order(found, at, orders, turned)
     try:
         return ordered, common_lines(votes, board), ""
     except OutlineNotSeen as error:

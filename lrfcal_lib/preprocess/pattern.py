@@ -14,6 +14,7 @@ from lrfcal_lib.preprocess.adjustment import SIGMA_FLOOR_PX, adjust_robust, bett
 
 WINDOW_SHARE, WIDEST_WINDOW = 0.4, 15  # half window around a corner: of the shortest side of a square; pixels
 SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second detector
+BEYOND, LEAST_BEYOND = 0.3, 0.25  # where to look outside the outermost corners, squares; contrast there, of that inside
 
 
 class PatternNotFound(ValueError):
@@ -78,7 +79,7 @@ class PatternFinder:
         size = (self.pattern.columns, self.pattern.rows)
         rough = self._rough(picture, size)
         corners = _sectors(picture, size) if rough is None else _smoothest(picture, size, rough)
-        if corners is None:
+        if corners is None or not _ends_in_squares(picture, corners, size):
             raise PatternNotFound(
                 f"no chessboard with {size[0]} x {size[1]} inner corners in the image: it must be whole, and not glare"
             )
@@ -170,6 +171,21 @@ def _refined(picture, rough, size):
     window = int(np.clip(WINDOW_SHARE * step, 2, WIDEST_WINDOW))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
     return cv2.cornerSubPix(picture, rough.astype(np.float32).copy(), (window, window), (-1, -1), stop).astype(float)
+
+
+def _ends_in_squares(picture, corners, size):
+    """Whether squares alternate outside the outermost corners: not where a pattern that is cut is taken a row off."""
+    grid = corners.reshape(size[1], size[0], 2)
+    for side in (np.rot90(grid, k) for k in range(4)):
+        edge, inner = (side[:2, 1:] + side[:2, :-1]) / 2
+        both = np.array([edge - BEYOND * (inner - edge), edge + BEYOND * (inner - edge)])
+        seen = np.all((both >= 0) & (both <= np.array(picture.shape[::-1]) - 1), axis=(0, 2))
+        outside, inside = cv2.remap(picture, both.astype(np.float32), None, cv2.INTER_LINEAR)[:, seen].astype(float)
+        sign = np.resize([1.0, -1.0], len(seen))[seen]
+        sign -= sign.mean() if len(sign) else 0.0
+        if (sign @ outside) * (sign @ inside) > -LEAST_BEYOND * (sign @ inside) ** 2:
+            return False
+    return True
 
 
 def _clockwise(corners, size):

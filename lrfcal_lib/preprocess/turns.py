@@ -57,24 +57,26 @@ def _between(rotations, placements, cameras, base, camera):
     return every[int(np.argmin(cost))]
 
 
-def decide(scores, first, partner):
-    """One order for every image, the same in all images of a placement.
+def decide(scores, first):
+    """One order for all images of a placement.
 
     Parameters
     ----------
     scores : array_like, shape (m, n)
-        How well each order explains each image; orders of a mirrored board frame are the second half.
-    first, partner : ndarray
+        How well each order explains each image, those that belong together in one column; orders of a mirrored board
+        frame are the second half.
+    first : ndarray of int, shape (m,)
         Of :func:`alike`.
 
     Returns
     -------
     ndarray of int, shape (m,)
     """
+    if not len(scores):
+        return np.zeros(0, int)
     total = np.zeros(np.shape(scores))
-    np.add.at(total, first, np.take_along_axis(np.asarray(scores, float), partner, axis=1))
+    np.add.at(total, first, scores)
     half = total.shape[1] // 2
     usual, mirrored = (part.max(axis=1).sum() for part in (total[:, :half], total[:, half:]))
     side = slice(0, half) if mirrored < CLEARLY * usual else slice(half, None)
-    best = total[:, side].argmax(axis=1) + side.start
-    return partner[np.arange(len(first)), best[first]]
+    return (total[:, side].argmax(axis=1) + side.start)[first]

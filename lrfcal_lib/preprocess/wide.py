@@ -124,7 +124,7 @@ def side_lines(pattern, distances):
     return np.column_stack([SIDE_NORMALS, offset])
 
 
-def resolve_turns(votes, up, first=None, partner=None):
+def resolve_turns(votes, up, first):
     """Which views see the pattern turned by 180 deg against the others.
 
     Parameters
@@ -133,19 +133,16 @@ def resolve_turns(votes, up, first=None, partner=None):
         Of :func:`edge_votes`, one row a view.
     up : ndarray, shape (v,)
         Component of the board's y axis down the image: most views keep y down.
-    first, partner : ndarray, shape (v,) and (v, 2), optional
-        Views that are decided together, see :func:`lrfcal_lib.preprocess.turns.alike`.
+    first : ndarray of int, shape (v,)
+        The first of the views that are turned alike, see :func:`lrfcal_lib.preprocess.turns.alike`.
 
     Returns
     -------
     ndarray of bool, shape (v,)
     """
-    first = np.arange(len(votes)) if first is None else first
-    against = np.zeros(len(votes), bool) if partner is None else partner[:, 0] == 1
-    up = np.where(against, -np.asarray(up), up)
+    up = np.asarray(up)
     # edges move by a few millimetres from view to view: widen the peaks before comparing
     wide = uniform_filter1d(np.nan_to_num(np.asarray(votes, float)), 9, axis=-1)
-    wide[against] = wide[against][:, [2, 3, 0, 1]]
     both = np.stack([wide, wide[:, [2, 3, 0, 1]]])
     turned = np.bincount(first, up)[first] < 0
     rows = np.arange(len(votes))
@@ -157,7 +154,7 @@ def resolve_turns(votes, up, first=None, partner=None):
             break
         turned = new
     kept_down = np.where(turned, -up, up)
-    return (turned if np.mean(kept_down > 0) >= 0.5 else ~turned) ^ against
+    return turned if np.mean(kept_down > 0) >= 0.5 else ~turned
 
 
 def common_lines(votes, board):
