@@ -186,10 +186,16 @@ def test_derivative_of_the_state_moves_only_what_is_asked():
 # the estimator
 
 
+def draw_plainly(rng, mount):
+    """Observations whose readings flip as the bound has it: a floor of the softness would state more than there is."""
+    obs, truth, _ = draw(rng, 12, mount=mount)
+    return replace(obs, beam_step=0 * obs.beam_step), truth
+
+
 @pytest.fixture(scope="module")
 def trials():
     return {
-        mount: monte_carlo(lambda rng, m=mount: draw(rng, 12, mount=m)[:2], solve_joint, range(30))
+        mount: monte_carlo(lambda rng, m=mount: draw_plainly(rng, m), solve_joint, range(30))
         for mount in ("head", "platform")
     }
 

@@ -225,7 +225,7 @@ def solve_joint(
         Share of edge beams expected to say nothing.
     noise : {'stated', 'estimate'}
         Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among neighbours) from the
-        residuals, and leave out placements that contradict all others, by name.
+        residuals, and leave out placements and images that contradict all others, by name.
     start : JointState, optional
         Skips the search for a start value.
     required : bool
