@@ -28,7 +28,7 @@ STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a wo
 DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
 LOST = 0.1  # share of the placements that may be left out without a warning
-SIZES = "check the stated size of the board and of the squares of its chessboard"
+SIZES = "check the stated size of the board and of the squares of its chessboard, which expected errors presume"
 POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
@@ -204,6 +204,8 @@ def judge(calibration, method=None, **options):
     else:
         found = _without_joint(calibration, method, options.get("distances", DISTANCES))
     reasons, words = _left_out(calibration, method)
+    if reasons:  # with the words of those that the estimate excluded
+        found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", words)
     return replace(_answered(found, sizes + reasons), notes=notes)
@@ -257,7 +259,7 @@ def _range_offset(joint):
     if abs(offset) > admitted + margin:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
-            f"the range finder (session.json may state systematic_error_m): {SIZES}, and the unit of the ranges"
+            f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
         )
         yield Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words)
 

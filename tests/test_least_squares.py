@@ -12,7 +12,12 @@ from synthetic import camera_case
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.camera import line_block, solve_lines_batch
 from lrfcal_lib.solvers.least_squares import Block, minimise, robust_rho, robust_weights, solve, whiten
-from lrfcal_lib.solvers.observability import null_space, placement_covariance, unobservable_motions
+from lrfcal_lib.solvers.observability import (
+    null_space,
+    placement_covariance,
+    pseudo_inverse,
+    unobservable_motions,
+)
 from lrfcal_lib.solvers.pose import apply_pose, exp_rotation, motion_words, move_pose, pose_array, pose_transform
 
 
@@ -218,6 +223,12 @@ def test_null_space_names_the_lost_direction():
     assert values[0] < 1e-6
     words = unobservable_motions(A.T @ A, np.ones(6), lambda d: motion_words(d, "left"), 1.0)
     assert words == ("translation along x of the left frame",)
+
+
+def test_rounding_errors_below_zero_are_no_information():
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    hessian = (turn * [-3e-13, 1e-6, 0.5, 1.0]) @ turn.T
+    np.testing.assert_allclose(pseudo_inverse(hessian), (turn * [0, 1e6, 2, 1]) @ turn.T, rtol=1e-6)
 
 
 def test_required_observability_raises_in_words():

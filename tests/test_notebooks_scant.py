@@ -1,8 +1,14 @@
 """Notebooks on sessions that leave questions open: they run to the end, and say what cannot be asked."""
 
+import json
+
+import numpy as np
 import pytest
 from notebook_runs import WITH_SESSION, run_plainly
 from tiny_sessions import record, rectangle
+
+from lrfcal_lib import cache
+from lrfcal_lib.export import calibrate_session
 
 SCANT = {
     "lines": {"pitch_deg": [0.0]},  # single scan lines: no sweep, no axis, no cloud
@@ -31,3 +37,12 @@ def test_runs_to_the_end_and_says_what_is_not_asked(path, scant):
     told = run_plainly(path, session, stages)
     assert SAYS.get((kind, path.stem[:2]), "") in told
     assert " nan " not in told
+
+
+def test_calibrate_writes_what_is_handed_over_with_its_axis(scant, tmp_path, monkeypatch):
+    _, session, stages = scant
+    monkeypatch.setenv(cache.VARIABLE, str(stages))
+    status = calibrate_session(session, tmp_path)
+    written = json.loads((tmp_path / "calibration.json").read_text())
+    assert (status == 3) == (written["verdict"]["answer"] == "no")
+    assert (np.diag(written["platform"]["axis_covariance"]) > 0).all(), "an axis that no data show is as stated"

@@ -21,10 +21,10 @@ from scipy.stats import chi2 as chi2_distribution
 
 from lrfcal_lib.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.observability import (
-    RANK,
     by_placement,
     name_words,
     placement_covariance,
+    pseudo_inverse,
     unobservable_motions,
     with_infinities,
 )
@@ -373,7 +373,7 @@ def solve(
     freedom = freedom if freedom is not None else _freedom(r, J, shared)
     inflation = _inflation(chi2, freedom)
     unit = np.asarray(scales)[:, None] * np.asarray(scales)
-    covariance = np.linalg.pinv(hessian * unit, rcond=RANK, hermitian=True) * unit * inflation[..., None, None]
+    covariance = pseudo_inverse(hessian * unit) * unit * inflation[..., None, None]
     covariance = with_infinities(covariance, hessian, scales)
     clustered, _ = placement_covariance(hessians, scores) if (groups is not None or shared) else (None, None)
     transform, parameters = read(state)

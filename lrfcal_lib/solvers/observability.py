@@ -57,6 +57,13 @@ def unobservable_motions(hessian, scales, words, limit):
     return tuple(words(direction) for direction in null_space(hessian, scales, limit)[0])
 
 
+def pseudo_inverse(hessian):
+    """Inverse of scaled normal equations on what they determine; eigenvalues below zero are rounding errors too."""
+    values, vectors = np.linalg.eigh(hessian)
+    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=values > RANK * values[..., -1:])
+    return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+
+
 def with_infinities(covariance, hessian, scales):
     """Covariances in which unknowns that take part in an undetermined direction have an infinite variance.
 
