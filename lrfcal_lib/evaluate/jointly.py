@@ -131,9 +131,11 @@ def size_error(joint):
     -------
     error, sigma : float
         Mean relative error of the lengths whose ends beams decide, and its standard deviation: scatter over placements,
-        range offset, edge bias. NaN with fewer than three placements.
+        range offset, edge bias. NaN with fewer than three placements, and where nobody knows the outline of the board.
     """
     prepared, model = joint.prepared, replace(joint.edge_model(), range_offset=0.0)
+    if prepared.board.corners is None:
+        return np.nan, np.nan
     true, edges, found = prepared.board.lengths(), prepared.board.edges, []
     for placement in joint.solution.boards:
         with suppress(DegenerateGeometry):
