@@ -30,4 +30,4 @@ def test_runs_to_the_end_and_says_what_is_not_asked(path, scant):
     kind, session, stages = scant
     told = run_plainly(path, session, stages)
     assert SAYS.get((kind, path.stem[:2]), "") in told
-    assert " nan " not in told
+    assert "sigma nan" not in told
