@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from joint_draws import draw
-from lrfcal_lib.simulate.observe import board_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib import evaluate, joint_calibration, pipeline
@@ -15,6 +14,7 @@ from lrfcal_lib.export import calibration_record
 from lrfcal_lib.fused_outline import edge_on_plane, fused_outline_of
 from lrfcal_lib.geometry import transform_difference
 from lrfcal_lib.session import open_session
+from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
 
 QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"

@@ -18,7 +18,7 @@ SAYS = {
     ("lines", "01"): "a single scan line",
     ("lines", "03"): "no sweeps with a straight side",
     ("lines", "07"): "whether it bends",
-    ("wall", "04"): "how sharp they are cannot be asked",
+    ("wall", "04"): "the images do not agree on the top edge",
     ("wall", "05"): "no placement has sides",
 }
 

@@ -2,15 +2,18 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from tiny_sessions import record, rectangle
+from scipy.spatial.transform import RigidTransform, Rotation
+from tiny_sessions import CAMERAS, MODEL, record, rectangle
 
+from lrfcal_lib.camera import project
 from lrfcal_lib.preprocess import image
 from lrfcal_lib.preprocess.turns import alike, decide
-from lrfcal_lib.session import open_session, transform_from_json
+from lrfcal_lib.session import ImageRecord, open_session, transform_from_json
 
 HALF, MIRROR = Rotation.from_rotvec([0, 0, np.pi]), Rotation.from_rotvec([np.pi, 0, 0])
 RECTANGLE = Rotation.concatenate([Rotation.identity(), HALF, MIRROR, MIRROR * HALF])
@@ -84,3 +87,22 @@ def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centr
         assert max((own[0].inv() * turn).magnitude() for turn in own) < 0.1, f"placement {number}"
         # a stated frame is the board's, as it is or turned by half a turn, never seen from behind
         assert not stated or min(own[0].magnitude(), (own[0] * HALF).magnitude()) < 0.1
+
+
+def test_a_plain_rectangle_is_turned_alike_in_both_cameras():
+    board, rng, pictures, true = replace(rectangle(), pattern=None), np.random.default_rng(1), {}, {}
+    beside = CAMERAS["right"] * CAMERAS["left"].inv()
+    for placement in range(6):
+        turn = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]) * Rotation.from_rotvec([*rng.uniform(-0.6, 0.6, 2), 0])
+        turn = turn * Rotation.from_euler("x", np.pi)  # z of the board faces the cameras
+        pose = RigidTransform.from_components([0.1, 0, 1.2] - turn.apply([*board.corners.mean(axis=0), 0.0]), turn)
+        for camera, seen in {"left": pose, "right": beside * pose}.items():
+            uv = project(seen.apply(np.column_stack([board.corners, np.zeros(4)])), MODEL)
+            picture = np.full((MODEL.height, MODEL.width), 170, np.uint8)
+            cv2.fillConvexPoly(picture, np.rint(uv * 256).astype(np.int32), 35, cv2.LINE_AA, 8)
+            pictures[f"{camera}{placement}"] = cv2.GaussianBlur(picture, (0, 0), 0.7)
+            true[camera, placement] = seen.rotation
+    records = [ImageRecord(n[:-1], Path(n), int(n[-1]), 0.0, 0.0, "board") for n in pictures]
+    views = image.survey(records, lambda r: pictures[r.file.name], board, dict.fromkeys(CAMERAS, MODEL)).views
+    off = [[true[c, v.placement].inv() * v.T_camera_board.rotation for v in views[c]] for c in CAMERAS]
+    assert max((a.inv() * b).magnitude() for a, b in zip(*off, strict=True)) < 0.1

@@ -11,14 +11,22 @@ from lrfcal_lib.board import Board, Chessboard
 from lrfcal_lib.camera import CameraModel, project, undistort
 from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import CameraInfo, LrfInfo, SessionWriter, board_to_json, model_to_json, transform_to_json
-from lrfcal_lib.simulate.rig import camera_mounting
+from lrfcal_lib.simulate.draw import AHEAD
 
 MODEL = CameraModel(480, 360, 500.0, 499.0, 241.0, 178.0, np.array([-0.12, 0.04, 0.001, -0.0005, 0.0]))
 HEAD = RigidTransform.from_components([0.0, 0.012, 0.055], Rotation.from_rotvec([0.3, 0.8, -1.0], degrees=True))
 STATED = RigidTransform.from_translation([0.0, 0.0, 0.05])
+
+
+def _ahead(centre, turn_deg):
+    """``T_camera_lrf`` of a camera at a point (metres) that looks ahead but for a turn (rotation vector, degrees)."""
+    turn = Rotation.from_rotvec(turn_deg, degrees=True) * AHEAD
+    return RigidTransform.from_components(-turn.apply(centre), turn)
+
+
 CAMERAS = {
-    "left": camera_mounting([-0.12, 0.03, 0.11], [-2.0, 1.5, 0.7]),
-    "right": camera_mounting([0.12, 0.03, 0.12], [-1.8, -1.9, -0.4]),
+    "left": _ahead([-0.12, 0.03, 0.11], [-2.0, 1.5, 0.7]),
+    "right": _ahead([0.12, 0.03, 0.12], [-1.8, -1.9, -0.4]),
 }
 FACING = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 BEARINGS = np.radians(np.arange(40.0, 140.1, 0.5))

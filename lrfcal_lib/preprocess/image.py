@@ -8,7 +8,7 @@ The stages have modules of their own and can be called from here: :mod:`.pattern
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import PurePath
 
 import numpy as np
@@ -57,6 +57,7 @@ __all__ = [
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
 REMEMBERED_IMAGES = 128
+SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 SETTLED = 100.0  # weight of a turn that was decided before against the edges of an image, of which a board has a few
 
 
@@ -185,15 +186,36 @@ def _survey_plain(choices, read, board, models, picks):
         raise ValueError(
             f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
         )
-    views = {}
+    found = []
     for camera, lists in choices.items():
 
         def view(record, model=models[camera]):
             return view_board(read(record), board, model, None, _of(record, picks), **_names(record))
 
         shown = [records for records in map(_shown, lists) if records]
-        views[camera] = [_first_usable(records, view, lambda v: bool(v.reason))[1] for records in shown]
+        found += [_first_usable(records, view, lambda v: bool(v.reason)) for records in shown]
+    views = {camera: [] for camera in choices}
+    for (record, view), pose in zip(found, _turned_alike([v for _, v in found]), strict=True):
+        if pose is not view.T_camera_board:
+            options = {"guess": pose, **_names(record)}
+            view = view_board(read(record), board, models[view.camera], None, _of(record, picks), **options)
+        views[view.camera].append(view)
     return Survey(views, dict(models), None, board)
+
+
+def _turned_alike(views):
+    """Poses of plain boards; one that looks the same when turned in its plane is turned alike in a whole placement."""
+    seen = [v for v in views if v.T_camera_board is not None]
+    own = [[v.T_camera_board, *filter(partial(_same_plane, v.T_camera_board), v.alternatives)] for v in seen]
+    most = max(map(len, own), default=0)
+    turns = [Rotation.concatenate([p.rotation for p in poses + poses[:1] * (most - len(poses))]) for poses in own]
+    partner = alike(turns, [v.placement for v in seen], [v.camera for v in seen])[1]
+    chosen = iter([poses[mine[0]] for poses, mine in zip(own, partner, strict=True)])
+    return [v.T_camera_board if v.T_camera_board is None else next(chosen) for v in views]
+
+
+def _same_plane(pose, other):
+    return pose.rotation.as_matrix()[:, 2] @ other.rotation.as_matrix()[:, 2] > SAME_PLANE
 
 
 def _shown(group):
