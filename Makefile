@@ -28,7 +28,7 @@ setup:
 	@PYTHON="$(PYTHON)" .ci/setup
 
 report: setup
-	@$(RUN) -m lrfcal_lib.report $${SESSION:+"$$SESSION"}
+	@$(RUN) -m lrfcal_lib report $${SESSION:+"$$SESSION"}
 
 test: export TESTS := 1
 test: setup
@@ -36,7 +36,7 @@ test: setup
 	$(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 notebooks: setup
-	@$(RUN) -m lrfcal_lib.report --store $${SESSION:+"$$SESSION"}
+	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
 
 golden: setup
 	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadfile tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py

@@ -9,7 +9,7 @@ frame           axes                                                            
 ``head``        turns with the platform; x is the tilt axis                                          P_P, eqs. 1-3
 ``platform``    fixed; equal to ``head`` at pitch 0; ``p_platform = Rx(pitch) p_head``                P, eqs. 4-6
 ``left``, ...   cameras as in OpenCV: x right, y down, z ahead                                        P_C, eq. 16
-``board``       in the board, z = 0; see :mod:`lrfcal_lib.board`                                     fig. 2
+``board``       in the board, z = 0; see :mod:`lrfcal_lib.model.board`                                     fig. 2
 =============== ==================================================================================== ===============
 
 Units are SI and radians; a name carries a suffix only where it is not SI (``pitch_deg``, ``edge_mm``, ``sigma_px``).

@@ -10,14 +10,14 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def _import_lasersetero(args):
-    from lrfcal_lib.importers import import_lasersetero
+    from lrfcal_lib.session.importers import import_lasersetero
 
     miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
     print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
 
 
 def _check(args):
-    from lrfcal_lib.session import open_session, validate
+    from lrfcal_lib.session.read import open_session, validate
 
     problems = validate(args.session)
     print("\n".join(problems) or f"{args.session}: nothing to complain about")
@@ -30,7 +30,7 @@ def _check(args):
 
 
 def _calibrate(args):
-    from lrfcal_lib.export import calibrate_session
+    from lrfcal_lib.evaluate.export import calibrate_session
 
     return calibrate_session(args.session)
 
@@ -46,13 +46,13 @@ def _simulate(args):
 
 
 def _report(args):
-    from lrfcal_lib.report import main
+    from lrfcal_lib.report.report import main
 
     return main(args.rest)
 
 
 def _record(args):
-    from lrfcal_lib.acquisition import main
+    from lrfcal_lib.acquire.record import main
 
     return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
 

@@ -9,10 +9,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 
-from lrfcal_lib.camera import CameraModel, line_distance, pinhole, project
-from lrfcal_lib.drivers.lms2xx import decode_scans, encode_scan, split_stream
-from lrfcal_lib.reconstruct import color_points
-from lrfcal_lib.solvers.camera import solve_lines, solve_lines_batch
+from lrfcal_lib.calibrate.reconstruct import color_points
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project
+from lrfcal_lib.session.lms2xx_codec import decode_scans, encode_scan, split_stream
+from lrfcal_lib.solvers.lines import solve_lines, solve_lines_batch
 
 REPEATS = 7
 

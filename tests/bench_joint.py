@@ -16,13 +16,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import consistency, monte_carlo
-from lrfcal_lib.solvers.edge_likelihood import beam_terms, edge_shift
-from lrfcal_lib.solvers.joint import best_start, solve_joint
-from lrfcal_lib.solvers.joint_blocks import (
+from lrfcal_lib.fit.least_squares import Block, minimise, whiten
+from lrfcal_lib.fit.residuals import (
     AXIS_COLUMNS,
     Unknowns,
     assemble,
+    beam_terms,
     edge_distance,
+    edge_shift,
     face_block,
     gather,
     move_state,
@@ -30,8 +31,8 @@ from lrfcal_lib.solvers.joint_blocks import (
     rays,
     view_block,
 )
-from lrfcal_lib.solvers.least_squares import Block, minimise, whiten
-from lrfcal_lib.solvers.pose import cross, pose_transform
+from lrfcal_lib.model.geometry import cross, pose_transform
+from lrfcal_lib.solvers.joint import best_start, solve_joint
 
 try:
     import gtsam

@@ -46,7 +46,7 @@ def real_data():
 @pytest.fixture(scope="session")
 def lms400_session(real_data):
     """Folder of the session imported from lms400_zed, the same for all processes of a test run."""
-    from lrfcal_lib.importers import import_lasersetero
+    from lrfcal_lib.session.importers import import_lasersetero
 
     target = shared_folder() / "lms400_zed"
     if not target.exists():
@@ -60,8 +60,9 @@ def lms400_session(real_data):
 @pytest.fixture(scope="session")
 def lms400(lms400_session):
     """The calibrated recording; what the notebooks of this test run have worked out of it is not done again."""
-    from lrfcal_lib import cache, pipeline
-    from lrfcal_lib.session import open_session
+    from lrfcal_lib.calibrate import pipeline
+    from lrfcal_lib.session import cache
+    from lrfcal_lib.session.read import open_session
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(cache.VARIABLE, str(stages()))

@@ -7,11 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
-from lrfcal_lib.drivers.lms2xx import encode_words, scan_quarters
-from lrfcal_lib.drivers.lms2xx_replies import Configuration
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import checked, rig_of
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_words, scan_quarters
 
 SIZE = (32, 24)
 BEAMS = 101  # 100 deg in steps of 1 deg

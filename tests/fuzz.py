@@ -30,24 +30,16 @@ import numpy as np
 from fake_rig import rig_data
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard, triangle_board
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.drivers.lms2xx import check_crc, crc16, encode_scan
 from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file
-from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.export import file_hashes
-from lrfcal_lib.preprocess.image import views_of
-from lrfcal_lib.session import (
-    CameraInfo,
-    LrfInfo,
-    SessionError,
-    SessionRecorder,
-    SessionWriter,
-    finish,
-    open_session,
-    transform_to_json,
-    validate,
-)
+from lrfcal_lib.evaluate.export import file_hashes
+from lrfcal_lib.evaluate.tables import read_truth
+from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.preprocess.survey import views_of
+from lrfcal_lib.session.lms2xx_codec import check_crc, crc16, encode_scan
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
+from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])

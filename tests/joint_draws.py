@@ -3,8 +3,8 @@
 import numpy as np
 
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
-from lrfcal_lib.solvers.joint_observations import JointObservations
 
 OFFSET = 0.005
 COARSE = np.radians(1.0)

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from shared import stages
 
-from lrfcal_lib import cache
+from lrfcal_lib.session import cache
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))

@@ -13,5 +13,5 @@ def shared_folder():
 
 
 def stages():
-    """Folder for the stages that notebooks and fixtures begin with (see lrfcal_lib.cache)."""
+    """Folder for the stages that notebooks and fixtures begin with (see lrfcal_lib.session.cache)."""
     return shared_folder() / "stages"

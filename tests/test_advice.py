@@ -6,18 +6,26 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.advice import Suggestion, direction_words, group_sigma, observability, suggest_placement
-from lrfcal_lib.candidates import board_grid, own_placements, visible
-from lrfcal_lib.forecast import candidate_information, measure_yield
-from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.residuals import range_residuals, view_residuals
+from lrfcal_lib.evaluate.jointly import range_residuals, view_residuals
+from lrfcal_lib.evaluate.next_placement import (
+    Suggestion,
+    board_grid,
+    candidate_information,
+    direction_words,
+    group_sigma,
+    measure_yield,
+    observability,
+    own_placements,
+    suggest_placement,
+    visible,
+)
+from lrfcal_lib.evaluate.uncertainty import beams_to, information
+from lrfcal_lib.evaluate.verdict import diagnose, verdict
+from lrfcal_lib.fit.residuals import JointState
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_blocks import JointState
-from lrfcal_lib.solvers.joint_observations import JointObservations
-from lrfcal_lib.solvers.pose import pose_array
-from lrfcal_lib.uncertainty import beams_to, information
-from lrfcal_lib.verdict import diagnose, verdict
 
 PATTERN = np.array([[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7])
 COARSE = {"distances": (1.0, 2.0), "turns": tuple(np.radians([0, 120, 240])), "elevations": (0.0,)}

@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case
 
-from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
-from lrfcal_lib.solvers.bauermann import point_block, solve_bauermann
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pose import move_pose, pose_array
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, transform_difference
+from lrfcal_lib.solvers.lines import point_block, solve_bauermann
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 

@@ -10,12 +10,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import binom
 
-from lrfcal_lib.board import Board, Chessboard
-from lrfcal_lib.camera import CameraModel, project
 from lrfcal_lib.evaluate.diagnosis import bend_words, bends_table, board_maps
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.pipeline import prepare_scans
-from lrfcal_lib.plots.diagnosis import board_bend
+from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.plots.results import board_bend
 from lrfcal_lib.preprocess.bend import (
     Bend,
     BoardBends,
@@ -28,8 +27,9 @@ from lrfcal_lib.preprocess.bend import (
     hull,
     sheet_surface,
 )
-from lrfcal_lib.preprocess.board_scan import find_board
-from lrfcal_lib.session import Sweep, open_session
+from lrfcal_lib.preprocess.board_in_scan import find_board
+from lrfcal_lib.preprocess.prepared import prepare_scans
+from lrfcal_lib.session.read import Sweep, open_session
 
 SIZE = 0.8
 BOARD = Board("square", ("a", "b", "c", "d"), SIZE * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),

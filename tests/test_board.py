@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lrfcal_lib import board as b
+from lrfcal_lib.model import board as b
 
 
 def test_the_exact_right_angle_makes_the_third_edge_493_58_mm():

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lrfcal_lib import cache
-from lrfcal_lib.prepared import prepare_scans
-from lrfcal_lib.session import open_session
+from lrfcal_lib.preprocess.prepared import prepare_scans
+from lrfcal_lib.session import cache
+from lrfcal_lib.session.read import open_session
 
 QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import camera as c
+from lrfcal_lib.model import camera as c
 
 MODEL = c.CameraModel(1280, 720, 700.0, 702.0, 640.0, 350.0, np.array([-0.17, 0.02, 0.001, -0.0004, 0.003]))
 

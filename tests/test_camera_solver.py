@@ -8,19 +8,12 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations
 
-from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
-from lrfcal_lib.solvers import METHODS, find_outlying_placements, starting_transform
-from lrfcal_lib.solvers.camera import (
-    cost_readings,
-    edge_residuals_px,
-    line_block,
-    plane_residuals_m,
-    solve_lines,
-    solve_lines_batch,
-)
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pose import move_pose, pose_array
-from lrfcal_lib.solvers.start import start_from_lines, start_from_planes, start_from_scene
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, transform_difference
+from lrfcal_lib.solvers import METHODS
+from lrfcal_lib.solvers.lines import cost_readings, find_outlying_placements, solve_lines, solve_lines_batch
+from lrfcal_lib.solvers.planes import start_from_lines, start_from_planes, start_from_scene, starting_transform
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 

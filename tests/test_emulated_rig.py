@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 import serial
 
-from lrfcal_lib.drivers.control import ask
-from lrfcal_lib.drivers.lms2xx import REASONS, split_stream
+from lrfcal_lib.drivers.port import ask
 from lrfcal_lib.drivers.rig_file import read_rig_file
-from lrfcal_lib.emulators import Clock, EmulatedRig, Head
+from lrfcal_lib.emulators import EmulatedRig
+from lrfcal_lib.emulators.head import Head
+from lrfcal_lib.emulators.line import Clock
 from lrfcal_lib.emulators.rig import main, summary
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
+from lrfcal_lib.session.lms2xx_codec import REASONS, split_stream
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import world_of

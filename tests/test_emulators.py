@@ -10,12 +10,18 @@ import serial
 from virtual import INDEXED, Bench, head, lms, telegrams
 
 from lrfcal_lib.drivers.host import VirtualHost
-from lrfcal_lib.drivers.lms2xx import decode_scan, encode_telegram, parse_telegram, split_stream
-from lrfcal_lib.drivers.lms2xx_replies import Configuration, parse_configuration, parse_status
-from lrfcal_lib.emulators import FAULTS, Clock, EmulatedHead, EmulatedLms, Faults, Head
-from lrfcal_lib.emulators.head import REACT_S
-from lrfcal_lib.emulators.line import RATES, SerialDevice, resample
-from lrfcal_lib.emulators.lms2xx import AHEAD_S, Memory
+from lrfcal_lib.emulators.head import REACT_S, EmulatedHead, Head
+from lrfcal_lib.emulators.line import FAULTS, RATES, Clock, Faults, SerialDevice, resample
+from lrfcal_lib.emulators.lms2xx import AHEAD_S, EmulatedLms, Memory
+from lrfcal_lib.session.lms2xx_codec import (
+    Configuration,
+    decode_scan,
+    encode_telegram,
+    parse_configuration,
+    parse_status,
+    parse_telegram,
+    split_stream,
+)
 from lrfcal_lib.simulate.rig import Platform
 
 DEADLINE = 60.0  # s, against hanging; nothing is timed by it

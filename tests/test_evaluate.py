@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 
-from lrfcal_lib import evaluate
-from lrfcal_lib.solvers.camera import solve_lines
-from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
+from lrfcal_lib.evaluate import tables
+from lrfcal_lib.solvers.lines import solve_lines
+from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 
 @pytest.fixture(scope="module")
@@ -22,27 +22,27 @@ def observed():
 
 
 def test_rms_ignores_what_is_missing():
-    assert evaluate.rms([3.0, np.nan, -3.0]) == 3.0
-    assert np.isnan(evaluate.rms([np.nan]))
+    assert tables.rms([3.0, np.nan, -3.0]) == 3.0
+    assert np.isnan(tables.rms([np.nan]))
 
 
 def test_left_out_errors_vanish_without_noise(observed):
     obs = observed[0.0]
-    edge, plane = evaluate.left_out_residuals(obs, obs, solve_lines, solve_lines(obs))
+    edge, plane = tables.left_out_residuals(obs, obs, solve_lines, solve_lines(obs))
     assert np.abs(edge).max() < 1e-6 and np.nanmax(np.abs(plane)) < 1e-8
 
 
 def test_left_out_errors_are_larger_than_fitted_ones(observed):
     obs = observed[1.0]
     full = solve_zhang_pless(obs)
-    _, plane = evaluate.left_out_residuals(obs, obs, solve_zhang_pless, full)
-    assert evaluate.rms(plane) > evaluate.rms(evaluate.plane_residuals_of(obs, full))
+    _, plane = tables.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    assert tables.rms(plane) > tables.rms(tables.plane_residuals_of(obs, full))
 
 
 def test_placements_that_leave_too_little_are_nan(observed):
     obs = observed[0.0].select(observed[0.0].placements[:3])
     full = SimpleNamespace(transform=solve_zhang_pless(observed[0.0]).transform)
-    edge, plane = evaluate.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    edge, plane = tables.left_out_residuals(obs, obs, solve_zhang_pless, full)
     assert np.isnan(edge).all() and np.isnan(plane).all()
 
 
@@ -50,22 +50,22 @@ def test_comparison_has_a_row_a_method(observed):
     obs = observed[1.0]
     observations = {("left", "half_step"): obs, ("left", "last_beam"): obs}
     solutions = {("left", "line"): solve_lines(obs), ("left", "zhang_pless"): solve_zhang_pless(obs)}
-    table = evaluate.method_comparison(observations, solutions)
+    table = tables.method_comparison(observations, solutions)
     assert table.method.tolist() == ["line", "zhang_pless"] and (table.n_placements == 14).all()
-    without = evaluate.method_comparison(observations, solutions, left_out=False)
+    without = tables.method_comparison(observations, solutions, left_out=False)
     assert without.left_out_edge_rms_px.isna().all()
     pd.testing.assert_series_equal(without.edge_rms_px, table.edge_rms_px)
 
 
 def test_poses_under_the_same_intrinsics_stay(observed):
     obs = observed[0.0]
-    assert evaluate.poses_under(obs, None) is obs.board_poses
-    np.testing.assert_allclose(evaluate.poses_under(obs, obs.model), obs.board_poses, atol=1e-6)
+    assert tables.poses_under(obs, None) is obs.board_poses
+    np.testing.assert_allclose(tables.poses_under(obs, obs.model), obs.board_poses, atol=1e-6)
 
 
 def test_camera_table_shows_degrees_and_millimetres(observed):
     solution = solve_lines(observed[1.0])
-    table = evaluate.camera_calibration_table({("left", "line"): solution}).set_index("parameter")
+    table = tables.camera_calibration_table({("left", "line"): solution}).set_index("parameter")
     np.testing.assert_allclose(table.value[["rx", "ry", "rz"]], np.rad2deg(solution.parameters[:3]))
     np.testing.assert_allclose(table.value[["tx", "ty", "tz"]], 1000 * solution.parameters[3:])
     assert (table.sigma > 0).all() and table.unit["tx"] == "mm"
@@ -78,13 +78,13 @@ def test_stereo_check_is_zero_for_exact_cameras():
         ("left", "line"): SimpleNamespace(transform=first),
         ("right", "line"): SimpleNamespace(transform=second),
     }
-    table = evaluate.stereo_check(solutions, ("left", "right"), second * first.inv())
+    table = tables.stereo_check(solutions, ("left", "right"), second * first.inv())
     assert table.method.tolist() == ["line"]
     assert table[["baseline_error_mm", "translation_error_mm", "rotation_error_deg"]].abs().max(axis=None) < 1e-6
 
 
 def test_the_papers_mean_error_is_reproduced():
-    errors = [abs(measured - stated) for stated, measured in evaluate.PAPER_EDGES_MM.values()]
+    errors = [abs(measured - stated) for stated, measured in tables.PAPER_EDGES_MM.values()]
     assert np.mean(errors) == pytest.approx(8.8410, abs=5e-5)
 
 
@@ -94,15 +94,15 @@ def test_summary_groups_by_source_ends_and_variant():
         ("a", 2, "top", "scan", "half_step", 100.0, 99.0, -1.0),
     ]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "error_mm"]
-    row = evaluate.edge_summary(pd.DataFrame(rows, columns=columns)).iloc[0]
+    row = tables.edge_summary(pd.DataFrame(rows, columns=columns)).iloc[0]
     assert (row.n, row.mean_abs_error_mm, row.mean_error_mm) == (2, 2.0, 1.0)
 
 
 def test_the_method_handed_over_does_well_on_both_features():
     columns = ["method", "left_out_edge_rms_px", "left_out_plane_rms_mm"]
     rows = [("line", 4.7, 42.0), ("zhang_pless", 6.0, 8.9), ("bauermann", 0.1, 0.1)]
-    assert evaluate.best_method(pd.DataFrame(rows, columns=columns)) == "zhang_pless"
+    assert tables.best_method(pd.DataFrame(rows, columns=columns)) == "zhang_pless"
     with pytest.raises(ValueError, match="left-out placements"):
-        evaluate.best_method(pd.DataFrame([("line", np.nan, np.nan)], columns=columns))
+        tables.best_method(pd.DataFrame([("line", np.nan, np.nan)], columns=columns))
     # a sheet on a wall shows no edges: planes judge alone
-    assert evaluate.best_method(pd.DataFrame([("zhang_pless", np.nan, 1.0)], columns=columns)) == "zhang_pless"
+    assert tables.best_method(pd.DataFrame([("zhang_pless", np.nan, 1.0)], columns=columns)) == "zhang_pless"

@@ -7,9 +7,9 @@ from notebook_runs import NOTEBOOKS, code_cells, read
 from scipy.ndimage import map_coordinates
 from tiny_sessions import record, rectangle
 
-from lrfcal_lib import plots
-from lrfcal_lib.prepared import Prepared, prepare_images
-from lrfcal_lib.session import open_session
+from lrfcal_lib.plots import recording
+from lrfcal_lib.preprocess.prepared import Prepared, prepare_images
+from lrfcal_lib.session.read import open_session
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_drawn_edges_lie_on_the_edges_of_the_board_in_the_drawn_image(ready):
     for camera, views in ready.views.items():
         for placement in views:
             fig, ax = plt.subplots()
-            plots.seen_points(ax, *ready.seen(camera, placement), ready.models[camera], {})
+            recording.seen_points(ax, *ready.seen(camera, placement), ready.models[camera], {})
             steps += [step_across(ax.images[0].get_array(), line.get_xydata()) for line in ax.lines]
             plt.close(fig)
     assert len(steps) >= 3 * 2 * 3

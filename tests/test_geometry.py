@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import geometry as g
+from lrfcal_lib.model import geometry as g
 
 
 def random_transform(rng, angle=1.0, shift=0.3):

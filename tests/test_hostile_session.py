@@ -12,10 +12,12 @@ import fuzz
 import numpy as np
 import pytest
 
-from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.export import file_hashes
-from lrfcal_lib.preprocess.pattern import estimate_intrinsics, first_pose
-from lrfcal_lib.session import SessionError, SessionRecorder, finish, open_session, validate
+from lrfcal_lib.evaluate.export import file_hashes
+from lrfcal_lib.evaluate.tables import read_truth
+from lrfcal_lib.preprocess.pattern_in_image import estimate_intrinsics, first_pose
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.write import SessionRecorder, finish
 
 SCANS = ["session.json", "lrf/scans.npz", "images.csv", "edges.csv", "images/left/0001.png", "truth.json"]
 TELEGRAMS = ["lrf/telegrams.bin", "lrf/index.csv", "platform.csv"]
@@ -155,7 +157,7 @@ def test_opencv_s_refusals_are_errors_in_the_values():
 
 
 def test_mistakes_of_ours_are_not_taken_for_damage(folder, monkeypatch):
-    monkeypatch.setattr("lrfcal_lib.session.recording.missing_parts", lambda *args: args[99])
+    monkeypatch.setattr("lrfcal_lib.session.read.missing_parts", lambda *args: args[99])
     with pytest.raises(IndexError):
         open_session(folder / "scans")
 
@@ -191,7 +193,7 @@ def test_check_finds_what_two_writers_left(folder, monkeypatch):
     path = folder / "telegrams"
     fuzz.recorder(path).finish()
     assert not [text for text in validate(path) if " line " in text]
-    monkeypatch.setattr("lrfcal_lib.session.writer.alone", lambda path: contextlib.nullcontext())
+    monkeypatch.setattr("lrfcal_lib.session.stated.alone", lambda path: contextlib.nullcontext())
     both = [fuzz.recorder(path) for _ in range(2)]
     for writer in both:
         writer.begin_placement(5)

@@ -11,10 +11,11 @@ import pytest
 from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_report import write_notebook
 
-from lrfcal_lib import notebook, report
-from lrfcal_lib.acquisition.checks import Light
-from lrfcal_lib.panel import words
-from lrfcal_lib.session import validate
+from lrfcal_lib.acquire import panel
+from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.report import notebook, report
+from lrfcal_lib.session import stated
+from lrfcal_lib.session.read import validate
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = ROOT / "data" / "sim_quick"
@@ -148,8 +149,18 @@ def test_nothing_runs_in_the_panel(page):
     light, task = Light(HOSTILE, "warn", HOSTILE), SimpleNamespace(title=HOSTILE, guidance=HOSTILE)
     vector = ((0.0,) * 3,) * 4
     result = SimpleNamespace(answer="no", sentences=(f"a: {HOSTILE}", HOSTILE), file=HOSTILE, poses={HOSTILE: vector})
-    said = [words.title(HOSTILE), words.soft(HOSTILE), words.state("busy", HOSTILE), words.error(HOSTILE, HOSTILE)]
-    said += [words.notes([HOSTILE]), words.lights(HOSTILE, [light]), words.task(task, True, (1,)), words.result(result)]
+    said = [
+        panel.title_html(HOSTILE),
+        panel.soft_html(HOSTILE),
+        panel.state_html("busy", HOSTILE),
+        panel.error_html(HOSTILE, HOSTILE),
+    ]
+    said += [
+        panel.notes([HOSTILE]),
+        panel.lights_html(HOSTILE, [light]),
+        panel.task(task, True, (1,)),
+        panel.result_html(result),
+    ]
     page.goto("about:blank")
     page.set_content("".join(f"<div>{part}</div>" for part in said))
     assert seen(page).count(HOSTILE) == 15
@@ -157,7 +168,7 @@ def test_nothing_runs_in_the_panel(page):
 
 def test_no_formula_is_left_for_a_page_to_draw():
     table = notebook.table(pd.DataFrame({"$a$": ["$b$"]}), "t", caption="$c$")
-    said = notebook.escape("$x$ \\(y\\) \\[z\\] \\begin{equation}") + table.data
+    said = stated.escape("$x$ \\(y\\) \\[z\\] \\begin{equation}") + table.data
     assert "$" not in said.replace("<span>$</span>", "") and "\\" not in said.replace("<span>\\</span>", "")
 
 

@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard, corners_of_lines, triangle_board
-from lrfcal_lib.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
-from lrfcal_lib.notebook import ROOT
-from lrfcal_lib.preprocess import adjustment, image, wide
-from lrfcal_lib.preprocess.edges import ImageEdge, correlation_factor, picked_edge, refine_edge
-from lrfcal_lib.preprocess.pattern import (
+from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
+from lrfcal_lib.model.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
+from lrfcal_lib.preprocess import edges_in_image, intrinsics, survey
+from lrfcal_lib.preprocess.board_in_image import (
+    find_polygon,
+    mirrored_pose,
+    order_scores,
+    pattern_orders,
+    pose_with_edges,
+)
+from lrfcal_lib.preprocess.edges_in_image import ImageEdge, correlation_factor, picked_edge, refine_edge
+from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
     estimate_relief,
     grid_noise,
@@ -24,10 +30,8 @@ from lrfcal_lib.preprocess.pattern import (
     stereo_transform,
     turn_pattern,
 )
-from lrfcal_lib.preprocess.silhouette import find_polygon
-from lrfcal_lib.preprocess.together import mirrored_pose, pose_with_edges
-from lrfcal_lib.preprocess.view import order_scores, pattern_orders
-from lrfcal_lib.session import open_session
+from lrfcal_lib.report.notebook import ROOT
+from lrfcal_lib.session.read import open_session
 
 MODEL = CameraModel(640, 480, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
 PATTERN = Chessboard(6, 4, 0.05)
@@ -147,7 +151,7 @@ def small_turn(a, b):
 @pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (0.6, 0.05), (-1.2, 0.05)])
 def test_corners_are_found_at_subpixel_level(roll, limit):
     pose = pose_of(roll)
-    found = image.find_pattern(render(pose), PATTERN)
+    found = survey.find_pattern(render(pose), PATTERN)
     exact = project(pose.apply(PATTERN.points()), MODEL)
     error = min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found)))
     assert error < limit
@@ -160,7 +164,7 @@ def test_white_squares_on_a_dark_board_are_found():
         exact = project(pose.apply(PATTERN.points()), MODEL)
         assert min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found))) < 0.1
     # a finder that has seen the negative still finds the positive
-    np.testing.assert_array_equal(finder(render(pose)), image.find_pattern(render(pose), PATTERN))
+    np.testing.assert_array_equal(finder(render(pose)), survey.find_pattern(render(pose), PATTERN))
 
 
 def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
@@ -189,7 +193,7 @@ def test_views_that_differ_most_come_first():
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
-    found = image.find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
+    found = survey.find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
     x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
 
@@ -197,27 +201,27 @@ def test_corners_run_clockwise_also_in_a_mirrored_image():
 def test_grey_images_give_the_same_corners():
     picture = render(pose_of())
     np.testing.assert_allclose(
-        image.find_pattern(picture[..., 0], PATTERN), image.find_pattern(picture, PATTERN), atol=0.01
+        survey.find_pattern(picture[..., 0], PATTERN), survey.find_pattern(picture, PATTERN), atol=0.01
     )
 
 
 def test_the_second_detector_helps_where_the_first_fails(monkeypatch):
-    from lrfcal_lib.preprocess import pattern
+    from lrfcal_lib.preprocess import pattern_in_image as pattern
 
     picture = render(pose_of())
-    exact = image.find_pattern(picture, PATTERN)
+    exact = survey.find_pattern(picture, PATTERN)
     monkeypatch.setattr(pattern, "_sectors", lambda *a: None)
-    classic = image.find_pattern(picture, PATTERN)
+    classic = survey.find_pattern(picture, PATTERN)
     monkeypatch.undo()
     monkeypatch.setattr(pattern, "_classic", lambda *a: None)
-    sectors = image.find_pattern(picture, PATTERN)
+    sectors = survey.find_pattern(picture, PATTERN)
     for other in (classic, sectors):
         assert min(np.abs(p - exact).max() for p in (other, turn_pattern(other))) < 0.3
 
 
 def test_no_pattern():
-    with pytest.raises(image.PatternNotFound, match="6 x 4 inner corners"):
-        image.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
+    with pytest.raises(survey.PatternNotFound, match="6 x 4 inner corners"):
+        survey.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
 
 
 def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
@@ -235,11 +239,11 @@ def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
 @pytest.mark.parametrize("beyond", [-5, 3, 20])
 def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
     pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
-    whole = image.find_pattern(picture, pattern)
+    whole = survey.find_pattern(picture, pattern)
     part = np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond])
     try:
-        found = image.find_pattern(part, pattern)
-    except image.PatternNotFound:
+        found = survey.find_pattern(part, pattern)
+    except survey.PatternNotFound:
         assert beyond < 18  # where all squares are seen it is found
     else:
         assert min(np.abs(p - whole).max() for p in (found, turn_pattern(found))) < 0.3
@@ -248,7 +252,7 @@ def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
 @pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3, 1), np.uint8), np.zeros((0, 0), np.uint8)])
 def test_what_is_no_image(bad):
     with pytest.raises(ValueError, match="must be uint8"):
-        image.find_pattern(bad, PATTERN)
+        survey.find_pattern(bad, PATTERN)
 
 
 # --- adjustment ----------------------------------------------------------------------------------------------------
@@ -260,21 +264,21 @@ def test_adjustment_jacobian_is_the_numeric_one():
     lens = np.stack([MODEL.parameters, MODEL.parameters * 1.05])
     points = PATTERN.points()
     basis = np.linalg.svd(np.column_stack([np.ones(24), points[:, :2]]))[0][:, 3:]
-    state = adjustment._State(lens, mounts, np.stack([p.as_matrix() for p in poses]), np.linspace(-1e-3, 2e-3, 21))
+    state = intrinsics._State(lens, mounts, np.stack([p.as_matrix() for p in poses]), np.linspace(-1e-3, 2e-3, 21))
     pixels = np.zeros((2, 2, 24, 2))
-    _, *blocks = adjustment._residuals(state, pixels, points, basis)
-    analytic = adjustment._jacobian(state, *blocks, basis).reshape(pixels.size, -1)
+    _, *blocks = intrinsics._residuals(state, pixels, points, basis)
+    analytic = intrinsics._jacobian(state, *blocks, basis).reshape(pixels.size, -1)
     for i in range(analytic.shape[1]):
         h = 1e-6 * max(1.0, np.abs(analytic[:, i]).max() ** -1)
         step = np.zeros(analytic.shape[1])
         step[i] = h
-        up, down = (adjustment._residuals(adjustment._moved(state, s), pixels, points, basis)[0] for s in (step, -step))
+        up, down = (intrinsics._residuals(intrinsics._moved(state, s), pixels, points, basis)[0] for s in (step, -step))
         np.testing.assert_allclose((down - up).ravel() / (2 * h), analytic[:, i], rtol=2e-5, atol=2e-4)
 
 
 def test_intrinsics_without_noise_are_exact():
     poses = view_poses(8)
-    result = image.estimate_intrinsics(pixels_of(poses), PATTERN, (640, 480))
+    result = survey.estimate_intrinsics(pixels_of(poses), PATTERN, (640, 480))
     np.testing.assert_allclose(result.model.parameters, MODEL.parameters, atol=2e-5)
     assert (result.model.width, result.model.height) == (640, 480)
     assert result.model.rms_px < 1e-5
@@ -286,7 +290,7 @@ def test_intrinsics_covariance_tells_the_error():
     poses = view_poses(8, seed=2)
     errors = []
     for seed in range(30):
-        model = image.estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, (640, 480)).model
+        model = survey.estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, (640, 480)).model
         sigma = np.sqrt(np.diag(model.covariance))[:8]
         errors.append((model.parameters - MODEL.parameters)[:8] / sigma)
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
@@ -295,9 +299,9 @@ def test_intrinsics_covariance_tells_the_error():
 def test_third_radial_term_stays_out_unless_the_images_need_it():
     rng = np.random.default_rng(4)
     poses = [pose_of(0, rng.uniform(-0.4, 0.4, 2), (*rng.uniform(-0.3, 0.3, 2), 0.8)) for _ in range(10)]
-    assert image.estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, (640, 480)).model.distortion[4] == 0
+    assert survey.estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, (640, 480)).model.distortion[4] == 0
     bent = MODEL.with_parameters([*MODEL.parameters[:8], 1.5])
-    model = image.estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, (640, 480)).model
+    model = survey.estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, (640, 480)).model
     assert model.distortion[4] == pytest.approx(1.5, abs=4 * np.sqrt(model.covariance[8, 8]))
 
 
@@ -308,7 +312,7 @@ def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
     waves -= plane @ np.linalg.lstsq(plane, waves, rcond=None)[0]
     poses = view_poses(12, seed=5)
     bumpy = pixels_of(poses, 0.02, points=points + waves[:, None] * [0, 0, 1])
-    result = image.estimate_intrinsics(bumpy, PATTERN, (640, 480), relief=True)
+    result = survey.estimate_intrinsics(bumpy, PATTERN, (640, 480), relief=True)
     np.testing.assert_allclose(result.relief, waves, atol=2e-4)
     assert abs(result.model.fx - MODEL.fx) < 4 * np.sqrt(result.model.covariance[0, 0])
     np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, waves, atol=2e-4)
@@ -318,7 +322,7 @@ def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
 def test_glaring_corners_are_left_out():
     pixels = pixels_of(view_poses(8), 0.1)
     pixels[3, 7] += [4.0, -3.0]
-    result = image.estimate_intrinsics(pixels, PATTERN, (640, 480))
+    result = survey.estimate_intrinsics(pixels, PATTERN, (640, 480))
     assert np.isnan(result.residuals[0, 3, 7]).all()
     assert np.isnan(result.residuals[..., 0]).sum() <= 2
     assert result.rms_px < 0.2
@@ -326,12 +330,12 @@ def test_glaring_corners_are_left_out():
 
 def test_too_few_or_parallel_views():
     with pytest.raises(ValueError, match="at least three views of the pattern, got 2"):
-        image.estimate_intrinsics(pixels_of(view_poses(2)), PATTERN, (640, 480))
+        survey.estimate_intrinsics(pixels_of(view_poses(2)), PATTERN, (640, 480))
     parallel = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i in range(4)]
     with pytest.raises(ValueError, match="parallel to itself.*focal length"):
-        image.estimate_intrinsics(pixels_of(parallel, 0.01), PATTERN, (640, 480))
+        survey.estimate_intrinsics(pixels_of(parallel, 0.01), PATTERN, (640, 480))
     with pytest.raises(ValueError, match="8 image coordinates cannot determine 15 unknowns"):
-        adjustment.adjust(pixels_of([pose_of()])[None, :, :4], Chessboard(2, 2, 0.05), [MODEL], [pose_of()])
+        intrinsics.adjust(pixels_of([pose_of()])[None, :, :4], Chessboard(2, 2, 0.05), [MODEL], [pose_of()])
 
 
 # --- pose ----------------------------------------------------------------------------------------------------------
@@ -339,11 +343,11 @@ def test_too_few_or_parallel_views():
 
 def test_pose_without_noise_is_exact_and_its_covariance_tells_the_error():
     pose = pose_of(0.3)
-    got, _ = image.board_pose(pixels_of([pose])[0], PATTERN, MODEL)
+    got, _ = survey.board_pose(pixels_of([pose])[0], PATTERN, MODEL)
     np.testing.assert_allclose(got.as_matrix(), pose.as_matrix(), atol=1e-8)
     chi2 = []
     for seed in range(60):
-        got, covariance = image.board_pose(pixels_of([pose], 0.3, seed)[0], PATTERN, MODEL)
+        got, covariance = survey.board_pose(pixels_of([pose], 0.3, seed)[0], PATTERN, MODEL)
         error = small_turn(got, pose)
         chi2.append(error @ np.linalg.solve(covariance, error))
     assert 0.6 < np.mean(chi2) / 6 < 1.4
@@ -356,7 +360,7 @@ def test_errors_that_agree_between_neighbours_widen_the_covariance():
     for _ in range(40):
         coarse = cv2.resize(rng.normal(0, 0.3, (3, 3, 2)), (6, 4), interpolation=cv2.INTER_CUBIC)
         noise = coarse.reshape(-1, 2) + rng.normal(0, 0.05, (24, 2))
-        got, covariance = image.board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)
+        got, covariance = survey.board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)
         error = small_turn(got, pose)
         chi2.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(chi2) < 5
@@ -365,10 +369,10 @@ def test_errors_that_agree_between_neighbours_widen_the_covariance():
 def test_pose_needs_corners():
     pixels = pixels_of([pose_of()])[0]
     with pytest.raises(ValueError, match="four or more of the pattern's 24 corners"):
-        image.board_pose(pixels[:10], PATTERN, MODEL)
+        survey.board_pose(pixels[:10], PATTERN, MODEL)
     pixels[3:] = np.nan
     with pytest.raises(ValueError, match="four or more"):
-        image.board_pose(pixels, PATTERN, MODEL)
+        survey.board_pose(pixels, PATTERN, MODEL)
 
 
 # --- edges ---------------------------------------------------------------------------------------------------------
@@ -377,7 +381,7 @@ def test_pose_needs_corners():
 @pytest.mark.parametrize("roll", [0.0, 0.7, np.pi / 2, np.pi, -2.5])
 def test_edges_of_a_known_board_at_any_roll(roll):
     pose = pose_of(roll)
-    view = image.view_board(render(pose), SHEET, MODEL, camera="left", file="a.png", placement=3, pitch=0.1)
+    view = survey.view_board(render(pose), SHEET, MODEL, camera="left", file="a.png", placement=3, pitch=0.1)
     assert (view.reason, view.rejected, view.placement, view.pitch) == ("", (), 3, 0.1)
     assert [e.name for e in view.edges] == list(SHEET.edges)
     assert max(edge_errors(view, pose).values()) < 0.05
@@ -388,7 +392,7 @@ def test_edges_of_a_known_board_at_any_roll(roll):
 
 def test_edges_before_clutter():
     pose = pose_of(0.1)
-    view = image.view_board(render(pose, background=clutter()), SHEET, MODEL)
+    view = survey.view_board(render(pose, background=clutter()), SHEET, MODEL)
     assert len(view.edges) == 4
     assert max(edge_errors(view, pose).values()) < 0.3
 
@@ -424,15 +428,16 @@ def test_corners_and_edges_together_are_better_and_know_how_much():
     chi2, alone, both = [], [], []
     for seed in range(60):
         pixels = pixels_of([FAR], 0.1, seed)[0]
-        start = image.board_pose(pixels, PATTERN, MODEL)
+        start = survey.board_pose(pixels, PATTERN, MODEL)
         pose, covariance = pose_with_edges(*start, pixels, noisy_edges(FAR, 100 + seed), SHEET, MODEL)
         error = small_turn(pose, FAR)
         chi2.append(error @ np.linalg.solve(covariance, error) / 6)
         alone.append(np.abs(small_turn(start[0], FAR)))
         both.append(np.abs(error))
-        assert np.all(np.diag(covariance) < np.diag(start[1]) * (1 + 1e-9)) or (
-            start[0].rotation * pose.rotation.inv()
-        ).magnitude() > 0.05
+        assert (
+            np.all(np.diag(covariance) < np.diag(start[1]) * (1 + 1e-9))
+            or (start[0].rotation * pose.rotation.inv()).magnitude() > 0.05
+        )
     assert 0.5 < np.mean(chi2) < 1.5
     assert np.all(np.median(both, axis=0) < np.median(alone, axis=0))
 
@@ -449,7 +454,7 @@ def test_edges_tell_a_pose_from_its_mirror_in_depth():
 
 def test_an_edge_that_contradicts_the_corners_is_left_out():
     pixels = pixels_of([FAR], 0.05, 1)[0]
-    start = image.board_pose(pixels, PATTERN, MODEL)
+    start = survey.board_pose(pixels, PATTERN, MODEL)
     edges = noisy_edges(FAR, 3, 0.05)
     good, _ = pose_with_edges(*start, pixels, edges[:3], SHEET, MODEL)
     moved = replace(edges[3], line=edges[3].line + [0, 0, 9.0])
@@ -465,7 +470,7 @@ def test_a_board_frame_whose_z_points_out_is_recognised_by_its_outline():
     upside = CORNERS * [1, -1] + [0, 3 * PATTERN.square]
     board = replace(SHEET, corners=upside[::-1].copy(), edges=("bottom", "right", "top", "left"))
     pose = pose_of()
-    view = image.view_board(render(pose), board, MODEL)
+    view = survey.view_board(render(pose), board, MODEL)
     assert len(view.edges) == 4
     assert view.T_camera_board.rotation.as_matrix()[2, 2] < 0
     np.testing.assert_allclose(view.pixels, mirror_pattern(pixels_of([pose])[0], PATTERN), atol=0.3)
@@ -491,7 +496,7 @@ def test_line_covariance_tells_the_error_over_noise():
 
 
 def systematic(edge):
-    from lrfcal_lib.preprocess.edges import SYSTEMATIC_PX
+    from lrfcal_lib.preprocess.edges_in_image import SYSTEMATIC_PX
 
     length = np.linalg.norm(edge.ends[1] - edge.ends[0])
     return np.diag([SYSTEMATIC_PX**2, 12 * SYSTEMATIC_PX**2 / length**2])
@@ -526,7 +531,7 @@ def test_correlated_residuals_count_less():
 
 def test_edges_outside_the_image_are_listed_with_the_reason():
     pose = pose_of(at=(0.0, 0.17, 0.8))
-    view = image.view_board(render(pose), SHEET, MODEL)
+    view = survey.view_board(render(pose), SHEET, MODEL)
     assert view.reason == ""
     assert dict(view.rejected).keys() == {"bottom"}
     assert "cut by the image border" in dict(view.rejected)["bottom"]
@@ -534,15 +539,15 @@ def test_edges_outside_the_image_are_listed_with_the_reason():
 
 def test_an_edge_that_nothing_shows_is_listed_with_the_reason():
     pose = pose_of()
-    view = image.view_board(render(pose, background=105.0), SHEET, MODEL)
+    view = survey.view_board(render(pose, background=105.0), SHEET, MODEL)
     assert {reason.split(":")[0] for _, reason in view.rejected} == {"no clear edge"}
     assert len(view.rejected) == 4
 
 
 def test_image_of_another_size_or_without_pattern():
-    view = image.view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
+    view = survey.view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
     assert "120 x 100" in view.reason and "640 x 480" in view.reason
-    view = image.view_board(np.full((480, 640, 3), 80, np.uint8), SHEET, MODEL)
+    view = survey.view_board(np.full((480, 640, 3), 80, np.uint8), SHEET, MODEL)
     assert "inner corners" in view.reason
     assert (view.edges, view.T_camera_board) == ((), None)
 
@@ -555,7 +560,7 @@ def test_picks_override_the_detector():
         Pick("left", Path("b.png"), "right", corners[:2]),
         Pick("right", Path("a.png"), "left", corners[:2]),
     ]
-    view = image.view_board(render(pose), SHEET, MODEL, picks=picks, camera="left", file="a.png")
+    view = survey.view_board(render(pose), SHEET, MODEL, picks=picks, camera="left", file="a.png")
     assert [e.name for e in view.edges if e.picked] == ["top"]
     top = view.edge("top")
     np.testing.assert_allclose(top.ends, undistort(picks[0].ends, MODEL), atol=1e-9)
@@ -563,7 +568,7 @@ def test_picks_override_the_detector():
     assert line_distance(pinhole(pose.apply([0.12, 0.095, 0.0]), MODEL), top.line) < 0
     assert view.edge("left").picked is False and view.edge("nowhere") is None
     with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
-        image.view_board(
+        survey.view_board(
             render(pose), SHEET, MODEL, picks=[replace(picks[0], edge="hypotenuse")], camera="left", file="a.png"
         )
 
@@ -574,7 +579,7 @@ def test_a_picked_edge_needs_two_points():
 
 
 def test_edge_of_a_hopeless_prediction():
-    with pytest.raises(image.EdgeNotSeen, match="predicted length is 3 px"):
+    with pytest.raises(survey.EdgeNotSeen, match="predicted length is 3 px"):
         refine_edge(render(pose_of()), MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0)
 
 
@@ -583,17 +588,17 @@ def test_edge_of_a_hopeless_prediction():
 
 def test_one_view_finds_the_edges_of_an_unknown_board():
     pose = pose_of(0.1)
-    view = image.view_board(render(pose), UNKNOWN, MODEL)
+    view = survey.view_board(render(pose), UNKNOWN, MODEL)
     turned = view.T_camera_board.rotation.as_matrix()[0, 0] < 0
     names = dict(zip(SHEET.edges, ("bottom", "left", "top", "right") if turned else SHEET.edges, strict=True))
     assert len(view.edges) == 4
     for edge in view.edges:
         assert np.abs(line_distance(edge.ends, true_line(names[edge.name], pose))).max() < 0.1
-    assert view.votes.shape == (4, len(wide.wide_distances(PATTERN)))
+    assert view.votes.shape == (4, len(edges_in_image.wide_distances(PATTERN)))
 
 
 def test_a_board_without_a_visible_edge_lists_all_four():
-    view = image.view_board(render(pose_of(), background=105.0), UNKNOWN, MODEL)
+    view = survey.view_board(render(pose_of(), background=105.0), UNKNOWN, MODEL)
     assert {reason for _, reason in view.rejected} <= {"no clear edge outside the pattern"} | set(
         dict(view.rejected).values()
     )
@@ -618,7 +623,7 @@ def session():
 @pytest.fixture(scope="module")
 def surveyed(session):
     _, records, read = session
-    return image.survey(records, read, UNKNOWN, {"left": MODEL, "right": MODEL})
+    return survey.survey(records, read, UNKNOWN, {"left": MODEL, "right": MODEL})
 
 
 def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed):
@@ -644,7 +649,7 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
 
 def test_survey_estimates_missing_intrinsics(session):
     _, records, read = session
-    found = image.survey(records, read, UNKNOWN, {"left": None, "right": MODEL})
+    found = survey.survey(records, read, UNKNOWN, {"left": None, "right": MODEL})
     model = found.models["left"]
     assert abs(model.fx - MODEL.fx) < 5 * np.sqrt(model.covariance[0, 0])
     assert found.models["right"] is MODEL
@@ -652,7 +657,7 @@ def test_survey_estimates_missing_intrinsics(session):
 
 def test_survey_of_a_known_board_keeps_its_corners(session):
     poses, records, read = session
-    found = image.survey(records[:4], read, SHEET, {"left": MODEL, "right": MODEL})
+    found = survey.survey(records[:4], read, SHEET, {"left": MODEL, "right": MODEL})
     assert found.board is SHEET and found.outline is None
     for group in found.views.values():
         for view in group:
@@ -663,7 +668,7 @@ def test_survey_of_a_known_board_keeps_its_corners(session):
 def test_images_for_the_intrinsics_make_no_views_and_blank_images_say_why(session):
     _, records, read = session
     records = [replace(records[0], purpose="intrinsics"), *records[1:], Record("left", Path("/s/left/9.png"), 9)]
-    found = image.survey(
+    found = survey.survey(
         records, lambda r: np.zeros((480, 640, 3), np.uint8) if r.placement == 9 else read(r), UNKNOWN, {"left": MODEL}
     )
     assert {v.placement for v in found.views["left"]} == {1, 2, 3, 4, 5, 6, 9}
@@ -684,13 +689,13 @@ def at_three_pitches(read, blank=()):
 
 def test_one_image_a_placement_is_the_middle_one_that_shows_the_board(session):
     records, read = at_three_pitches(session[2], {"1_2", "2_0", "2_1", "2_2"})
-    found = image.survey(records, read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
+    found = survey.survey(records, read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
     assert [v.file for v in found] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png"]
     assert [v.reason == "" for v in found] == [True, True, False, True]
-    everything = image.survey(records, read, SHEET, {"left": MODEL}).views["left"]
+    everything = survey.survey(records, read, SHEET, {"left": MODEL}).views["left"]
     assert len(everything) == 12
     unknown = [replace(r, pitch=np.nan) for r in records]
-    found = image.survey(unknown[:3], read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
+    found = survey.survey(unknown[:3], read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
     assert [v.file for v in found] == ["0_0.png"]
 
 
@@ -698,7 +703,7 @@ def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
     picture = render(triangle_pose(), TRIANGLE)
     records, read = at_three_pitches(lambda r: picture, {"1_2"})
     loose = [replace(r, placement=-1, file=Path(f"/s/left/x{i}.png")) for i, r in enumerate(records[:2])]
-    found = image.survey(
+    found = survey.survey(
         records + loose,
         lambda r: picture if r.placement < 0 else read(r),
         TRIANGLE,
@@ -713,18 +718,18 @@ def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
 def test_intrinsics_use_a_spread_of_the_images():
     pixels = list(pixels_of(view_poses(40)))
     group = [Record("left", Path("a"), i, purpose="intrinsics" if i < 20 else "board") for i in range(40)]
-    chosen = image._for_intrinsics(["no board", *pixels[1:]], group)
-    assert len(chosen) == image.VIEWS_FOR_INTRINSICS
+    chosen = survey._for_intrinsics(["no board", *pixels[1:]], group)
+    assert len(chosen) == survey.VIEWS_FOR_INTRINSICS
     mine = {id(p) for p in pixels[1:20]}
     assert mine <= {id(p) for p in chosen}
-    assert len(image._for_intrinsics(pixels, [replace(r, purpose="board") for r in group])) == 40
+    assert len(survey._for_intrinsics(pixels, [replace(r, purpose="board") for r in group])) == 40
 
 
 def test_picks_reach_their_image_in_a_survey(session):
     poses, records, read = session
     corners = project(poses["left", 1].apply(np.column_stack([CORNERS, np.zeros(4)])), MODEL)
     pick = Pick("left", Path("/s/left/1.png"), "right", corners[1:3])
-    found = image.survey(records[:6], read, SHEET, {"left": MODEL, "right": MODEL}, [pick])
+    found = survey.survey(records[:6], read, SHEET, {"left": MODEL, "right": MODEL}, [pick])
     picked = [(v.camera, v.placement, e.name) for g in found.views.values() for v in g for e in v.edges if e.picked]
     assert picked == [("left", 1, "right")]
 
@@ -732,16 +737,16 @@ def test_picks_reach_their_image_in_a_survey(session):
 def test_surveys_that_cannot_work(session):
     _, records, read = session
     with pytest.raises(ValueError, match="camera 'left': intrinsics need at least three views"):
-        image.survey(records[:2], read, UNKNOWN, {"left": None})
+        survey.survey(records[:2], read, UNKNOWN, {"left": None})
     with pytest.raises(ValueError, match="no intrinsics and board 'triangle' no pattern"):
-        image.survey(records, read, triangle_board(), {"left": None})
+        survey.survey(records, read, triangle_board(), {"left": None})
     with pytest.raises(ValueError, match="has 3 edges and no known corners"):
-        image.survey(records[:2], read, replace(UNKNOWN, edges=("a", "b", "c")), {"left": MODEL})
+        survey.survey(records[:2], read, replace(UNKNOWN, edges=("a", "b", "c")), {"left": MODEL})
     with pytest.raises(ValueError, match="none of 2 images shows the pattern"):
         blank = np.zeros((480, 640, 3), np.uint8)
-        image.survey(records[:2], lambda r: blank, UNKNOWN, {"left": MODEL, "right": MODEL})
+        survey.survey(records[:2], lambda r: blank, UNKNOWN, {"left": MODEL, "right": MODEL})
     with pytest.raises(ValueError, match="do not agree on the top edge"):
-        wide.common_lines(np.zeros((3, 4, len(wide.wide_distances(PATTERN)))), UNKNOWN)
+        survey.common_lines(np.zeros((3, 4, len(edges_in_image.wide_distances(PATTERN)))), UNKNOWN)
 
 
 def test_outline_needs_every_edge(surveyed):
@@ -750,24 +755,26 @@ def test_outline_needs_every_edge(surveyed):
         for c, g in surveyed.views.items()
     }
     with pytest.raises(ValueError, match="edge 'right' of board 'sheet' was found in none of 14 images"):
-        image.measure_outline(views, UNKNOWN, surveyed.models)
+        survey.measure_outline(views, UNKNOWN, surveyed.models)
 
 
 def test_one_view_makes_an_outline_without_spread(surveyed):
     views = {"left": surveyed.views["left"][:1]}
-    outline = image.measure_outline(views, UNKNOWN, surveyed.models)
+    outline = survey.measure_outline(views, UNKNOWN, surveyed.models)
     assert np.isnan(outline.line_sd).all()
     assert all(np.isnan(sd) for sd in outline.length_sd.values())
 
 
 def test_stereo_check_recovers_the_mounting(surveyed):
     models = [surveyed.models[c] for c in ("left", "right")]
-    transform, covariance, result = image.stereo_check(surveyed.views["left"], surveyed.views["right"], PATTERN, models)
+    transform, covariance, result = survey.stereo_check(
+        surveyed.views["left"], surveyed.views["right"], PATTERN, models
+    )
     np.testing.assert_allclose(transform.translation, [-0.05, 0, 0], atol=5e-4)
     assert transform.rotation.magnitude() < 2e-3
     assert covariance.shape == (6, 6) and result.rms_px < 0.2
     with pytest.raises(ValueError, match="no placement shows the pattern to both cameras"):
-        image.stereo_check(surveyed.views["left"][:2], surveyed.views["right"][3:], PATTERN, models)
+        survey.stereo_check(surveyed.views["left"][:2], surveyed.views["right"][3:], PATTERN, models)
 
 
 def test_stereo_covariance_tells_the_error():
@@ -802,7 +809,7 @@ def triangle_pose(roll=0.4, tilt=(0.3, -0.35), at=(0.02, 0.0, 0.9)):
 def test_a_plain_triangle_is_found_and_a_guess_tells_its_corners(roll):
     pose = triangle_pose(roll)
     guess = RigidTransform.from_components(pose.translation, Rotation.from_rotvec([0.1, -0.1, 0.1]) * pose.rotation)
-    view = image.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, guess=guess)
+    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, guess=guess)
     assert view.reason == "" and len(view.edges) == 3
     assert max(edge_errors(view, pose, TRIANGLE).values()) < 0.05
     corners = corners_of_lines(np.stack([e.line for e in view.edges]))
@@ -816,7 +823,7 @@ def test_a_plain_triangle_is_found_and_a_guess_tells_its_corners(roll):
 
 def test_other_poses_of_a_triangle_are_reported():
     pose = triangle_pose()
-    view = image.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
+    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
     everything = [view.T_camera_board, *view.alternatives]
     assert len(everything) >= 3
     assert min((p.rotation * pose.rotation.inv()).magnitude() for p in everything) < 0.01
@@ -829,7 +836,7 @@ def test_other_poses_of_a_triangle_are_reported():
 def test_a_picked_edge_tells_which_side_is_which():
     pose = triangle_pose()
     ends = project(pose.apply(np.column_stack([TRIANGLE.corners[[1, 2]], [0, 0]])), MODEL)
-    view = image.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks=[Pick("", Path("a"), "bc", ends)], file="a")
+    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks=[Pick("", Path("a"), "bc", ends)], file="a")
     assert view.edge("bc").picked
     assert max(edge_errors(view, pose, TRIANGLE).values()) < 0.1
 
@@ -838,7 +845,7 @@ def test_a_triangle_picked_whole_needs_no_detector():
     pose = triangle_pose()
     corners = project(pose.apply(np.column_stack([TRIANGLE.corners, np.zeros(3)])), MODEL)
     picks = [Pick("", Path("a"), n, corners[[i, (i + 1) % 3]]) for i, n in enumerate(TRIANGLE.edges)]
-    view = image.view_board(np.zeros((480, 640, 3), np.uint8), TRIANGLE, MODEL, picks=picks, file="a", guess=pose)
+    view = survey.view_board(np.zeros((480, 640, 3), np.uint8), TRIANGLE, MODEL, picks=picks, file="a", guess=pose)
     assert view.reason == "" and all(e.picked for e in view.edges)
     np.testing.assert_allclose(view.T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
@@ -846,7 +853,7 @@ def test_a_triangle_picked_whole_needs_no_detector():
 def test_a_plain_quadrilateral_is_over_determined():
     board = Board("slab", ("a", "b", "c", "d"), np.array([[0, 0], [0.4, 0], [0.35, 0.3], [0, 0.25]]))
     pose = triangle_pose(at=(0.0, 0.0, 1.0))
-    view = image.view_board(render(pose, board), board, MODEL)
+    view = survey.view_board(render(pose, board), board, MODEL)
     assert view.reason == ""
     assert (view.T_camera_board.rotation * pose.rotation.inv()).magnitude() < 0.02
     assert max(edge_errors(view, pose, board).values()) < 0.05
@@ -854,21 +861,21 @@ def test_a_plain_quadrilateral_is_over_determined():
 
 def test_triangles_that_cannot_be_used():
     blank = np.full((480, 640, 3), 200, np.uint8)
-    assert "no dark region with 3 straight edges" in image.view_board(blank, TRIANGLE, MODEL).reason
+    assert "no dark region with 3 straight edges" in survey.view_board(blank, TRIANGLE, MODEL).reason
     cut = render(triangle_pose(at=(0.42, 0.0, 0.9)), TRIANGLE)
-    assert "cut by the image border" in image.view_board(cut, TRIANGLE, MODEL).reason
+    assert "cut by the image border" in survey.view_board(cut, TRIANGLE, MODEL).reason
     disc = cv2.circle(blank.copy(), (300, 200), 80, (20, 20, 20), -1)
-    with pytest.raises(image.OutlineNotFound, match="no dark region"):
+    with pytest.raises(survey.OutlineNotFound, match="no dark region"):
         find_polygon(disc, 3)
     square = Board("square", ("a", "b", "c", "d"), np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
     flat = cv2.fillPoly(blank.copy(), [np.array([[100, 100], [500, 140], [400, 200], [120, 300]])], (20, 20, 20))
-    assert "explains the outline" in image.view_board(flat, square, MODEL).reason
+    assert "explains the outline" in survey.view_board(flat, square, MODEL).reason
 
 
 def test_plain_boards_in_a_survey():
     pose = triangle_pose()
     picture = render(pose, TRIANGLE)
-    found = image.survey([Record("left", Path("/s/0.png"), 0)], lambda r: picture, TRIANGLE, {"left": MODEL})
+    found = survey.survey([Record("left", Path("/s/0.png"), 0)], lambda r: picture, TRIANGLE, {"left": MODEL})
     assert found.outline is None and found.board is TRIANGLE
     assert len(found.views["left"][0].edges) == 3
 
@@ -884,7 +891,7 @@ def test_poses_in_a_simulated_session_are_as_good_as_they_say():
         stated = truth["cameras"][name]["intrinsics"]
         lens = [stated[key] for key in ("fx", "fy", "cx", "cy")]
         models[name] = CameraModel(info.width, info.height, *lens, np.array(stated["distortion"]))
-    found = image.views_of(session, models, one_per_placement=True)
+    found = survey.views_of(session, models, one_per_placement=True)
     chi2 = []
     for view in (v for group in found.views.values() for v in group):
         stated = truth["images"][f"images/{view.camera}/{view.file}"]["T_camera_board"]
@@ -906,7 +913,7 @@ def lms400(real_data):
     folder = real_data / "lms400_zed"
     records = [Record(c, folder / f"{c}_{i:02d}.png", i) for c in ("left", "right") for i in range(1, 21)]
     board = Board("cardboard", ("top", "right", "bottom", "left"), None, Chessboard(8, 6, 0.0775), ("left", "top"))
-    return image.survey(records, lambda r: cv2.imread(str(r.file)), board, {"left": None, "right": None})
+    return survey.survey(records, lambda r: cv2.imread(str(r.file)), board, {"left": None, "right": None})
 
 
 def test_real_cameras_and_edges(lms400):
@@ -944,14 +951,14 @@ def test_real_cameras_see_the_same_edges(lms400):
 
 def test_real_stereo(lms400):
     views, models = lms400.views, [lms400.models[c] for c in ("left", "right")]
-    transform, covariance, _ = image.stereo_check(
+    transform, covariance, _ = survey.stereo_check(
         views["left"], views["right"], lms400.board.pattern, models, relief=lms400.relief
     )
     # shape-free bundle of an independent analysis, with its own uncertainty
     assert np.linalg.norm(transform.translation) == pytest.approx(0.1200, abs=0.0006)
     np.testing.assert_allclose(np.rad2deg(transform.rotation.as_rotvec()), [0.457, 0.479, -0.025], atol=0.12)
     assert np.all(np.sqrt(np.diag(covariance)) < 1e-3)
-    refined, covariance, _ = image.stereo_check(
+    refined, covariance, _ = survey.stereo_check(
         views["left"], views["right"], lms400.board.pattern, models, relief=lms400.relief, refine=True
     )
     sigma = np.sqrt(np.diag(covariance))
@@ -966,8 +973,8 @@ def test_opencv_stereo_pairs(real_data):
     numbers = [i for i in range(1, 15) if i != 10]
     corners, models = [], []
     for camera, rms in (("left", 0.4087), ("right", 0.4586)):
-        pixels = [image.find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers]
-        result = image.estimate_intrinsics(pixels, pattern, (640, 480))
+        pixels = [survey.find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers]
+        result = survey.estimate_intrinsics(pixels, pattern, (640, 480))
         assert result.rms_px < rms
         corners.append(dict(zip(numbers, pixels, strict=True)))
         models.append(result.model)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib import importers
 from lrfcal_lib.__main__ import main
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
-from lrfcal_lib.session import SessionError, open_session, transform_from_json
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.session import importers
+from lrfcal_lib.session.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
+from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.stated import SessionError, transform_from_json
 
 BOUGUET = """
 fc = [ 700.5 ; 701.5 ];

@@ -1,84 +1,77 @@
-"""Imports go one way, and the light half of the library stays light."""
+"""Imports go one way: folders stand on floors, and the light half of the library stays light."""
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 LIBRARY = Path(__file__).resolve().parents[1] / "lrfcal_lib"
-# a module may import from its own rank and below
-RANKS = [
-    {"geometry", "board", "features", "codecs", "cache"},
-    {"camera"},
-    {"session"},
-    {"preprocess", "importers"},
-    {"solvers"},
-    {"uncertainty", "candidates", "forecast", "advice", "residuals"},
-    {"reconstruct", "prepared"},
-    {"pairing"},
-    {"joint_pairing"},
-    {"joint_calibration"},
-    {"fused_outline"},
-    {"pipeline"},
+# a folder imports from the floors below it, never from another folder on its own floor; the commands stand on the roof
+FLOORS = [
+    {"model"},
+    {"fit", "session", "plots"},
+    {"preprocess", "solvers", "drivers", "simulate"},
+    {"calibrate", "emulators"},
     {"evaluate"},
-    {"verdict"},
-    {"notebook", "plots", "export", "report", "acquisition", "panel", "drivers", "emulators"},  # see APART
-    {"__main__"},
+    {"acquire", "report"},
 ]
-RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
-# what knows the geometry of a rig and its session only, so that it can judge or feed the rest
-APART = dict.fromkeys(("simulate", "drivers"), {"geometry", "board", "camera", "session", "codecs"})
-# emulated devices stand between the two: they look at the simulated world and speak as the drivers expect
-APART["emulators"] = APART["drivers"] | {"simulate", "drivers"}
-CODECS = {"lms2xx", "lms2xx_frame", "lms2xx_replies"}
+FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names} | {"__main__": len(FLOORS)}
 MODULES = sorted(LIBRARY.rglob("*.py"))
 
 
-def part_of(names):
-    """First name below the library; of the drivers, codecs (sessions are read with them) count apart."""
-    return "codecs" if names[0] == "drivers" and CODECS.intersection(names[1:2]) else names[0]
+def name_of(path):
+    parts = path.relative_to(LIBRARY.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported_parts(path):
-    """First name after ``lrfcal_lib`` of everything a file imports from the library."""
-    names = []
-    for node in ast.walk(ast.parse(path.read_text())):
+NAMES = {name_of(path) for path in MODULES}
+
+
+def imported(path, *, lazily=True):
+    """Modules of the library that a file imports; without those that functions import when they are called."""
+    tree, found = ast.parse(path.read_text()), set()
+    for node in ast.walk(tree) if lazily else tree.body:
         if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
+            found |= {alias.name for alias in node.names if alias.name.startswith("lrfcal_lib")}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path.name} imports relatively: the direction could not be seen"
-            deeper = node.module == "lrfcal_lib"
-            names += [f"lrfcal_lib.{alias.name}" for alias in node.names] if deeper else [node.module]
-    parts = [part_of(name.split(".")[1:]) for name in names if name.startswith("lrfcal_lib.")]
-    return [part for part in parts if part != "__version__"]
+            longer = {f"{node.module}.{alias.name}" for alias in node.names} & NAMES
+            found |= longer or ({node.module} if node.module in NAMES else set())
+    return found
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(LIBRARY)))
 def test_imports_point_down(path):
-    part = part_of(path.relative_to(LIBRARY).with_suffix("").parts)
-    imported = set(imported_parts(path)) - {part}
-    if part == "__init__":
-        assert not imported
-    elif part in APART:
-        assert imported <= APART[part]
-    elif part != "__main__":
-        assert part in RANK, f"{part} has no place in RANKS yet"
-        assert not {other for other in imported if RANK.get(other, len(RANKS)) > RANK[part]}
+    part = path.relative_to(LIBRARY).with_suffix("").parts[0]
+    others = {name.split(".")[1] for name in imported(path) if "." in name} - {part}
+    assert part == "__init__" and not others or part in FLOOR, f"{part} stands on no floor yet"
+    assert not {other for other in others if FLOOR[other] >= FLOOR[part]}
+
+
+def test_no_circle_among_modules():
+    graph = {name_of(path): imported(path, lazily=False) - {name_of(path)} for path in MODULES}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"modules import each other in a circle: {' <- '.join(error.args[1])}")
 
 
 def test_the_walk_sees_imports(tmp_path):
     source = tmp_path / "x.py"
-    source.write_text("def f():\n    from lrfcal_lib import plots\n    import lrfcal_lib.solvers.camera\n")
-    assert imported_parts(source) == ["plots", "solvers"]
+    source.write_text("def f():\n    from lrfcal_lib.plots import rig\n    import lrfcal_lib.solvers.joint\n")
+    assert imported(source) == {"lrfcal_lib.plots.rig", "lrfcal_lib.solvers.joint"} and not imported(
+        source, lazily=False
+    )
 
 
 def test_solvers_and_preprocessing_need_no_heavy_library():
     code = """
 import importlib, pkgutil, sys
 import lrfcal_lib
-for name in ("geometry", "board", "camera", "session", "preprocess", "solvers"):
+for name in ("model", "fit", "session", "preprocess", "solvers"):
     module = importlib.import_module("lrfcal_lib." + name)
     for found in pkgutil.walk_packages(getattr(module, "__path__", []), module.__name__ + "."):
         importlib.import_module(found.name)

@@ -8,12 +8,17 @@ from joint_draws import draw, none
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import bound, state_errors
-from lrfcal_lib.geometry import DegenerateGeometry, axis_difference, transform_difference
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import SENSOR, JointState, Unknowns, gather, move_state, named_blocks
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    axis_difference,
+    pose_array,
+    pose_transform,
+    transform_difference,
+)
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint, total_cost
-from lrfcal_lib.solvers.joint_blocks import SENSOR, JointState, Unknowns, gather, move_state, named_blocks
-from lrfcal_lib.solvers.joint_observations import JointObservations
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pose import pose_array, pose_transform
 
 MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave

@@ -8,9 +8,9 @@ from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
-from lrfcal_lib.geometry import DegenerateGeometry
+from lrfcal_lib.evaluate.uncertainty import projection_sigma
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.uncertainty import projection_sigma
 
 MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
 FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])

@@ -8,12 +8,13 @@ import pytest
 from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import evaluate, joint_calibration, pipeline
+from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
+from lrfcal_lib.evaluate import jointly, tables
+from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.monte_carlo import state_errors
-from lrfcal_lib.export import calibration_record
-from lrfcal_lib.fused_outline import edge_on_plane, fused_outline_of
-from lrfcal_lib.geometry import transform_difference
-from lrfcal_lib.session import open_session
+from lrfcal_lib.model.geometry import transform_difference
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
 
@@ -27,12 +28,12 @@ def found():
 
 @pytest.fixture(scope="module")
 def joint(found):
-    return joint_calibration.leave_out(found.joint, groups=4)
+    return pipeline.leave_out(found.joint, groups=4)
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return evaluate.read_truth(open_session(QUICK))
+    return tables.read_truth(open_session(QUICK))
 
 
 def test_the_session_asks_for_its_unknowns(joint):
@@ -44,9 +45,9 @@ def test_the_session_asks_for_its_unknowns(joint):
 
 def test_the_scale_of_the_pitch_is_free_with_the_axis_whatever_the_images(joint):
     """Held at zero, a wrong scale would go into the axis: also with cameras on the base, and one image a placement."""
-    views = {name: found[:1] for name, found in joint_calibration.all_views(joint.prepared).items()}
-    seen = joint_calibration.observe_joint(joint.prepared, views)
-    assert "pitch_scale" in joint_calibration.joint_settings(joint.prepared, seen)["sensor"]
+    views = {name: found[:1] for name, found in pipeline.all_views(joint.prepared).items()}
+    seen = pipeline.observe_joint(joint.prepared, views)
+    assert "pitch_scale" in pipeline.joint_settings(joint.prepared, seen)["sensor"]
 
 
 def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
@@ -59,7 +60,7 @@ def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
     fine, square = {"pitch_step": np.radians(0.5), "sigma_range": 0.003, "sigma_px": 0.1}, 0.0
     for seed in range(3):
         obs, truth, _ = draw(np.random.default_rng(seed), 20, mount="platform", stretch=0.002, lean=high, **fine)
-        sensor = joint_calibration.joint_settings(joint.prepared, obs)["sensor"]
+        sensor = pipeline.joint_settings(joint.prepared, obs)["sensor"]
         found = solve_joint(obs, sensor=sensor)
         error, k = state_errors(found.state, truth, found.unknowns)[:16], found.solution.covariance[:16, :16]
         square += error @ np.linalg.solve(k, error) / 48
@@ -69,11 +70,11 @@ def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
 def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
     for noise, sweep in (((0.005, 0.0), "offset"), ((0.005, 0.04), "offset_stretch")):
         loose = replace(joint.prepared, pitch_noise=pipeline.PitchNoise(*noise))
-        assert joint_calibration.joint_settings(loose, joint.observations)["sweep"] == sweep
+        assert pipeline.joint_settings(loose, joint.observations)["sweep"] == sweep
 
 
 def test_errors_agree_with_their_sigma(joint, truth):
-    table = evaluate.joint_errors(joint, truth)
+    table = jointly.joint_errors(joint, truth)
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
     assert (table.translation_error_mm < 3.5 * table.translation_sigma_mm).all()
     assert table.translation_error_mm.max() < 25
@@ -110,7 +111,7 @@ def test_corrections_undo_what_the_estimate_found(joint):
 
 
 def test_it_is_handed_over_with_its_platform_and_sensor(found):
-    assert evaluate.handed_over(found) == "joint"
+    assert tables.handed_over(found) == "joint"
     record = calibration_record(found, "joint")
     np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
     assert set(record["cameras"]) == set(found.joint.observations.cameras)
@@ -118,26 +119,26 @@ def test_it_is_handed_over_with_its_platform_and_sensor(found):
     assert record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
-    assert min(edges) <= evaluate.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
+    assert min(edges) <= jointly.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
     assert "sensor" not in calibration_record(found, "line")
 
 
 def test_what_did_not_converge_is_not_handed_over(found):
     bad = replace(found.joint.solution, solution=replace(found.joint.solution.solution, converged=False))
-    assert evaluate.handed_over(replace(found, joint=replace(found.joint, solution=bad))) in ("line", "zhang_pless")
+    assert tables.handed_over(replace(found, joint=replace(found.joint, solution=bad))) in ("line", "zhang_pless")
 
 
 def test_tables_hold_the_joint_estimate(found, joint):
-    comparison = evaluate.method_comparison(found.observations, found.solutions, joint=joint)
+    comparison = tables.method_comparison(found.observations, found.solutions, joint=joint)
     row = comparison[comparison.method == "joint"].iloc[0]
     assert np.isfinite([row.left_out_edge_rms_px, row.left_out_plane_rms_mm]).all()
-    assert "joint" in set(evaluate.platform_calibration_table(found.platform).method)
-    assert "joint" in set(evaluate.camera_calibration_table(found.solutions).method)
-    assert set(evaluate.joint_table(joint).unit) <= {"deg", "mm", "%", "1"}
-    assert (evaluate.joint_table(joint).sigma > 0).all()
-    assert len(evaluate.noise_table(joint)) == len(joint.solution.noise)
-    assert evaluate.joint_fit(joint)["plane_rms_mm"] < 12
-    assert set(evaluate.edge_bias_mm(joint).edge) <= set(joint.observations.edges)
+    assert "joint" in set(tables.platform_calibration_table(found.platform).method)
+    assert "joint" in set(tables.camera_calibration_table(found.solutions).method)
+    assert set(jointly.joint_table(joint).unit) <= {"deg", "mm", "%", "1"}
+    assert (jointly.joint_table(joint).sigma > 0).all()
+    assert len(jointly.noise_table(joint)) == len(joint.solution.noise)
+    assert jointly.joint_fit(joint)["plane_rms_mm"] < 12
+    assert set(jointly.edge_bias_mm(joint).edge) <= set(joint.observations.edges)
 
 
 def test_boards_of_unknown_size_in_the_coloured_cloud(joint):

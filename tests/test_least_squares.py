@@ -9,16 +9,29 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case
 
-from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.solvers.camera import line_block, solve_lines_batch
-from lrfcal_lib.solvers.least_squares import Block, minimise, robust_rho, robust_weights, solve, whiten
-from lrfcal_lib.solvers.observability import (
+from lrfcal_lib.fit.least_squares import (
+    Block,
+    minimise,
     null_space,
     placement_covariance,
     pseudo_inverse,
+    robust_rho,
+    robust_weights,
+    solve,
     unobservable_motions,
+    whiten,
 )
-from lrfcal_lib.solvers.pose import apply_pose, exp_rotation, motion_words, move_pose, pose_array, pose_transform
+from lrfcal_lib.fit.residuals import line_block
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    apply_pose,
+    exp_rotation,
+    motion_words,
+    move_pose,
+    pose_array,
+    pose_transform,
+)
+from lrfcal_lib.solvers.lines import solve_lines_batch
 
 
 def line_problem(x, y, sigma=1.0):

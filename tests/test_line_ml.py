@@ -7,19 +7,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case
 
-from lrfcal_lib.evaluate.shots import crossings, shots_table, solve_shots, start_near
-from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
+from lrfcal_lib.evaluate.monte_carlo import crossings, shots_table, solve_shots, start_near
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
 from lrfcal_lib.simulate.draw import ShotSetup, draw_shots
-from lrfcal_lib.solvers.line_ml import (
-    _block,
-    _Intervals,
-    _move,
-    edge_bias,
-    softness,
-    solve_line_ml,
-    solve_line_ml_batch,
-)
-from lrfcal_lib.solvers.pose import pose_array
+from lrfcal_lib.solvers.lines import _block, _Intervals, _move, edge_bias, softness, solve_line_ml, solve_line_ml_batch
 
 FULL = ("points", "covariance", "half_step", "noise", "radius", "background", "lines", "line_sigma")
 BIASES = (-0.5, -0.25, 0.0, 0.25, 0.5)

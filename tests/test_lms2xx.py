@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from lrfcal_lib.drivers import lms2xx, lms2xx_replies
-from lrfcal_lib.drivers.lms2xx import (
+from lrfcal_lib.session import lms2xx_codec
+from lrfcal_lib.session.lms2xx_codec import (
     MODES,
     REASONS,
     TelegramError,
@@ -109,7 +109,7 @@ def test_commands_are_the_verified_bytes(text):
     code, data = TO_DEVICE[text]
     raw, data = bytes.fromhex(text), bytes.fromhex(data)
     assert encode_telegram(code, data) == raw
-    assert parse_telegram(raw) == lms2xx.Telegram(code, data)
+    assert parse_telegram(raw) == lms2xx_codec.Telegram(code, data)
 
 
 @pytest.mark.parametrize("text", FROM_DEVICE)
@@ -117,7 +117,7 @@ def test_replies_are_the_verified_bytes(text):
     code, data, status, address = FROM_DEVICE[text]
     raw, data = bytes.fromhex(text), bytes.fromhex(data)
     assert encode_telegram(code, data, status=status, address=address) == raw
-    assert parse_telegram(raw) == lms2xx.Telegram(code, data, status, address)
+    assert parse_telegram(raw) == lms2xx_codec.Telegram(code, data, status, address)
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5, 7, 8, 9, 255, 256, 257, 730, 812])
@@ -347,46 +347,46 @@ def test_both_directions_are_told_apart():
 
 def test_configuration_survives_and_says_its_mode():
     raw = next(bytes.fromhex(text) for text in FROM_DEVICE if text.startswith("02 80 24 00 F4"))
-    read = lms2xx_replies.parse_configuration(raw)
+    read = lms2xx_codec.parse_configuration(raw)
     assert (read.measuring_mode, read.unit, read.realtime_indices, read.blanking_m) == (4, "mm", False, 0.0)
-    assert lms2xx_replies.encode_configuration(read) == raw
+    assert lms2xx_codec.encode_configuration(read) == raw
     changed = read.changed(measuring_mode=6, unit="cm", realtime_indices=True)
-    again = lms2xx_replies.parse_configuration(lms2xx_replies.encode_configuration(changed))
+    again = lms2xx_codec.parse_configuration(lms2xx_codec.encode_configuration(changed))
     assert (again.measuring_mode, again.unit, again.realtime_indices) == (6, "cm", True)
     assert again.changed(measuring_mode=4, unit="mm", realtime_indices=False) == read
     written = next(bytes.fromhex(text) for text in FROM_DEVICE if text.startswith("02 80 25 00 F7"))
-    assert lms2xx_replies.parse_configuration(written).measuring_mode == 0
+    assert lms2xx_codec.parse_configuration(written).measuring_mode == 0
 
 
 def test_the_factory_configuration_is_that_of_an_outdoor_device():
-    factory = lms2xx_replies.Configuration()
+    factory = lms2xx_codec.Configuration()
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
 def test_variant_type_errors_and_status_byte():
     by_head = {text[12:17]: bytes.fromhex(text) for text in FROM_DEVICE}
-    assert lms2xx_replies.parse_variant(by_head["BB 00"]) == (False, 180.0, 0.5)
-    assert lms2xx_replies.parse_type(by_head["BA 4C"]) == ("LMS221", "302063", "X01.27")
-    assert lms2xx_replies.parse_errors(by_head["B2 10"]) == []
+    assert lms2xx_codec.parse_variant(by_head["BB 00"]) == (False, 180.0, 0.5)
+    assert lms2xx_codec.parse_type(by_head["BA 4C"]) == ("LMS221", "302063", "X01.27")
+    assert lms2xx_codec.parse_errors(by_head["B2 10"]) == []
     old = encode_telegram(0xB2, bytes.fromhex("84 16 01 31 07 02"), status=0x12)
-    assert lms2xx_replies.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
-    byte = lms2xx_replies.parse_status_byte
-    assert byte(0x10) == lms2xx_replies.StatusByte("ok", False, False, False)
-    assert byte(0xF3) == lms2xx_replies.StatusByte("error", True, True, True)
+    assert lms2xx_codec.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
+    byte = lms2xx_codec.parse_status_byte
+    assert byte(0x10) == lms2xx_codec.StatusByte("ok", False, False, False)
+    assert byte(0xF3) == lms2xx_codec.StatusByte("error", True, True, True)
 
 
 def test_bad_replies_are_refused():
     for parse, raw, message in (
-        (lms2xx_replies.parse_status, A0, "code A0 is not the reply B1"),
-        (lms2xx_replies.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
-        (lms2xx_replies.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
-        (lms2xx_replies.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
-        (lms2xx_replies.parse_variant, encode_telegram(0xBB, b"\1", status=16), "1 bytes of data, needs 5"),
-        (lms2xx_replies.parse_errors, A0[:-1], "states 9 bytes, got 8"),
+        (lms2xx_codec.parse_status, A0, "code A0 is not the reply B1"),
+        (lms2xx_codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
+        (lms2xx_codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
+        (lms2xx_codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
+        (lms2xx_codec.parse_variant, encode_telegram(0xBB, b"\1", status=16), "1 bytes of data, needs 5"),
+        (lms2xx_codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
     ):
         with pytest.raises(TelegramError, match=message):
             parse(raw)
-    odd = lms2xx_replies.Configuration(b"\0\0\0\0\0\0\7")
+    odd = lms2xx_codec.Configuration(b"\0\0\0\0\0\0\7")
     with pytest.raises(TelegramError, match="unit 7 is neither 0"):
         _ = odd.unit
 
@@ -429,7 +429,7 @@ def test_replies_with_any_content_give_a_value_or_a_telegram_error(parse):
     for _ in range(2000):
         raw = encode_telegram(code, rng.bytes(rng.integers(0, 160)), status=int(rng.integers(256)))
         try:
-            getattr(lms2xx_replies, parse)(raw)
+            getattr(lms2xx_codec, parse)(raw)
             values += 1
         except TelegramError:
             refused += 1
@@ -472,11 +472,11 @@ def test_real_scans_decode_and_encode_to_the_same_bytes(captures):
 
 def test_a_real_device_describes_itself(captures):
     replies = {raw[4]: raw for direction, raw, _ in captures if direction == "lms->host"}
-    status = lms2xx_replies.parse_status(replies[0xB1])
+    status = lms2xx_codec.parse_status(replies[0xB1])
     assert (status.firmware, status.serial, status.measuring_mode, status.unit) == ("V02.19", "05270497", 4, "mm")
     assert (status.scan_angle_deg, status.resolution_deg, status.baud, status.laser_on) == (180.0, 0.5, 38400, True)
     assert status.mirror_hz == pytest.approx(75.08, abs=0.01)
-    assert lms2xx_replies.parse_type(replies[0xBA]) == ("LMS200", "S18063", "V02.19")
+    assert lms2xx_codec.parse_type(replies[0xBA]) == ("LMS200", "S18063", "V02.19")
     for code in (0xF4, 0xF7):
-        read = lms2xx_replies.parse_configuration(replies[code])
+        read = lms2xx_codec.parse_configuration(replies[code])
         assert (read.measuring_mode, read.unit) == (4, "mm")

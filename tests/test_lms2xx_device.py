@@ -11,17 +11,14 @@ import serial
 from virtual import INDEXED, Bench
 from virtual import lms as lms_on
 
-from lrfcal_lib.drivers import serial_port
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.host import VirtualHost
-from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
-from lrfcal_lib.drivers.lms2xx_device import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import TURN_S, Link, interval_s, transfer_s
-from lrfcal_lib.drivers.lms2xx_replies import Configuration
-from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock
-from lrfcal_lib.drivers.serial_port import open_port, set_rate
-from lrfcal_lib.emulators import Clock, EmulatedLms, SyntheticSource
-from lrfcal_lib.emulators.line import SerialDevice
+from lrfcal_lib.drivers.lms2xx import LMS2xx
+from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, interval_s, transfer_s
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate
+from lrfcal_lib.emulators.line import Clock, SerialDevice
+from lrfcal_lib.emulators.lms2xx import EmulatedLms, SyntheticSource
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_scan, encode_telegram
 
 
 def emulated(**options):
@@ -71,12 +68,12 @@ def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch)
     with pytest.raises(PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"):
         open_port(wire[1], 9600, timeout=0)
     held.close()
-    monkeypatch.setattr(serial_port, "_holder", lambda path: "another program")
+    monkeypatch.setattr(port, "_holder", lambda path: "another program")
 
     def forbidden(*_, **__):
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 
-    monkeypatch.setattr(serial_port.serial, "Serial", forbidden)
+    monkeypatch.setattr(port.serial, "Serial", forbidden)
     with pytest.raises(PortError, match="no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout"):
         open_port("/dev/ttyUSB0", 9600, timeout=0)
 
@@ -89,8 +86,8 @@ def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wir
             set_rate(port, 12345)
         with pytest.raises(PortError, match="cannot do -1 Bd"):
             set_rate(port, -1)
-        real = serial_port.termios.tcgetattr
-        monkeypatch.setattr(serial_port.termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
+        real = port.termios.tcgetattr
+        monkeypatch.setattr(port.termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
         with pytest.raises(PortError, match="does not take 500000 Bd.*RS-422 interface"):
             set_rate(port, 500000)
         assert port.baudrate == 19200

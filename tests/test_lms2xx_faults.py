@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from virtual import INDEXED, lms
 
-from lrfcal_lib.drivers.errors import DeviceError
-from lrfcal_lib.drivers.lms2xx import crc16, decode_scan, encode_scan
-from lrfcal_lib.drivers.lms2xx_device import LMS2xx
-from lrfcal_lib.emulators import FAULTS
+from lrfcal_lib.drivers.lms2xx import LMS2xx
+from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.emulators.line import FAULTS
+from lrfcal_lib.session.lms2xx_codec import crc16, decode_scan, encode_scan
 
 DEVICES = 4
 RECOVERY_S, CALL_S = 3.0, 12.0  # longest: until all works again, and of any call

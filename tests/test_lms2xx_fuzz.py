@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from shared import STRINGS
 
-from lrfcal_lib.drivers import lms2xx_replies
-from lrfcal_lib.drivers.lms2xx import (
+from lrfcal_lib.session import lms2xx_codec
+from lrfcal_lib.session.lms2xx_codec import (
     MODES,
     TelegramError,
     crc16,
@@ -94,9 +94,9 @@ def _parse_contents(rng, seeds, count):
 def _parse_single(rng, seeds, count):
     """Damaged contents with sound checksums, and damaged frames, one string after the other."""
     outcomes = {True: 0, False: 0}
-    parsers = {0xB0: decode_scan, 0xB1: lms2xx_replies.parse_status, 0xB2: lms2xx_replies.parse_errors,
-               0xBA: lms2xx_replies.parse_type, 0xBB: lms2xx_replies.parse_variant,
-               0xF4: lms2xx_replies.parse_configuration, 0xF7: lms2xx_replies.parse_configuration}  # fmt: skip
+    parsers = {0xB0: decode_scan, 0xB1: lms2xx_codec.parse_status, 0xB2: lms2xx_codec.parse_errors,
+               0xBA: lms2xx_codec.parse_type, 0xBB: lms2xx_codec.parse_variant,
+               0xF4: lms2xx_codec.parse_configuration, 0xF7: lms2xx_codec.parse_configuration}  # fmt: skip
     for seed in seeds:
         parse = parsers.get(int(seed[4]), parse_telegram)
         strings, lengths = _strings(rng, seed, count)

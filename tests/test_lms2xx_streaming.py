@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from virtual import INDEXED, lms
 
-from lrfcal_lib.drivers.lms2xx_device import LMS2xx
+from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import RATES
 
 STREAM_S, SCAN_S, TURNS, BYTES = 30.0, 2 * 0.01332, 2, 732 + 2  # of the variant 180/0.5

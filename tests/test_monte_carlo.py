@@ -8,10 +8,10 @@ from joint_draws import draw
 from test_joint import moved, random_problem
 
 from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, groups_of, monte_carlo, spread, state_errors
-from lrfcal_lib.geometry import DegenerateGeometry
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import Unknowns, gather, move_state, named_blocks
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_blocks import Unknowns, gather, move_state, named_blocks
-from lrfcal_lib.solvers.least_squares import whiten
 
 SENSOR = ("range_offset", "edge_log_odds")
 NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "left_rx", "left_tx", "range_offset")

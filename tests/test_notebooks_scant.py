@@ -7,8 +7,8 @@ import pytest
 from notebook_runs import WITH_SESSION, run_plainly
 from tiny_sessions import record, rectangle
 
-from lrfcal_lib import cache
-from lrfcal_lib.export import calibrate_session
+from lrfcal_lib.evaluate.export import calibrate_session
+from lrfcal_lib.session import cache
 
 SCANT = {
     "lines": {"pitch_deg": [0.0]},  # single scan lines: no sweep, no axis, no cloud

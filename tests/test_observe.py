@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from joint_draws import draw
 
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.solvers.joint_blocks import Unknowns, gather, named_blocks
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pose import pose_transform
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import Unknowns, gather, named_blocks
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, pose_transform
 
 MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from test_scan import facing
 
-from lrfcal_lib.board import Board
-from lrfcal_lib.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess.edge_cells import EdgeCells
-from lrfcal_lib.solvers.edge_likelihood import edge_shift
-from lrfcal_lib.solvers.outline_ml import EdgeModel, face_surface, measure_outline
+from lrfcal_lib.calibrate.outline import EdgeModel, face_surface, measure_outline
+from lrfcal_lib.fit.residuals import edge_shift
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess.edges_in_scan import EdgeCells
 
 HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
 BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))

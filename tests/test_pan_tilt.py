@@ -15,12 +15,11 @@ import pytest
 import virtual
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, OutOfRange, PortError, Refused, WrongDevice
-from lrfcal_lib.drivers.head_sweep import drawn_to_readings
+from lrfcal_lib.drivers.head import HeadSettings, PanTilt, drawn_to_readings
 from lrfcal_lib.drivers.host import VirtualHost
-from lrfcal_lib.drivers.pan_tilt import HeadSettings, PanTilt
-from lrfcal_lib.emulators import FAULTS, Clock, EmulatedHead, Head
-from lrfcal_lib.emulators.line import SerialDevice
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, PortError, Refused, WrongDevice
+from lrfcal_lib.emulators.head import EmulatedHead, Head
+from lrfcal_lib.emulators.line import FAULTS, Clock, SerialDevice
 from lrfcal_lib.simulate.rig import Platform
 
 FAST = HeadSettings(baudrate=38400, settle_s=0.04, stall_s=0.2, poll_s=0.01, reply_s=0.1, gap_s=0.005, retries=2,

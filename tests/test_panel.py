@@ -1,6 +1,7 @@
 """The data collection panel without a browser: its logic on a fake rig, its pictures, its words, its buttons."""
 
 import json
+import logging
 import threading
 
 import cv2
@@ -8,13 +9,26 @@ import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, rig_data
 
-from lrfcal_lib.acquisition import Light, RecordingError
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, OutOfRange, PortError
+from lrfcal_lib.acquire import collector
+from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
+from lrfcal_lib.acquire.panel import (
+    Panel,
+    SweepPicture,
+    TopView,
+    error_html,
+    jpeg,
+    lights_html,
+    png,
+    reach_of,
+    result_html,
+)
+from lrfcal_lib.acquire.record import RecordingError
+from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.emulators import rig as practice
-from lrfcal_lib.panel import Busy, Collector, Interrupted, Panel, collector, result, widgets, words
-from lrfcal_lib.panel.pictures import SweepPicture, TopView, jpeg, png, reach_of
-from lrfcal_lib.session import SessionError, open_session, validate
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import SessionError
 
 WAIT_S = 20  # guards against hanging
 VIEW = np.radians([40.0, 140.0])
@@ -296,16 +310,16 @@ def test_images_become_files_no_wider_than_asked():
 
 def test_lights_say_their_state_in_signs_and_words():
     found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
-    said = words.lights("Quality", found)
+    said = lights_html("Quality", found)
     for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
         assert sign in said
-    assert "→ next" in words.lights("", [Light("information", "warn", "put it there")])
-    assert "as soon as a placement is recorded" in words.lights("Quality", ())
+    assert "→ next" in lights_html("", [Light("information", "warn", "put it there")])
+    assert "as soon as a placement is recorded" in lights_html("Quality", ())
 
 
 def test_errors_are_said_or_not():
-    assert words.error("failed", "") == ""
-    assert "check the plug" in words.error("connecting failed", "check the plug") and "✕" in words.error("a", "b")
+    assert error_html("failed", "") == ""
+    assert "check the plug" in error_html("connecting failed", "check the plug") and "✕" in error_html("a", "b")
 
 
 @pytest.mark.parametrize("answer, said", [("yes", "✓ can be trusted"), ("with care", "! use"), ("no", "✕ cannot be")])
@@ -313,19 +327,19 @@ def test_a_result_says_whether_to_trust_it(answer, said):
     sigma = np.full(3, 0.5)
     poses = {"left": (np.array([90.0, 1.0, -2.0]), np.array([120.0, 30.0, -4.0]), sigma, sigma)}
     sentences = ("Use this calibration with care: few placements.", "Record next: there.")
-    shown = words.result(result.Result(answer, sentences, "joint", poses, None, None))
+    shown = result_html(collector.Result(answer, sentences, "joint", poses, None, None))
     for text in (said, "Few placements.", "Record next", "90.00 ± 0.50", "-4.0 ± 0.5", "left"):
         assert text in shown
-    assert "<table" not in words.result(result.Result("no", sentences, "", {}, None, None))
+    assert "<table" not in result_html(collector.Result("no", sentences, "", {}, None, None))
 
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):
     def refuse(prepared):
-        raise result.DegenerateGeometry("one placement only")
+        raise collector.DegenerateGeometry("one placement only")
 
-    monkeypatch.setattr(result, "prepare", lambda session: session)
-    monkeypatch.setattr(result, "calibrate_jointly", refuse)
-    assert result.advise(None) == "not determined yet: one placement only"
+    monkeypatch.setattr(collector, "prepare", lambda session: session)
+    monkeypatch.setattr(collector, "calibrate_jointly", refuse)
+    assert collector.advise(None) == "not determined yet: one placement only"
 
 
 # ------------------------------------------------------------------------------------------------- the buttons
@@ -409,10 +423,10 @@ def test_what_nobody_expects_is_said_too(panel, monkeypatch, caplog):
 
 def test_drivers_report_into_the_panel(panel):
     panel.connect()
-    widgets.logging.getLogger("lrfcal_lib.drivers").warning("the head does not tell its tilt")
+    logging.getLogger("lrfcal_lib.drivers").warning("the head does not tell its tilt")
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
-    assert panel._notes not in widgets.logging.getLogger("lrfcal_lib").handlers
+    assert panel._notes not in logging.getLogger("lrfcal_lib").handlers
 
 
 def test_stop_ends_what_a_button_began(panel):

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import pairing, pipeline
-from lrfcal_lib.board import triangle_board
-from lrfcal_lib.geometry import axis_difference, axis_of
-from lrfcal_lib.prepared import PitchNoise, Prepared
-from lrfcal_lib.solvers.platform import chart_parameters
-from lrfcal_lib.solvers.pose import pose_array
-from lrfcal_lib.solvers.solution import Solution
+from lrfcal_lib.calibrate import observe, pipeline
+from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
+from lrfcal_lib.preprocess.prepared import PitchNoise, Prepared
 
 SIGMA = (np.radians(0.5), 0.010)
 STATED = pipeline.stated_covariance(SIGMA)
@@ -86,27 +85,27 @@ def side(board, edge, n=20, shift=0.0, turn_deg=0.0):
 def test_sides_are_named_after_the_nearest_edge():
     board = triangle_board()
     sides = {4: side(board, "bc", shift=0.01), 7: side(board, "ab", shift=-0.01), 9: side(board, "ca")}
-    assert pairing._nearest_edges(board, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
+    assert observe._nearest_edges(board, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
 
 
 def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
     board = triangle_board()
-    names, problems = pairing._nearest_edges(board, {0: side(board, "ab", turn_deg=5), 1: side(board, "bc", shift=0.2)})
+    names, problems = observe._nearest_edges(board, {0: side(board, "ab", turn_deg=5), 1: side(board, "bc", shift=0.2)})
     assert names == {}
     assert "turned by 5.0 deg" in problems[0] and "200 mm from the edge 'bc'" in problems[1]
 
 
 def test_two_sides_do_not_share_an_edge():
     board = triangle_board()
-    names, _ = pairing._nearest_edges(board, {0: side(board, "ab"), 1: side(board, "ab", shift=0.02)})
+    names, _ = observe._nearest_edges(board, {0: side(board, "ab"), 1: side(board, "ab", shift=0.02)})
     assert list(names.values()).count("ab") == 1
 
 
 def test_thinning_keeps_the_ends():
     rows = np.arange(5, 205)
-    kept = pairing.thin(rows, 24)
+    kept = observe.thin(rows, 24)
     assert len(kept) == 24 and kept[0] == 5 and kept[-1] == 204
-    assert (pairing.thin(rows[:7], 24) == rows[:7]).all()
+    assert (observe.thin(rows[:7], 24) == rows[:7]).all()
 
 
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():

@@ -17,7 +17,10 @@ from synthetic import (
     sweep_boards,
 )
 
-from lrfcal_lib.geometry import (
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import move_head, prior_terms
+from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     TiltAxis,
     axis_difference,
@@ -25,21 +28,27 @@ from lrfcal_lib.geometry import (
     head_from_axis,
     head_from_paper,
     lrf_to_platform,
+    pose_array,
     tilt,
 )
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pitch_blocks import gather, move_pitch_state, pitch_blocks, pitch_of
-from lrfcal_lib.solvers.pitch_errors import SweepPoints, estimate_pitch_errors
-from lrfcal_lib.solvers.platform import GAUGE, PlatformObservations, PlatformPrior, solve_platform
-from lrfcal_lib.solvers.platform_blocks import (
-    move_head,
+from lrfcal_lib.solvers.pitch import (
+    SweepPoints,
+    estimate_pitch_errors,
+    gather,
+    move_pitch_state,
+    pitch_blocks,
+    pitch_of,
+)
+from lrfcal_lib.solvers.platform import (
+    GAUGE,
+    PlatformObservations,
     move_platform,
     platform_blocks,
     prepare_boards,
-    prior_terms,
+    projected_block,
+    solve_platform,
+    solve_projected,
 )
-from lrfcal_lib.solvers.pose import pose_array
-from lrfcal_lib.solvers.projected import projected_block, solve_projected
 
 AXIS = TiltAxis(
     np.array([0.9993, 0.02, -0.0317]) / np.linalg.norm([0.9993, 0.02, -0.0317]), np.array([0.0, -0.05, -0.12])

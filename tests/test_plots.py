@@ -9,12 +9,12 @@ import pytest
 from matplotlib.colors import to_hex
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import plots
-from lrfcal_lib.advice import Direction
-from lrfcal_lib.board import Board, Chessboard, outline_lines
-from lrfcal_lib.camera import CameraModel, pinhole, project, undistort
-from lrfcal_lib.session import Sweep
-from lrfcal_lib.uncertainty import SigmaMap
+from lrfcal_lib.evaluate.next_placement import Direction
+from lrfcal_lib.evaluate.uncertainty import SigmaMap
+from lrfcal_lib.model.board import Board, Chessboard, outline_lines
+from lrfcal_lib.model.camera import CameraModel, pinhole, project, undistort
+from lrfcal_lib.plots import recording, results, rig
+from lrfcal_lib.session.read import Sweep
 
 MODEL = CameraModel(640, 480, 500.0, 505.0, 320.0, 240.0, np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
 
@@ -64,7 +64,7 @@ def lines_of(ax, color):
 
 
 def test_range_image_is_seen_from_behind_the_sensor(ax, sweep, scan):
-    plots.range_image(ax, sweep, scan.mask)
+    recording.range_image(ax, sweep, scan.mask)
     left, right = ax.get_xlim()
     assert left > right, "large bearings are to the left"
     assert labels(ax) == ("bearing [deg]", "pitch [deg]")
@@ -76,14 +76,14 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, sweep, scan):
 
 def test_range_image_numbers_lines_when_the_head_stands_still(ax, sweep):
     still = Sweep(4, sweep.ranges, sweep.bearings, np.zeros(6), sweep.time_s)
-    plots.range_image(ax, still)
+    recording.range_image(ax, still)
     assert labels(ax)[1] == "scan line"
 
 
 def test_scan_line_is_to_scale_with_the_board_in_the_colour_of_the_lrf(ax, sweep, scan):
-    plots.scan_line(ax, sweep, 2, scan.mask)
+    recording.scan_line(ax, sweep, 2, scan.mask)
     assert ax.get_aspect() == 1
-    board = lines_of(ax, plots.COLORS["lrf"])[0]
+    board = lines_of(ax, recording.COLORS["lrf"])[0]
     np.testing.assert_allclose(np.hypot(board.get_xdata(), board.get_ydata()), 2.0)
     assert labels(ax) == ("x [m]", "y [m]")
 
@@ -92,24 +92,24 @@ def test_scan_line_is_to_scale_with_the_board_in_the_colour_of_the_lrf(ax, sweep
 def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
     points = 2.0 * np.array([[np.cos(np.radians(b)), np.sin(np.radians(b)), 0.0] for b in (79.5, 99.5)])
     found = SimpleNamespace(variant="half_step", points=points, line=np.array([2, 2]), end=np.array([-1, 1]))
-    plots.edge_of_line(ax, scan, 2, end, edges=[found])
+    recording.edge_of_line(ax, scan, 2, end, edges=[found])
     (mark,) = [line for line in ax.lines if line.get_label() == "half step"]
     assert mark.get_xdata()[0] == pytest.approx(bearing)
 
 
 def test_edge_of_line_refuses_a_line_without_board(ax, scan):
     with pytest.raises(ValueError, match="no beam of scan line 0 is on the board of placement 4"):
-        plots.edge_of_line(ax, scan, 0)
+        recording.edge_of_line(ax, scan, 0)
 
 
 def test_crossings_and_sides_colour_by_side_and_cross_out_the_rest(ax):
     points = np.array([[0.1, 2.0, 0.0], [0.2, 2.0, 0.0], [-0.1, 2.0, 0.0], [0.0, 2.1, 0.0]])
     side = np.array([0, 0, 3, -1])
-    plots.crossings(ax, SimpleNamespace(points=points, pitch=np.radians([1.0, 2, 3, 4]), side=side))
+    recording.crossings(ax, SimpleNamespace(points=points, pitch=np.radians([1.0, 2, 3, 4]), side=side))
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["side 0", "side 3", "not used"]
-    assert lines_of(ax, plots.COLORS["outlier"])[0].get_ydata() == pytest.approx([4.0])
+    assert lines_of(ax, recording.COLORS["outlier"])[0].get_ydata() == pytest.approx([4.0])
     ax.clear()
-    plots.sides(ax, points[:, :2], side, {0: "left", 3: "top"}, face=np.zeros((2, 2)))
+    recording.sides(ax, points[:, :2], side, {0: "left", 3: "top"}, face=np.zeros((2, 2)))
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["left", "top", "not used"]
     assert ax.get_aspect() == 1
 
@@ -117,21 +117,21 @@ def test_crossings_and_sides_colour_by_side_and_cross_out_the_rest(ax):
 def test_projection_picks_its_plane_and_draws_fits_over_their_points(ax):
     t = np.linspace(0, 1, 5)[:, None]
     points = [1.0, 2.0, 3.0] + t * [0.0, 3.0, 4.0]
-    plots.projection(ax, {"ab": points}, "yz", {"ab": (points[2], np.array([0.0, 0.6, 0.8]))})
+    recording.projection(ax, {"ab": points}, "yz", {"ab": (points[2], np.array([0.0, 0.6, 0.8]))})
     dots, fit = ax.lines
     np.testing.assert_allclose(dots.get_xydata(), points[:, 1:])
     np.testing.assert_allclose(fit.get_xydata(), points[[0, -1], 1:])
     assert labels(ax) == ("y [m]", "z [m]")
     with pytest.raises(ValueError, match="plane must be one of xz, yz, xy, got 'zz'"):
-        plots.projection(ax, {}, "zz")
+        recording.projection(ax, {}, "zz")
 
 
 def test_an_image_edge_goes_back_through_the_lens():
     edge = image_edge(ends=((60.0, 40.0), (580.0, 60.0)))
-    stretch = plots.stretch_in_image(edge, MODEL, 41)
+    stretch = recording.stretch_in_image(edge, MODEL, 41)
     np.testing.assert_allclose(undistort(stretch, MODEL)[[0, -1]], edge.ends, atol=1e-6)
     points = np.array([[-0.4, -0.3, 1.2], [0.3, 0.2, 0.9]])
-    ends = plots.stretch_in_image(SimpleNamespace(ends=pinhole(points, MODEL)), MODEL, 2)
+    ends = recording.stretch_in_image(SimpleNamespace(ends=pinhole(points, MODEL)), MODEL, 2)
     np.testing.assert_allclose(ends, project(points, MODEL), atol=1e-9)
 
 
@@ -139,28 +139,30 @@ def test_board_view_is_cut_to_the_board_and_names_what_is_missing(ax):
     pixels = np.array([[200.0, 150.0], [300.0, 250.0]])
     found = {"pixels": pixels, "edges": (image_edge(),), "rejected": (("top", "too dim"),)}
     view = SimpleNamespace(camera="right", placement=3, **found)
-    plots.board_view(ax, np.zeros((480, 640, 3), np.uint8), view, MODEL, margin=20)
-    assert lines_of(ax, plots.COLORS["right"])
+    recording.board_view(ax, np.zeros((480, 640, 3), np.uint8), view, MODEL, margin=20)
+    assert lines_of(ax, recording.COLORS["right"])
     assert ax.get_title(loc="center") + ax.get_title(loc="left") == "right, placement 3; not used: top"
     assert ax.get_xlim()[1] == pytest.approx(320.0) and ax.get_ylim()[0] > ax.get_ylim()[1]
 
 
 def test_board_view_without_anything_shows_the_whole_image(ax):
     view = SimpleNamespace(camera="left", placement=3, pixels=None, edges=(), rejected=())
-    plots.board_view(ax, np.zeros((48, 64), np.uint8), view, MODEL)
+    recording.board_view(ax, np.zeros((48, 64), np.uint8), view, MODEL)
     assert ax.get_xlim() == (-0.5, 63.5) and ax.get_ylim() == (47.5, -0.5)
 
 
 def test_edge_detail_is_centred_on_the_edge(ax):
     edge = image_edge(ends=((320.0, 200.0), (320.0, 280.0)))
-    plots.edge_detail(ax, np.zeros((480, 640, 3), np.uint8), edge, MODEL, half_width=10)
+    recording.edge_detail(ax, np.zeros((480, 640, 3), np.uint8), edge, MODEL, half_width=10)
     assert np.mean(ax.get_xlim()) == pytest.approx(320.0, abs=0.1)
     assert np.mean(ax.get_ylim()) == pytest.approx(240.0, abs=0.1)
 
 
 def test_projected_points_of_two_methods_stay_apart(ax):
     uv = {"line": np.array([[100.0, 90.0], [np.nan, np.nan]]), "zhang_pless": np.array([[104.0, 95.0]])}
-    plots.projected_points(ax, np.zeros((480, 640, 3), np.uint8), uv, [np.array([[100.0, 80.0], [101.0, 120.0]])], 30)
+    recording.projected_points(
+        ax, np.zeros((480, 640, 3), np.uint8), uv, [np.array([[100.0, 80.0], [101.0, 120.0]])], 30
+    )
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["edge in the image", "line", "zhang_pless"]
     assert ax.get_xlim() == (70.0, 134.0)
 
@@ -168,7 +170,7 @@ def test_projected_points_of_two_methods_stay_apart(ax):
 def test_pictures_are_shown_in_their_colours(ax):
     blue_first = np.zeros((2, 2, 3), np.uint8)
     blue_first[..., 0] = 255
-    plots.picture(ax, blue_first)
+    recording.picture(ax, blue_first)
     assert ax.images[0].get_array()[0, 0].tolist() == [0, 0, 255]
 
 
@@ -177,7 +179,7 @@ def test_outline_tells_lengths_and_exaggerated_spread(ax):
     board = Board("b", ("top", "right", "bottom", "left"), corners, Chessboard(3, 2, 0.1, (0.2, 0.2)))
     spread = np.array([0.001, 0.002, np.nan, 0.001])
     lengths = {"top": 0.8, "right": 0.6}
-    plots.outline(
+    recording.outline(
         ax, SimpleNamespace(lines=outline_lines(corners), line_sd=spread, lengths=lengths, board=board), exaggerate=10
     )
     assert [t.get_text() for t in ax.texts] == ["top\n800.0 mm", "right\n600.0 mm", "bottom", "left"]
@@ -188,7 +190,7 @@ def test_outline_tells_lengths_and_exaggerated_spread(ax):
 def test_residual_strips_show_every_residual_in_its_placement_and_the_rms(ax):
     placement = np.array([7, 3, 3, 7, 7, 12])
     residuals = np.array([1.0, -2.0, 2.0, 1.0, 1.0, 0.5])
-    plots.residual_strips(ax, residuals, placement, "distance [mm]")
+    results.residual_strips(ax, residuals, placement, "distance [mm]")
     dots = max(ax.lines, key=lambda line: len(line.get_xdata()))
     np.testing.assert_array_equal(np.rint(dots.get_xdata()), [1, 0, 0, 1, 1, 2])
     np.testing.assert_array_equal(dots.get_ydata(), residuals)
@@ -198,37 +200,39 @@ def test_residual_strips_show_every_residual_in_its_placement_and_the_rms(ax):
 
 
 def test_pitch_offsets_are_in_degrees_and_apart_by_direction(ax):
-    plots.pitch_offsets(ax, [1, 2, 3], np.radians([0.3, -0.2, 0.1]), np.radians([0.1, 0.1, 0.1]), [1, -1, 1])
+    results.pitch_offsets(ax, [1, 2, 3], np.radians([0.3, -0.2, 0.1]), np.radians([0.1, 0.1, 0.1]), [1, -1, 1])
     heights = {round(bar.get_x() + bar.get_width() / 2): bar.get_height() for bar in ax.patches}
     assert heights == pytest.approx({0: 0.3, 1: -0.2, 2: 0.1})
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["upwards", "downwards"]
 
 
 def test_parameter_comparison_draws_bars_only_where_a_sigma_is_known(ax):
-    plots.parameter_comparison(ax, {"line": 1.0, "bauermann": 2.0}, {"line": 0.2, "bauermann": np.nan}, "tx [mm]", 1.1)
+    results.parameter_comparison(
+        ax, {"line": 1.0, "bauermann": 2.0}, {"line": 0.2, "bauermann": np.nan}, "tx [mm]", 1.1
+    )
     assert [len(c.lines[2]) for c in ax.containers] == [1, 0]
     assert ax.get_ylim()[0] > ax.get_ylim()[1], "first method on top"
     assert [t.get_text() for t in ax.get_yticklabels()] == ["line", "bauermann"]
 
 
 def test_edge_errors_show_each_edge_and_the_mean(ax):
-    plots.edge_errors(ax, {"last_beam": [-5.0, -3.0], "half_step": [1.0, 2.0, 0.0]})
+    results.edge_errors(ax, {"last_beam": [-5.0, -3.0], "half_step": [1.0, 2.0, 0.0]})
     means = [line.get_ydata()[0] for line in ax.lines if len(line.get_ydata()) == 2 and line.get_linewidth() == 2.5]
     assert means == pytest.approx([-4.0, 1.0])
     assert [t.get_text() for t in ax.get_xticklabels()] == ["last beam", "half step"]
 
 
 def test_cost_history_is_logarithmic(ax):
-    plots.cost_history(ax, {"line": [100.0, 1.0, 0.1]})
+    results.cost_history(ax, {"line": [100.0, 1.0, 0.1]})
     assert ax.get_yscale() == "log"
 
 
 def test_frames_draw_the_columns_of_their_rotation(ax3d):
     pose = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, 0.2, 0.3]))
-    plots.frames(ax3d, {"left": pose}, length=0.5)
+    rig.frames(ax3d, {"left": pose}, length=0.5)
     tips = np.array([np.array(line.get_data_3d())[:, 1] for line in ax3d.lines])
     np.testing.assert_allclose(tips, pose.translation + 0.5 * pose.rotation.as_matrix().T)
-    assert [to_hex(line.get_color()) for line in ax3d.lines] == list(plots.AXES_RGB)
+    assert [to_hex(line.get_color()) for line in ax3d.lines] == list(recording.AXES_RGB)
 
 
 class Recorder:
@@ -249,9 +253,9 @@ class Recorder:
 
 def test_feature_surfaces_lie_where_the_feature_puts_them():
     axes, point, direction = Recorder(), np.array([1.0, 0.0, 2.0]), np.array([0.6, 0.0, 0.8])
-    plots.cylinder(axes, point, direction, 0.5, 2.0)
-    plots.sphere(axes, point, 0.7)
-    plots.slab(axes, point, direction, 0.4, 1.0)
+    rig.cylinder(axes, point, direction, 0.5, 2.0)
+    rig.sphere(axes, point, 0.7)
+    rig.slab(axes, point, direction, 0.4, 1.0)
     cylinder, sphere = axes.surfaces
     np.testing.assert_allclose(np.linalg.norm(np.cross(cylinder - point, direction), axis=1), 0.5)
     np.testing.assert_allclose(np.ptp((cylinder - point) @ direction), 4.0)
@@ -263,16 +267,16 @@ def test_feature_surfaces_lie_where_the_feature_puts_them():
 
 
 def test_surfaces_can_be_drawn(ax3d):
-    plots.cylinder(ax3d, np.zeros(3), [0, 0, 1], 0.5, 2.0)
-    plots.sphere(ax3d, np.zeros(3), 0.7)
-    plots.slab(ax3d, np.zeros(3), [0, 0, 1], 0.4, 1.0)
+    rig.cylinder(ax3d, np.zeros(3), [0, 0, 1], 0.5, 2.0)
+    rig.sphere(ax3d, np.zeros(3), 0.7)
+    rig.slab(ax3d, np.zeros(3), [0, 0, 1], 0.4, 1.0)
     assert len(ax3d.collections) == 4
 
 
 def test_space_is_to_scale(ax3d):
-    plots.polygon(ax3d, np.eye(3))
-    plots.rays(ax3d, np.zeros(3), np.eye(3))
-    plots.space(ax3d, [[0, 0, 0], [1.0, 2.0, 4.0]])
+    rig.polygon(ax3d, np.eye(3))
+    rig.rays(ax3d, np.zeros(3), np.eye(3))
+    rig.space(ax3d, [[0, 0, 0], [1.0, 2.0, 4.0]])
     assert ax3d._box_aspect[2] / ax3d._box_aspect[0] == pytest.approx(4.0)
     assert ax3d.get_zlim() == (0.0, 4.0)
 
@@ -281,7 +285,7 @@ IDENTITY = RigidTransform.identity()
 
 
 def test_render_puts_a_point_where_the_pinhole_does():
-    picture = plots.render([[0.2, -0.1, 2.0]], [[10, 20, 30]], IDENTITY, (40, 60), focal=50, splat=0)
+    picture = rig.render([[0.2, -0.1, 2.0]], [[10, 20, 30]], IDENTITY, (40, 60), focal=50, splat=0)
     (v,), (u,) = np.nonzero((picture != 255).any(axis=2))
     assert (u, v) == (round(29.5 + 5), round(19.5 - 2.5))
     assert picture[v, u].tolist() == [10, 20, 30]
@@ -290,19 +294,19 @@ def test_render_puts_a_point_where_the_pinhole_does():
 def test_render_shows_the_nearer_point_whatever_the_order():
     points, colors = np.array([[0, 0, 3.0], [0, 0, 1.0], [0, 0, 2.0]]), np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]])
     for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
-        picture = plots.render(points[order], colors[order], IDENTITY, (9, 9))
+        picture = rig.render(points[order], colors[order], IDENTITY, (9, 9))
         assert set(picture[3:6, 3:6].ravel()) == {2}
         assert (picture == 255).sum() == 3 * (81 - 9)
 
 
 def test_render_leaves_out_what_cannot_be_seen():
     points = [[0, 0, -1.0], [np.nan, 0, 1], [50.0, 0, 1.0]]
-    assert (plots.render(points, np.zeros((3, 3)), IDENTITY, (8, 8)) == 255).all()
-    assert (plots.render(np.empty((0, 3)), np.empty((0, 3)), IDENTITY, (8, 8), background=0) == 0).all()
+    assert (rig.render(points, np.zeros((3, 3)), IDENTITY, (8, 8)) == 255).all()
+    assert (rig.render(np.empty((0, 3)), np.empty((0, 3)), IDENTITY, (8, 8), background=0) == 0).all()
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
-    view = plots.look_at([3.0, 1.0, 2.0], [0.0, 0.0, 1.0])
+    view = rig.look_at([3.0, 1.0, 2.0], [0.0, 0.0, 1.0])
     target, above = view.apply([[0.0, 0.0, 1.0], [0.0, 0.0, 1.5]])
     np.testing.assert_allclose(target[:2], 0.0, atol=1e-12)
     assert target[2] == pytest.approx(np.sqrt(11)) and above[1] < 0 and above[0] == pytest.approx(0)
@@ -312,12 +316,14 @@ def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
 @pytest.mark.parametrize(("eye", "target"), [([0, 0, 1], [0, 0, 1]), ([0, 0, 5], [0, 0, 1])])
 def test_look_at_refuses_an_impossible_view(eye, target):
     with pytest.raises(ValueError, match="choose another eye or another up"):
-        plots.look_at(eye, target)
+        rig.look_at(eye, target)
 
 
 def test_every_sensor_has_one_colour_of_its_own():
-    assert len(set(plots.COLORS.values())) == len(plots.COLORS)
-    assert plots.color_of("left") == plots.COLORS["left"] and plots.color_of("cam0", 9) == plots.SERIES[1]
+    assert len(set(recording.COLORS.values())) == len(recording.COLORS)
+    assert (
+        recording.color_of("left") == recording.COLORS["left"] and recording.color_of("cam0", 9) == recording.SERIES[1]
+    )
 
 
 SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2.0]), np.array([
@@ -326,7 +332,7 @@ SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2
 
 
 def test_map_of_projection_sigma(ax):
-    plots.projection_map(ax, SIGMA, 0, "left")
+    results.projection_map(ax, SIGMA, 0, "left")
     assert labels(ax) == ("u [px]", "v [px]") and ax.get_aspect() == 1
     assert ax.get_ylim()[0] > ax.get_ylim()[1]  # v points down
     assert ax.get_title() == "left at 1 m: 3.9 px rms"
@@ -335,19 +341,19 @@ def test_map_of_projection_sigma(ax):
 
 
 def test_map_says_where_there_is_no_bound(ax):
-    plots.projection_map(ax, SIGMA, 1, largest=5.0)
+    results.projection_map(ax, SIGMA, 1, largest=5.0)
     assert ax.get_title() == "at 2 m: no bound"
     assert ax.collections[0].get_array().count() == 3 and ax.collections[0].get_clim() == (0.0, 5.0)
 
 
 def test_map_of_points_in_degrees_and_millimetres(ax):
-    plots.point_map(ax, replace(SIGMA, columns=np.radians([80.0, 90, 100]), rows=np.radians([-5.0, 5])))
+    results.point_map(ax, replace(SIGMA, columns=np.radians([80.0, 90, 100]), rows=np.radians([-5.0, 5])))
     assert labels(ax) == ("bearing [deg]", "pitch [deg]") and ax.get_title() == "cloud at 1 m: 3.9e+03 mm rms"
     assert ax.get_xlim()[0] > ax.get_xlim()[1]  # bearings grow to the left, as one sees them
 
 
 def test_parts_of_a_point_by_distance(ax):
-    plots.point_parts(ax, replace(SIGMA, sigma=SIGMA.sigma[:, 1:]))
+    results.point_parts(ax, replace(SIGMA, sigma=SIGMA.sigma[:, 1:]))
     drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
     assert set(drawn) == {"axis", "calibration"} and np.allclose(drawn["axis"], 1.0)
     assert labels(ax) == ("distance [m]", "standard deviation [mm]")
@@ -355,34 +361,34 @@ def test_parts_of_a_point_by_distance(ax):
 
 def test_observability_bars_name_what_is_lost(ax):
     known = [Direction(0.0, "the range offset", np.inf), Direction(500.0, "the edge bias", 0.002)]
-    plots.observability_bars(ax, known)
+    results.observability_bars(ax, known)
     assert [t.get_text() for t in ax.texts] == [" not determined", " 2 mm"]
     assert [t.get_text() for t in ax.get_yticklabels()] == ["the range offset", "the edge bias"]
     assert ax.get_title() == "1 motions are not determined"
-    assert [to_hex(p.get_facecolor()) for p in ax.patches] == [plots.COLORS["outlier"], plots.COLORS["fit"]]
+    assert [to_hex(p.get_facecolor()) for p in ax.patches] == [recording.COLORS["outlier"], recording.COLORS["fit"]]
 
 
 def test_misfit_bars_mark_outliers(ax):
-    plots.misfit_bars(ax, {1: 1.0, 4: 0.9, 7: 9.0})
-    assert [to_hex(p.get_facecolor()) for p in ax.patches][2] == plots.COLORS["outlier"]
+    results.misfit_bars(ax, {1: 1.0, 4: 0.9, 7: 9.0})
+    assert [to_hex(p.get_facecolor()) for p in ax.patches][2] == recording.COLORS["outlier"]
     assert ax.get_title() == "1 of 3 placements fit much worse than the others"
 
 
 def test_residuals_by_range_show_a_trend(ax):
     distance = np.linspace(1, 3, 200)
-    plots.residuals_by_range(ax, distance, 0.001 * (distance - 2))
+    results.residuals_by_range(ax, distance, 0.001 * (distance - 2))
     x, y = ax.lines[1].get_data()
     assert np.allclose(y, x - 2, atol=1e-9) and labels(ax) == ("range [m]", "predicted - measured [mm]")
     assert ax.get_title() == "ranges: 0.58 mm rms"
 
 
 def test_residuals_by_region_are_arrows(ax):
-    plots.residuals_by_region(ax, np.array([[100.0, 50.0]]), np.array([[3.0, 4.0]]), MODEL, "left")
+    results.residuals_by_region(ax, np.array([[100.0, 50.0]]), np.array([[3.0, 4.0]]), MODEL, "left")
     arrows = ax.collections[0]
     assert np.allclose([arrows.U, arrows.V], [[3.0], [4.0]]) and arrows.scale == pytest.approx(5 / 80)
     assert ax.get_title() == "left: 5 px rms, predicted - seen" and ax.get_ylim() == (480, 0)
 
 
 def test_residuals_of_a_camera_without_boards(ax):
-    plots.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
+    results.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
     assert ax.get_title() == "right: no board in any image"

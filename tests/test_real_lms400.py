@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib import evaluate, joint_calibration, pipeline
-from lrfcal_lib.export import calibration_record, write_calibration
-from lrfcal_lib.geometry import axis_difference, axis_of, lrf_to_platform, transform_difference
-from lrfcal_lib.importers import import_lasersetero
-from lrfcal_lib.pairing import observe
-from lrfcal_lib.session import open_session, transform_from_json
-from lrfcal_lib.solvers.camera import plane_residuals_m
-from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless
+from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate.observe import observe
+from lrfcal_lib.evaluate import jointly, tables
+from lrfcal_lib.evaluate.export import calibration_record, write_calibration
+from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.model.geometry import axis_difference, axis_of, lrf_to_platform, transform_difference
+from lrfcal_lib.session.importers import import_lasersetero
+from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.stated import transform_from_json
+from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 # the chessboard stereo transform of the authors' intrinsics and board poses, and its baseline
 PUBLISHED_STEREO_DEG, PUBLISHED_BASELINE_MM = (0.521, 0.292, -0.014), 117.72
@@ -62,7 +64,7 @@ def with_published_poses(obs, session):
 def test_zhang_pless_reproduces_the_published_calibration(published, camera, limit_mm):
     obs = published[camera]
     solution = solve_zhang_pless(obs, weighted=False)
-    assert 1000 * evaluate.rms(plane_residuals_m(obs, solution.transform)) <= limit_mm
+    assert 1000 * tables.rms(plane_residuals_m(obs, solution.transform)) <= limit_mm
 
 
 def test_zhang_pless_reproduces_the_published_stereo(published):
@@ -81,13 +83,13 @@ def test_the_line_method_agrees_with_the_chessboard_stereo(found):
     for camera in ("left", "right"):
         obs = found.observations[camera, "half_step"].along()
         assert len(set(zip(obs.crossing_placement, obs.crossing_edge, strict=True))) >= 33
-    check = evaluate.stereo_check(found.solutions, *pipeline.stereo_reference(found.prepared)[:2]).set_index("method")
+    check = tables.stereo_check(found.solutions, *pipeline.stereo_reference(found.prepared)[:2]).set_index("method")
     assert abs(check.baseline_error_mm["line"]) < 4.0 and check.rotation_error_deg["line"] < 0.25
 
 
 def test_edge_lengths_are_right_to_six_millimetres(found):
-    table = evaluate.edge_lengths(found.prepared, found.platform.T_head_lrf)
-    summary = evaluate.edge_summary(table[table.ends == "scan"]).set_index(["source", "variant"])
+    table = tables.edge_lengths(found.prepared, found.platform.T_head_lrf)
+    summary = tables.edge_summary(table[table.ends == "scan"]).set_index(["source", "variant"])
     own = summary.loc["lms400_zed"]
     assert (own.n >= 30).all()
     assert own.mean_abs_error_mm["half_step"] < 6.0 < 8.84
@@ -124,7 +126,7 @@ def test_methods_are_close_to_the_authors_calibration(found):
 
 
 def test_left_out_errors_are_reported_for_every_method(found, joint):
-    table = evaluate.method_comparison(found.observations, found.solutions, joint=joint)
+    table = tables.method_comparison(found.observations, found.solutions, joint=joint)
     assert len(table) == 16 and np.isfinite(table.drop(columns=["camera", "method"]).to_numpy()).all()
     assert (table.left_out_plane_rms_mm < 25).all() and (table.left_out_edge_rms_px < 12).all()
     table = table.groupby("method").left_out_edge_rms_px.mean()
@@ -133,7 +135,7 @@ def test_left_out_errors_are_reported_for_every_method(found, joint):
 
 @pytest.fixture(scope="module")
 def joint(found):
-    return joint_calibration.leave_out(found.joint)
+    return pipeline.leave_out(found.joint)
 
 
 def test_the_joint_estimate_asks_for_errors_of_every_sweep(joint):
@@ -142,19 +144,19 @@ def test_the_joint_estimate_asks_for_errors_of_every_sweep(joint):
 
 
 def test_the_joint_estimate_fits(joint):
-    fit = evaluate.joint_fit(joint)
+    fit = jointly.joint_fit(joint)
     assert fit["plane_rms_mm"] < 6.5 and fit["edge_rms_px"] < 2.0
 
 
 def test_the_joint_cameras_agree_with_the_chessboard(found):
     cameras, T_second_first, _ = pipeline.stereo_reference(found.prepared)
-    row = evaluate.stereo_check(found.solutions, cameras, T_second_first).set_index("method").loc["joint"]
+    row = tables.stereo_check(found.solutions, cameras, T_second_first).set_index("method").loc["joint"]
     assert abs(row.baseline_error_mm) < 1.5 and row.translation_error_mm < 2.0 and row.rotation_error_deg < 0.15
 
 
 def test_random_halves_agree_as_their_sigma_says(joint):
     """The prior of the platform is common to both halves, so they differ a little less than predicted."""
-    middle = evaluate.random_halves(joint).median(numeric_only=True)
+    middle = jointly.random_halves(joint).median(numeric_only=True)
     assert middle.rotation_deg < 0.4 and middle.translation_mm < 12
     usual = 0.89  # median of the length of a normal 3-vector, relative to its root mean square
     for unit in ("rotation_deg", "translation_mm"):
@@ -162,8 +164,8 @@ def test_random_halves_agree_as_their_sigma_says(joint):
 
 
 def test_edge_lengths_of_left_out_placements(joint):
-    table = evaluate.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint=joint)
-    summary = evaluate.edge_summary(table).set_index(["variant", "ends"]).mean_abs_error_mm
+    table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint=joint)
+    summary = tables.edge_summary(table).set_index(["variant", "ends"]).mean_abs_error_mm
     assert summary["likelihood", "scan"] < 4.7 and summary["half_step", "scan"] < 4.7
 
 

@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import bare_observations
 
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.solvers import SweepPoints, estimate_pitch_errors, plane_residuals_m, solve_zhang_pless
+from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
+from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])  # the authors' platform
 

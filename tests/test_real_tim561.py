@@ -5,9 +5,10 @@ import pytest
 import scipy.io
 from synthetic import bare_observations
 
-from lrfcal_lib.camera import CameraModel, line_through
-from lrfcal_lib.solvers import edge_residuals_px, find_outlying_placements, solve_lines, solve_wasielewski_strauss
-from lrfcal_lib.solvers.start import start_from_lines
+from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.model.camera import CameraModel, line_through
+from lrfcal_lib.solvers.lines import find_outlying_placements, solve_lines, solve_wasielewski_strauss
+from lrfcal_lib.solvers.planes import start_from_lines
 
 
 @pytest.fixture(scope="module")

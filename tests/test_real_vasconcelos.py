@@ -5,8 +5,10 @@ import pytest
 import scipy.io
 from synthetic import bare_observations
 
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.solvers import find_outlying_placements, plane_residuals_m, solve_zhang_pless
+from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.solvers.lines import find_outlying_placements
+from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib import reconstruct as rec
-from lrfcal_lib.board import triangle_board
-from lrfcal_lib.camera import CameraModel
+from lrfcal_lib.calibrate import reconstruct as rec
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.model.camera import CameraModel
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
 

@@ -18,25 +18,17 @@ import pytest
 from fake_rig import SIZE, make_rig, opened, picture, rig_data, telegram
 
 from lrfcal_lib import __main__ as command_line
-from lrfcal_lib.acquisition import (
-    Light,
-    Recording,
-    RecordingError,
-    Terminal,
-    check_image,
-    check_placement,
-    check_scan,
-    main,
-    record,
-    terminal,
-)
-from lrfcal_lib.acquisition.checks import edge_rise
-from lrfcal_lib.board import Chessboard
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.drivers import emergency
-from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
+from lrfcal_lib.acquire import record
+from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan, edge_rise
+from lrfcal_lib.acquire.record import Recording, RecordingError, Terminal, main, record_session
+from lrfcal_lib.drivers import port
+from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.rig import Moved, Scanned
-from lrfcal_lib.session import SessionError, SessionRecorder, finish, open_session, validate
+from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.write import SessionRecorder, finish
 
 QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 
@@ -437,7 +429,7 @@ def answers(*texts):
 def test_the_display_is_plain_text(tmp_path, live, monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
     screen, ask = Screen(live), answers("", "", "")
-    record(make_rig(listed(-4, 0, 4)), tmp_path / "s", terminal=Terminal(screen, ask))
+    record_session(make_rig(listed(-4, 0, 4)), tmp_path / "s", terminal=Terminal(screen, ask))
     text = screen.getvalue()
     assert "\x1b" not in text and "\a" not in text and ("\r" in text) == live
     assert "placement 2 (2 of 3): board, pitch 0.00 to 2.00 deg" in text and "3 scans, 1 images" in text
@@ -447,7 +439,7 @@ def test_the_display_is_plain_text(tmp_path, live, monkeypatch):
 
 def test_the_last_placement_can_be_asked_for_again(tmp_path):
     ask = answers("", "what?", "R", "", "q")
-    recording = record(make_rig(listed(-4, 0)), tmp_path / "s", terminal=Terminal(Screen(), ask))
+    recording = record_session(make_rig(listed(-4, 0)), tmp_path / "s", terminal=Terminal(Screen(), ask))
     assert recording.finished == (1,) and "dropped" in (tmp_path / "s" / "images.csv").read_text()
     assert "r: placement 1 again" in ask.asked[1] and "again" not in ask.asked[0]
     assert open_session(tmp_path / "s").placements == (1,)
@@ -455,19 +447,21 @@ def test_the_last_placement_can_be_asked_for_again(tmp_path):
 
 def test_without_anybody_to_move_the_board(tmp_path):
     with pytest.raises(RecordingError, match="nobody is there to move the board"):
-        record(make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(Screen(), answers()))
+        record_session(make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(Screen(), answers()))
 
 
 def test_an_emulated_board_moves_by_itself(tmp_path, monkeypatch):
     rig, moved = make_rig(listed(-4, 0)), []
     monkeypatch.setattr(rig, "move_board", lambda number: moved.append(number) or True)
-    record(rig, tmp_path / "s", terminal=Terminal(Screen(), answers()))
+    record_session(rig, tmp_path / "s", terminal=Terminal(Screen(), answers()))
     assert moved == [1, 2]
 
 
 def test_lights_and_advice_are_shown(tmp_path):
     screen = Screen()
-    record(make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(screen, answers("")), advice=lambda s: "go left")
+    record_session(
+        make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(screen, answers("")), advice=lambda s: "go left"
+    )
     text = screen.getvalue()
     assert "BAD   scan: no board" in text and "BAD   camera left" in text and "WARN  information: go left" in text
 
@@ -498,7 +492,7 @@ def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(tmp_
 
     rig.cameras["left"].show = show
     ask = answers("", "", "", "")
-    record(rig, tmp_path / "s", terminal=Terminal(Screen(), ask))
+    record_session(rig, tmp_path / "s", terminal=Terminal(Screen(), ask))
     session = open_session(tmp_path / "s")
     assert len(session.images(purpose="intrinsics")) == 2 and all(r.placement == -1 for r in session.images()[:2])
     assert [text[15:26] for text in ask.asked[:3]] == ["view 1 of 2", "view 2 of 2", "view 2 of 2"]
@@ -527,7 +521,7 @@ def rig_file(tmp_path):
 
 def run(rig_file, tmp_path, rig, monkeypatch, ask, **options):
     """Exit code of the program with fakes."""
-    monkeypatch.setattr(terminal, "Rig", opened(rig))
+    monkeypatch.setattr(record, "Rig", opened(rig))
     return main(rig_file, tmp_path / "s", terminal=Terminal(Screen(), ask), **options)
 
 
@@ -569,7 +563,7 @@ def test_ctrl_c_amid_a_sweep(rig_file, tmp_path, monkeypatch, capsys, scans):
 def test_signals_say_what_is_safe_and_how_to_go_on(rig_file, tmp_path, monkeypatch, capsys, number):
     """As `emergency` turns them into an exit, amid the second placement."""
     rig, seen = make_rig(listed(-4, 0, 4)), []
-    emergency.guard(rig.head)
+    port.guard(rig.head)
     rig.head.emergency_stop = rig.head.stop
 
     def end():
@@ -579,7 +573,7 @@ def test_signals_say_what_is_safe_and_how_to_go_on(rig_file, tmp_path, monkeypat
 
     rig.lrf.wait = end
     assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "", "")) == 128 + number
-    emergency.release(rig.head)
+    port.release(rig.head)
     said = f"stopped by {number.name}; placements 1 are safe; --resume goes on from there"
     assert rig.head.stops and capsys.readouterr().err.strip() == said
     rig.lrf.wait = None
@@ -588,9 +582,7 @@ def test_signals_say_what_is_safe_and_how_to_go_on(rig_file, tmp_path, monkeypat
 
 @pytest.mark.parametrize("removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"])
 @pytest.mark.parametrize("scans", [5, 9, 0])
-def test_a_session_removed_amid_a_recording_is_not_called_safe(
-    rig_file, tmp_path, monkeypatch, capsys, removed, scans
-):
+def test_a_session_removed_amid_a_recording_is_not_called_safe(rig_file, tmp_path, monkeypatch, capsys, removed, scans):
     """While the second or the last placement is recorded, or before the third one is begun."""
     rig, seen, path = make_rig(listed(-4, 0, 4)), [], tmp_path / "s" / removed
 
@@ -654,7 +646,7 @@ def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, capsys, key, value, me
 
 def test_the_command_line_passes_everything_on(monkeypatch, capsys):
     got = {}
-    monkeypatch.setattr("lrfcal_lib.acquisition.main", lambda *args, **options: got.update(options, args=args) or 0)
+    monkeypatch.setattr("lrfcal_lib.acquire.record.main", lambda *args, **options: got.update(options, args=args) or 0)
     line = ["record", "rig.json", "s", "--resume", "--placements", "3", "--mode", "continuous"]
     assert command_line.main(line) == 0
     assert got == {"args": ("rig.json", "s"), "resume": True, "count": 3, "mode": "continuous"}
@@ -751,5 +743,5 @@ def test_a_device_error_keeps_its_note(tmp_path):
     write(rig, tmp_path / "s", count=1)
     rig.head.fail = DeviceError("gone")
     with pytest.raises(DeviceError) as caught:
-        record(rig, tmp_path / "s", resume=True, terminal=Terminal(Screen(), answers("")))
+        record_session(rig, tmp_path / "s", resume=True, terminal=Terminal(Screen(), answers("")))
     assert caught.value.__notes__ == ["placements 1 are safe; --resume goes on from there"]

@@ -15,7 +15,7 @@ import pytest
 
 from lrfcal_lib.emulators import EmulatedRig
 from lrfcal_lib.emulators.rig import practice_setup, quick_file
-from lrfcal_lib.session import open_session, validate
+from lrfcal_lib.session.read import open_session, validate
 
 DEADLINE = 120.0  # s, against hanging
 FORBIDDEN = """

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from lrfcal_lib.acquisition import Terminal, check_placement, record
+from lrfcal_lib.acquire.checks import check_placement
+from lrfcal_lib.acquire.record import Terminal, record_session
+from lrfcal_lib.calibrate.observe import observe_all
+from lrfcal_lib.calibrate.pipeline import calibrate_cameras, calibrate_jointly, calibrate_platform, prepare
 from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators import EmulatedRig
 from lrfcal_lib.emulators.world import scaled
-from lrfcal_lib.joint_calibration import calibrate_jointly
-from lrfcal_lib.pairing import observe_all
-from lrfcal_lib.pipeline import calibrate_cameras, calibrate_platform, prepare
-from lrfcal_lib.session import model_to_json, open_session, validate
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import model_to_json
 from lrfcal_lib.simulate import record as simulated
 from lrfcal_lib.simulate.rig import PLACES, pairs, random, sim_quick
 
@@ -88,7 +89,9 @@ def recorded_session(setup, tmp_path_factory):
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
         with Rig.open(stated, clock=host.time, host=host, camera=lambda name: Still(emulated, name)) as rig:
-            record(rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself")))
+            record_session(
+                rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself"))
+            )
     return open_session(folder / "s")
 
 

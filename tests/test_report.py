@@ -16,9 +16,10 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib import notebook, report
-from lrfcal_lib.board import triangle_board
-from lrfcal_lib.session import LrfInfo, SessionError, SessionWriter
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.report import notebook, report
+from lrfcal_lib.session.stated import LrfInfo, SessionError
+from lrfcal_lib.session.write import SessionWriter
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 GOOD = """
@@ -212,7 +213,7 @@ def test_make_takes_a_session_with_a_space():
     shown = subprocess.run(
         ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'", 'SESSION=a "b c'],
         cwd=report.ROOT, capture_output=True, text=True, check=True)  # fmt: skip
-    assert shown.stdout == '<-m><lrfcal_lib.report><a "b c>'
+    assert shown.stdout == '<-m><lrfcal_lib.report.report><a "b c>'
 
 
 def test_pages_of_notebooks_hide_code_and_hold_their_pictures(finished):

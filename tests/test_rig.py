@@ -13,13 +13,12 @@ import pytest
 from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
-from lrfcal_lib.drivers.errors import DeviceError, NoReply, PortError
-from lrfcal_lib.drivers.head_settings import HEAD, HeadSettings
-from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, Configuration, parse_configuration
+from lrfcal_lib.drivers.head import HEAD, HeadSettings
+from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
-from lrfcal_lib.drivers.serial_port import open_port
-from lrfcal_lib.drivers.video_sources import find_source
+from lrfcal_lib.drivers.video import find_source
+from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
 
 # ------------------------------------------------------------------------------------------------------ rig file
 

@@ -8,12 +8,12 @@ from matplotlib.path import Path as Polygon
 from scipy import ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, triangle_board
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import scan
-from lrfcal_lib.preprocess.board_scan import fit_lines
-from lrfcal_lib.preprocess.sides import straight_runs
-from lrfcal_lib.session import Sweep, open_session
+from lrfcal_lib.model.board import Board, triangle_board
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess import edges_in_scan
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
+from lrfcal_lib.preprocess.edges_in_scan import straight_runs
+from lrfcal_lib.session.read import Sweep, open_session
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
 SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
@@ -78,7 +78,7 @@ def spoiled(s, ranges):
 
 
 def found(s, **options):
-    return scan.find_board(s.sweep, s.board, HEAD, **options)
+    return edges_in_scan.find_board(s.sweep, s.board, HEAD, **options)
 
 
 # ---------------------------------------------------------------------------------------------- finding the board
@@ -96,7 +96,7 @@ def test_the_board_and_nothing_else_is_found(wall):
 
 def test_nothing_need_be_known_about_board_or_platform():
     s = scene(sigma=0.004)
-    assert np.mean(scan.find_board(s.sweep).mask != s.on) < 1e-3
+    assert np.mean(edges_in_scan.find_board(s.sweep).mask != s.on) < 1e-3
 
 
 def test_the_nearest_of_two_boards_is_taken():
@@ -138,13 +138,13 @@ MISSING = {
 def test_no_board_is_said_with_what_was_seen(message):
     s = scene(wall=3.5)
     ranges = MISSING[message](s)
-    with pytest.raises(scan.BoardNotFound, match="placement 1: " + message):
+    with pytest.raises(edges_in_scan.BoardNotFound, match="placement 1: " + message):
         found(spoiled(s, ranges))
 
 
 def test_a_board_of_another_size_is_not_taken():
-    with pytest.raises(scan.BoardNotFound, match=r"seen: 0\.5\d m2"):
-        scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
+    with pytest.raises(edges_in_scan.BoardNotFound, match=r"seen: 0\.5\d m2"):
+        edges_in_scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
 
 
 def behind(s, centre, width, length, depth):
@@ -194,14 +194,14 @@ def test_points_of_one_scan_line_are_no_board():
     ranges = shelf(s, 12)
     assert np.mean(found(spoiled(s, ranges)).mask != s.on) < 2e-3
     alone = np.where(s.on, np.nan, ranges)
-    with pytest.raises(scan.BoardNotFound, match="on 1 of 161 scan lines"):
+    with pytest.raises(edges_in_scan.BoardNotFound, match="on 1 of 161 scan lines"):
         found(spoiled(s, alone))
 
 
 @pytest.mark.parametrize("roll", [25.0, 70.0, 160.0, 250.0])
 def test_a_board_that_makes_one_plane_with_its_post_is_refused(roll):
     s = noisy_triangle(roll=roll)
-    with pytest.raises(scan.BoardNotFound, match=r"no flat surface of the board's size; seen: 0\.\d+ m2"):
+    with pytest.raises(edges_in_scan.BoardNotFound, match=r"no flat surface of the board's size; seen: 0\.\d+ m2"):
         found(spoiled(s, behind(s, (0.08, 0.05), 0.06, 1.0, 0.01)[0]))
 
 
@@ -211,14 +211,14 @@ def test_a_plane_seen_along_itself_is_no_board():
     ranges = np.full(s.on.shape, np.nan)
     depth = 1.0 + 0.25 * np.random.default_rng(0).random(s.on.shape) ** 0.5
     ranges[40:80] = np.where(flat, depth, np.nan)[40:80]
-    with pytest.raises(scan.BoardNotFound, match="seen along itself"):
+    with pytest.raises(edges_in_scan.BoardNotFound, match="seen along itself"):
         found(spoiled(s, np.sort(ranges, axis=0)))
 
 
 def test_what_clutter_leaves_on_a_plane_is_no_board():
     s = noisy_triangle(wall=None)
     hidden = np.random.default_rng(1).random(s.on.shape) < 0.75
-    with pytest.raises(scan.BoardNotFound, match="filled to 2[0-9] %"):
+    with pytest.raises(edges_in_scan.BoardNotFound, match="filled to 2[0-9] %"):
         found(spoiled(s, np.where(hidden, np.nan, s.sweep.ranges)))
 
 
@@ -228,7 +228,7 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
     ranges, post = behind(s, (0.08, 0.05), 0.06, 1.0, 0.2)
     b = found(spoiled(s, ranges))
     assert post.sum() > 50 and not np.any(b.mask & post)
-    for e in (scan.edge_points(b), scan.sweep_edges(b)):
+    for e in (edges_in_scan.edge_points(b), edges_in_scan.sweep_edges(b)):
         assert 1 <= len(e.sides) <= 3
         error = s.edge_errors(e)[0][e.side >= 0]
         assert np.abs(error).max() < 0.025 and np.mean(np.abs(error)) < 0.006
@@ -241,9 +241,9 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
 
 def test_pieces_end_at_jumps_gaps_and_lines():
     ranges = np.array([[1.0, 1.01, 2.0, 2.0, np.nan, 2.0], [2.0, np.nan, np.nan, 2.0, 2.5, 2.5]])
-    assert scan.segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
-    assert scan.segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
-    assert (scan.segments(np.full((2, 3), np.nan)) == -1).all()
+    assert edges_in_scan.segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
+    assert edges_in_scan.segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
+    assert (edges_in_scan.segments(np.full((2, 3), np.nan)) == -1).all()
 
 
 def test_median_filter_is_the_median_of_what_exists():
@@ -251,21 +251,21 @@ def test_median_filter_is_the_median_of_what_exists():
     ranges = rng.random((7, 30))
     ranges[rng.random(ranges.shape) < 0.2] = np.nan
     mask = rng.random(ranges.shape) < 0.8
-    out = scan.median_filter(ranges, mask, 5)
+    out = edges_in_scan.median_filter(ranges, mask, 5)
     taken = np.where(mask, ranges, np.nan)
     for line, beam in np.ndindex(ranges.shape):
         if np.isfinite(taken[line, beam]):
             assert out[line, beam] == np.nanmedian(taken[line, max(beam - 2, 0) : beam + 3])
         else:
             assert np.isnan(out[line, beam])
-    np.testing.assert_array_equal(scan.median_filter(ranges, width=1), ranges)
-    assert np.isnan(scan.median_filter(np.full((2, 3), np.nan))).all()
+    np.testing.assert_array_equal(edges_in_scan.median_filter(ranges, width=1), ranges)
+    assert np.isnan(edges_in_scan.median_filter(np.full((2, 3), np.nan))).all()
 
 
 @pytest.mark.parametrize("width", [0, 4, -1])
 def test_median_filter_needs_an_odd_width(width):
     with pytest.raises(ValueError, match=f"odd and positive, got {width}"):
-        scan.median_filter(np.ones((1, 5)), width=width)
+        edges_in_scan.median_filter(np.ones((1, 5)), width=width)
 
 
 def test_lines_are_fitted_exactly_and_outliers_do_not_count():
@@ -296,21 +296,21 @@ def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
     ranges[rows, last + 1] = 0.5 * (ranges[rows, last] + ranges[rows, last + 2])
     b = found(spoiled(s, ranges))
     assert len(rows) * 0.95 <= b.n_jump_points <= len(rows) * 1.1
-    before, after = scan.count_jump_points(b)
+    before, after = edges_in_scan.count_jump_points(b)
     assert before == b.n_jump_points and after < 0.05 * before
-    profile = scan.edge_profile(b, rows[30], +1, 10)
+    profile = edges_in_scan.edge_profile(b, rows[30], +1, 10)
     assert len(profile.bearings) == 21
     assert np.isfinite(profile.fitted[:11]).all() and np.isnan(profile.fitted[11:]).all()
     assert abs(profile.original[11] - profile.original[10]) > 0.3
     assert np.abs(profile.filtered[:11] - profile.fitted[:11]).max() < 0.02
     with pytest.raises(ValueError, match="scan line 0 of placement 1 does not hit the board"):
-        scan.edge_profile(b, 0)
+        edges_in_scan.edge_profile(b, 0)
 
 
 # ---------------------------------------------------------------------------------------------- edges
 
 
-def outward(s, variant, function=scan.edge_points):
+def outward(s, variant, function=edges_in_scan.edge_points):
     """Errors of the edge points of the sides that were found, in millimetres across the edge, and the edges."""
     e = function(found(s), variant)
     error, edge = s.edge_errors(e)
@@ -336,7 +336,7 @@ def test_the_covariance_of_edge_points_is_realistic(sigma):
     ratios = []
     for seed, roll in enumerate(np.linspace(5, 14, 6)):
         s = scene(pose=facing(roll=roll), sigma=sigma, seed=seed)
-        e = scan.edge_points(found(s))
+        e = edges_in_scan.edge_points(found(s))
         error, edge = s.edge_errors(e)
         n = s.normals(edge, e.pitch)
         variance = np.einsum("ni,nij,nj->n", n, e.covariance, n)
@@ -348,7 +348,7 @@ def test_ranges_of_edge_points_are_as_good_as_their_covariance_says():
     ratios = []
     for seed in range(6):
         s = scene(sigma=0.01, seed=seed)
-        e = scan.edge_points(found(s))
+        e = edges_in_scan.edge_points(found(s))
         p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))
         normal = s.in_lrf([0, 0, 1.0], e.pitch)
         ratios.append(p[:, 2] ** 2 / np.einsum("ni,nij,nj->n", normal, e.covariance, normal))
@@ -358,7 +358,7 @@ def test_ranges_of_edge_points_are_as_good_as_their_covariance_says():
 def test_four_sides_are_found_and_named_alike_by_lines_and_columns():
     s = scene(pose=facing(roll=32.0), sigma=0.004)
     b = found(s)
-    lines, columns = scan.edge_points(b), scan.sweep_edges(b)
+    lines, columns = edges_in_scan.edge_points(b), edges_in_scan.sweep_edges(b)
     assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {x.side for x in columns.sides}
     names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
     assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3]
@@ -379,7 +379,7 @@ def test_sides_are_turned_as_little_as_their_sigma_says():
     turned = []
     for seed in range(8):
         b = found(s := noisy_triangle(seed, roll=10.0 + 40 * seed))
-        for e in (scan.edge_points(b), scan.sweep_edges(b)):
+        for e in (edges_in_scan.edge_points(b), edges_in_scan.sweep_edges(b)):
             turned += [angle / side.angle_sigma for side, angle in directions(s, e)]
     assert len(turned) > 30 and max(turned) < 1.5  # a spot of no size before an even wall does better than a real one
 
@@ -388,25 +388,25 @@ def test_the_sigma_of_a_direction_is_that_of_neighbours_which_share_their_errors
     rng, t = np.random.default_rng(0), np.linspace(0, 0.4, 40)
     noise = np.repeat(0.01 * rng.standard_normal((3000, 20)), 2, axis=1)
     slopes = np.polyfit(t, noise.T, 1)[0]
-    side = scan.ScanSide(0, 1, 40, 0.4, 0.01, 1.0, np.zeros((2, 3)))
+    side = edges_in_scan.ScanSide(0, 1, 40, 0.4, 0.01, 1.0, np.zeros((2, 3)))
     assert side.angle_sigma == pytest.approx(np.std(slopes), rel=0.15)
     assert replace(side, rms=0.0).angle_sigma > 0
 
 
 def test_both_variants_number_the_sides_alike():
     b = found(scene(sigma=0.004))
-    half, last = (scan.edge_points(b, v) for v in ("half_step", "last_beam"))
+    half, last = (edges_in_scan.edge_points(b, v) for v in ("half_step", "last_beam"))
     np.testing.assert_array_equal(half.side, last.side)
     np.testing.assert_array_equal(half.line, last.line)
 
 
 def test_columns_see_the_edges_that_lie_along_the_scan_lines():
     s = scene(pose=facing(roll=3.0))
-    error, edge, e = outward(s, "half_step", scan.sweep_edges)
+    error, edge, e = outward(s, "half_step", edges_in_scan.sweep_edges)
     assert {x.end for x in e.sides} == {-1, 1} and np.mean(np.isin(edge, [0, 2])) > 0.97
     spacing = 1000 * 1.6 * np.radians(0.25)
     assert abs(error.mean()) < 0.1 * spacing and np.abs(error).max() < 0.75 * spacing
-    last = outward(s, "last_beam", scan.sweep_edges)[0]
+    last = outward(s, "last_beam", edges_in_scan.sweep_edges)[0]
     assert -0.65 * spacing < last.mean() < -0.35 * spacing
     n = s.normals(s.edge_errors(e)[1], e.pitch)
     ratio = s.edge_errors(e)[0] ** 2 / np.einsum("ni,nij,nj->n", n, e.covariance, n)
@@ -416,8 +416,8 @@ def test_columns_see_the_edges_that_lie_along_the_scan_lines():
 def test_a_triangle_has_three_sides():
     s = scene(triangle_board(0.6, 0.7), facing(1.5, 20.0, 15.0, (0.2, 0.23)), sigma=0.004)
     b = found(s)
-    error, edge = s.edge_errors(scan.edge_points(b))
-    e = scan.edge_points(b)
+    error, edge = s.edge_errors(edges_in_scan.edge_points(b))
+    e = edges_in_scan.edge_points(b)
     assert set(edge[e.side >= 0]) == {0, 1, 2} and len(e.sides) == 3
     assert np.mean(e.side >= 0) > 0.9
 
@@ -425,7 +425,7 @@ def test_a_triangle_has_three_sides():
 def test_a_paper_like_scan_of_the_papers_board():
     pose = facing(1.5, 25.0, 20.0, (0.1, 0.13))
     s = scene(triangle_board(), pose, step=0.5, pitch_step=0.5, sigma=0.01)
-    e = scan.edge_points(found(s))
+    e = edges_in_scan.edge_points(found(s))
     error = s.edge_errors(e)[0][e.side >= 0]
     assert len(e.sides) >= 2 and np.abs(error).max() < 0.025
 
@@ -438,8 +438,8 @@ def test_holes_do_not_make_edges(fill):
     middle = first + s.on.sum(axis=1) // 2
     for row in rows[5:-5:2]:
         ranges[row, middle[row] + rng.integers(-25, 20) + np.arange(rng.integers(1, 8))] = fill
-    holed = scan.edge_points(found(spoiled(s, ranges)))
-    clean = scan.edge_points(found(s))
+    holed = edges_in_scan.edge_points(found(spoiled(s, ranges)))
+    clean = edges_in_scan.edge_points(found(s))
     np.testing.assert_array_equal(holed.line, clean.line)
     assert np.abs(s.edge_errors(holed)[0][holed.side >= 0]).max() < 0.008
     assert np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
@@ -451,21 +451,21 @@ def test_speckle_at_a_side_is_outvoted():
     last = ranges.shape[1] - 1 - s.on[:, ::-1].argmax(axis=1)
     for row in rng.choice(np.flatnonzero(s.on.any(axis=1)), 30, replace=False):
         ranges[row, last[row] - rng.integers(3, 25) : last[row] + 1] = np.nan
-    e = scan.edge_points(found(spoiled(s, ranges)))
+    e = edges_in_scan.edge_points(found(spoiled(s, ranges)))
     error, side = s.edge_errors(e)[0], e.side
     assert np.abs(error[side >= 0]).max() < 0.012
-    assert np.sum(side >= 0) > np.sum(scan.edge_points(found(s)).side >= 0) - 40
+    assert np.sum(side >= 0) > np.sum(edges_in_scan.edge_points(found(s)).side >= 0) - 40
 
 
 def test_the_border_of_the_view_is_no_edge():
     s = scene(pose=facing(x=0.95), sigma=0.003)
-    e = scan.edge_points(found(s))
+    e = edges_in_scan.edge_points(found(s))
     assert {x.end for x in e.sides} == {1} and np.abs(s.edge_errors(e)[0][e.side >= 0]).max() < 0.01
 
 
 def test_the_end_of_the_sweep_is_no_edge():
     s = scene(pose=facing(roll=2.0), pitch=(-5, 20), sigma=0.003)
-    e = scan.sweep_edges(found(s))
+    e = edges_in_scan.sweep_edges(found(s))
     assert {x.end for x in e.sides} == {1}
     assert np.abs(s.edge_errors(e)[0][e.side >= 0]).max() < 0.012
 
@@ -475,7 +475,7 @@ def test_what_hides_the_board_makes_no_edge():
     ranges = s.sweep.ranges.copy()
     post = (s.sweep.bearings > np.radians(97)) & (s.sweep.bearings < np.radians(107))
     ranges[:, post] = 0.8
-    e = scan.edge_points(found(spoiled(s, ranges)))
+    e = edges_in_scan.edge_points(found(spoiled(s, ranges)))
     assert np.abs(s.edge_errors(e)[0]).max() < 0.012
     assert {x.end for x in e.sides} == {-1}
 
@@ -484,11 +484,11 @@ def test_scans_at_one_pitch_give_their_ends():
     s = scene(pitch=0.0)
     s = spoiled(s, np.repeat(s.sweep.ranges, 3, axis=0))
     s = replace(s, sweep=replace(s.sweep, pitch=np.zeros(3), time_s=np.zeros(3)))
-    e = scan.edge_points(found(s))
+    e = edges_in_scan.edge_points(found(s))
     assert e.side.tolist() == [0, 0, 0, 1, 1, 1] and e.end.tolist() == [-1] * 3 + [1] * 3
     assert np.abs(s.edge_errors(e)[0]).max() < 0.004
     single = replace(s, sweep=replace(s.sweep, ranges=s.sweep.ranges[:1], pitch=np.zeros(1), time_s=np.zeros(1)))
-    np.testing.assert_allclose(scan.edge_points(found(single)).points, e.points[[0, 3]])
+    np.testing.assert_allclose(edges_in_scan.edge_points(found(single)).points, e.points[[0, 3]])
 
 
 def test_a_warped_board_moves_the_ends_where_the_board_is():
@@ -496,7 +496,7 @@ def test_a_warped_board_moves_the_ends_where_the_board_is():
     count, beam = np.maximum(s.on.sum(axis=1, keepdims=True), 1), np.arange(s.on.shape[1])
     centre = (s.on * beam).sum(axis=1, keepdims=True) / count
     bend = 0.012 * ((beam - centre) / (count / 2)) ** 2
-    e = scan.edge_points(found(spoiled(s, s.sweep.ranges + np.where(s.on, bend, 0.0))))
+    e = edges_in_scan.edge_points(found(spoiled(s, s.sweep.ranges + np.where(s.on, bend, 0.0))))
     p = s.pose.inv().apply(lrf_to_platform(e.points, e.pitch, HEAD))
     along = polar_to_points(1.0, np.arctan2(e.points[:, 1], e.points[:, 0]))
     flat = np.linalg.norm(e.points, axis=1) - 0.012  # where a flat board would be
@@ -516,10 +516,13 @@ def key(e):
 def test_the_direction_of_the_sweep_does_not_matter():
     s = scene(sigma=0.004)
     turned = replace(s.sweep, ranges=s.sweep.ranges[::-1], pitch=s.sweep.pitch[::-1])
-    a, b = key(scan.edge_points(found(s))), key(scan.edge_points(scan.find_board(turned, s.board, HEAD)))
+    a, b = (
+        key(edges_in_scan.edge_points(found(s))),
+        key(edges_in_scan.edge_points(edges_in_scan.find_board(turned, s.board, HEAD))),
+    )
     np.testing.assert_allclose(a[0], b[0], atol=1e-4)
     assert np.mean(a[1] == b[1]) > 0.99
-    first, second = (scan.sweep_edges(scan.find_board(x, s.board, HEAD)) for x in (s.sweep, turned))
+    first, second = (edges_in_scan.sweep_edges(edges_in_scan.find_board(x, s.board, HEAD)) for x in (s.sweep, turned))
     assert sorted(first.end) == sorted(second.end)
 
 
@@ -529,7 +532,7 @@ def test_a_wider_view_without_returns_changes_nothing():
     ranges = np.full((len(s.sweep.pitch), len(more)), np.nan)
     ranges[:, 60 : 60 + len(s.sweep.bearings)] = s.sweep.ranges
     wide = replace(s.sweep, ranges=ranges, bearings=more)
-    a, b = scan.edge_points(found(s)), scan.edge_points(scan.find_board(wide, s.board, HEAD))
+    a, b = edges_in_scan.edge_points(found(s)), edges_in_scan.edge_points(edges_in_scan.find_board(wide, s.board, HEAD))
     np.testing.assert_allclose(a.points, b.points, atol=1e-9)
     np.testing.assert_array_equal(a.side, b.side)
 
@@ -537,8 +540,8 @@ def test_a_wider_view_without_returns_changes_nothing():
 def test_the_same_sweep_gives_the_same_result():
     b = found(scene(sigma=0.004))
     c = found(scene(sigma=0.004))
-    np.testing.assert_array_equal(scan.edge_points(b).points, scan.edge_points(c).points)
-    np.testing.assert_array_equal(scan.edge_points(b).side, scan.edge_points(c).side)
+    np.testing.assert_array_equal(edges_in_scan.edge_points(b).points, edges_in_scan.edge_points(c).points)
+    np.testing.assert_array_equal(edges_in_scan.edge_points(b).side, edges_in_scan.edge_points(c).side)
 
 
 @pytest.mark.parametrize("turn", np.radians([0, 33, 90, 200]))
@@ -566,7 +569,7 @@ def test_too_short_or_too_few_is_no_side():
 
 def test_face_points_lie_on_the_face_and_away_from_the_edges():
     s = scene(sigma=0.005)
-    p_lrf, pitch, covariance = scan.face_points(found(s), 300)
+    p_lrf, pitch, covariance = edges_in_scan.face_points(found(s), 300)
     assert p_lrf.shape == (300, 3) and pitch.shape == (300,) and covariance.shape == (300, 3, 3)
     p = s.pose.inv().apply(lrf_to_platform(p_lrf, pitch, HEAD))
     lines = s.board.lines()
@@ -577,7 +580,7 @@ def test_face_points_lie_on_the_face_and_away_from_the_edges():
     assert np.linalg.eigvalsh(covariance)[:, 1].min() > 0
 
 
-@pytest.mark.parametrize("function", [scan.edge_points, scan.sweep_edges])
+@pytest.mark.parametrize("function", [edges_in_scan.edge_points, edges_in_scan.sweep_edges])
 def test_another_variant_is_refused(function):
     with pytest.raises(ValueError, match="variant is one of half_step, last_beam, got 'middle'"):
         function(found(scene()), "middle")
@@ -589,8 +592,10 @@ def test_another_variant_is_refused(function):
 @pytest.fixture(scope="module")
 def real(lms400_session):
     session = open_session(lms400_session)
-    scans = {p: scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements}
-    edges = {p: scan.edge_points(b) for p, b in scans.items()}
+    scans = {
+        p: edges_in_scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements
+    }
+    edges = {p: edges_in_scan.edge_points(b) for p, b in scans.items()}
     return scans, edges
 
 
@@ -629,5 +634,5 @@ def test_the_recordings_opposite_sides_are_as_far_apart_as_the_board_is_wide(rea
 
 
 def test_the_cut_of_placement_7_is_no_edge(real):
-    columns = scan.sweep_edges(real[0][7])
+    columns = edges_in_scan.sweep_edges(real[0][7])
     assert all(np.radians(30) < x.angle < np.radians(60) for x in columns.sides) and len(columns.sides) == 4

@@ -5,11 +5,11 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from lrfcal_lib import evaluate
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.notebook import ROOT
-from lrfcal_lib.preprocess import scan
-from lrfcal_lib.session import open_session
+from lrfcal_lib.evaluate import tables
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess import edges_in_scan
+from lrfcal_lib.report.notebook import ROOT
+from lrfcal_lib.session.read import open_session
 
 PLACEMENTS = [("sim_quick", n) for n in range(1, 5)] + [("sim_lms221", n) for n in range(1, 25)]
 WIDEST = 0.025  # metres; half a spot at 3 m, by which an edge before nothing lies farther out
@@ -18,7 +18,7 @@ WIDEST = 0.025  # metres; half a spot at 3 m, by which an edge before nothing li
 @lru_cache
 def opened(name):
     session = open_session(ROOT / "data" / name)
-    return session, evaluate.read_truth(session)
+    return session, tables.read_truth(session)
 
 
 @lru_cache
@@ -34,7 +34,11 @@ def seen(name, placement):
     ranges = (normal @ pose.translation - origin @ normal) / (rays @ normal)
     at = pose.inv().apply((origin + ranges[..., None] * rays).reshape(-1, 3))[:, :2]
     beyond = (at @ truth.board.lines()[:, :2].T + truth.board.lines()[:, 2]).max(axis=1).reshape(pitch.shape)
-    return scan.find_board(sweep, session.board, session.T_head_lrf), np.where(ranges > 0, beyond, np.inf), ranges
+    return (
+        edges_in_scan.find_board(sweep, session.board, session.T_head_lrf),
+        np.where(ranges > 0, beyond, np.inf),
+        ranges,
+    )
 
 
 def on_board(name, placement, edges):
@@ -60,7 +64,10 @@ def test_the_board_and_hardly_anything_else_is_found(name, placement):
 @pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
 def test_each_edge_gives_one_side_with_its_direction(name, placement):
     lines, number_of = opened(name)[1].board.lines(), {}
-    for edges in (scan.edge_points(seen(name, placement)[0]), scan.sweep_edges(seen(name, placement)[0])):
+    for edges in (
+        edges_in_scan.edge_points(seen(name, placement)[0]),
+        edges_in_scan.sweep_edges(seen(name, placement)[0]),
+    ):
         p, here = on_board(name, placement, edges), []
         for side in edges.sides:
             mine = p[edges.side == side.side]
@@ -77,5 +84,7 @@ def test_each_edge_gives_one_side_with_its_direction(name, placement):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
     session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
-    board = scan.find_board(session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed))
+    board = edges_in_scan.find_board(
+        session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed)
+    )
     assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()

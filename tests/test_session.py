@@ -9,24 +9,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard, triangle_board
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.session import (
+from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.session.read import image_size, open_session, validate
+from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
     SessionError,
-    SessionWriter,
     board_from_json,
     board_to_json,
-    finish,
-    image_size,
     model_from_json,
     model_to_json,
-    open_session,
     transform_from_json,
     transform_to_json,
-    validate,
 )
+from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
 LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)

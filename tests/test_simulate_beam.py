@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.drivers.lms2xx import decode_scan, encode_words
+from lrfcal_lib.session.lms2xx_codec import decode_scan, encode_words
 from lrfcal_lib.simulate.beam import (
     DAZZLED,
     LMS200,

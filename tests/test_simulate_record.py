@@ -13,9 +13,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.__main__ import main
-from lrfcal_lib.board import triangle_board
-from lrfcal_lib.geometry import lrf_to_platform
-from lrfcal_lib.session import open_session, transform_from_json, validate
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.model.geometry import lrf_to_platform
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import transform_from_json
 from lrfcal_lib.simulate import record
 from lrfcal_lib.simulate.beam import LMS221
 from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick

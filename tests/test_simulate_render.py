@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.camera import CameraModel, project, undistort
+from lrfcal_lib.model.camera import CameraModel, project, undistort
 from lrfcal_lib.simulate.rig import printed_triangle
 from lrfcal_lib.simulate.scene import (
     Exposure,

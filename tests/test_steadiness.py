@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.camera import CameraModel, distort, project
 from lrfcal_lib.evaluate.diagnosis import (
     Diagnosis,
     findings_in_words,
@@ -18,20 +17,24 @@ from lrfcal_lib.evaluate.diagnosis import (
     steadiness_table,
     steps_table,
 )
-from lrfcal_lib.plots.diagnosis import background_motion
+from lrfcal_lib.model.camera import CameraModel, distort, project
+from lrfcal_lib.plots.results import background_motion
 from lrfcal_lib.preprocess.bend import BoardBends
-from lrfcal_lib.preprocess.image_motion import BackgroundLost, find_features, fit_motion, motion_misses
 from lrfcal_lib.preprocess.steadiness import (
+    BackgroundLost,
     Steadiness,
     Step,
     board_hull,
     camera_steadiness,
+    find_features,
     find_steps,
+    fit_motion,
+    motion_misses,
     pixel_metric,
     steadiness_of,
     turn_px,
 )
-from lrfcal_lib.session import open_session
+from lrfcal_lib.session.read import open_session
 
 MODEL = CameraModel(480, 320, 300.0, 302.0, 241.0, 158.0, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
 PLACEMENTS = range(1, 9)

@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from lrfcal_lib.board import triangle_board
-from lrfcal_lib.drivers.lms2xx import encode_scan, encode_telegram
-from lrfcal_lib.drivers.lms2xx_replies import Configuration, encode_configuration
-from lrfcal_lib.session import LrfInfo, SessionError, SessionWriter, finish, open_session, validate
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_scan, encode_telegram
+from lrfcal_lib.session.read import open_session, validate
+from lrfcal_lib.session.stated import LrfInfo, SessionError
+from lrfcal_lib.session.write import SessionWriter, finish
 
 LRF = LrfInfo("made up", (np.radians(40), np.radians(140)), np.radians(0.25), 0.01, max_range=32.0)
 PITCH = np.radians([-0.5, -0.25, 0.0, 0.25])

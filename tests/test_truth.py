@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lrfcal_lib import evaluate, pipeline
-from lrfcal_lib.notebook import ROOT
-from lrfcal_lib.session import SessionError, open_session
+from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.evaluate import tables
+from lrfcal_lib.report.notebook import ROOT
+from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.stated import SessionError
 
 QUICK = ROOT / "data" / "sim_quick"
 
@@ -21,29 +23,29 @@ def session():
 
 @pytest.fixture(scope="module")
 def truth(session):
-    return evaluate.read_truth(session)
+    return tables.read_truth(session)
 
 
 def test_a_recording_has_no_truth(tmp_path):
-    assert evaluate.read_truth(SimpleNamespace(path=tmp_path)) is None
+    assert tables.read_truth(SimpleNamespace(path=tmp_path)) is None
 
 
 def test_damaged_truth_is_named(tmp_path):
     (tmp_path / "truth.json").write_text(json.dumps({"T_head_lrf": {}}))
     with pytest.raises(SessionError, match="truth.json.*simulate the session again"):
-        evaluate.read_truth(SimpleNamespace(path=tmp_path))
+        tables.read_truth(SimpleNamespace(path=tmp_path))
 
 
 def test_the_true_calibration_has_no_error(truth):
     for camera, transform in truth.cameras.items():
-        errors = evaluate.camera_errors(SimpleNamespace(transform=transform), truth, camera)
+        errors = tables.camera_errors(SimpleNamespace(transform=transform), truth, camera)
         assert max(errors.values()) < 1e-6
-    assert max(evaluate.axis_errors(truth.T_head_lrf, truth)) < 1e-6
+    assert max(tables.axis_errors(truth.T_head_lrf, truth)) < 1e-6
 
 
 def test_without_truth_there_are_no_errors():
-    assert evaluate.camera_errors(None, None, "left") == {}
-    assert np.isnan(evaluate.axis_errors(None, None)).all()
+    assert tables.camera_errors(None, None, "left") == {}
+    assert np.isnan(tables.axis_errors(None, None)).all()
 
 
 def test_only_evaluate_reads_the_truth():
@@ -60,8 +62,8 @@ def test_the_session_calibrates_without_its_truth(tmp_path):
     (copy / "truth.json").unlink()
     found = pipeline.calibrate(open_session(copy))
     assert {method for _, method in found.solutions} >= {"line", "zhang_pless", "line_last_beam"}
-    truth = evaluate.read_truth(open_session(QUICK))
-    errors = [evaluate.camera_errors(found.solutions[c, "zhang_pless"], truth, c) for c in ("left", "right")]
+    truth = tables.read_truth(open_session(QUICK))
+    errors = [tables.camera_errors(found.solutions[c, "zhang_pless"], truth, c) for c in ("left", "right")]
     assert max(e["rotation_error_deg"] for e in errors) < 8.0  # four placements of a small board: loose
     assert np.isfinite(pipeline.color_cloud(found, every=5).points).all()
     assert pipeline.color_cloud(found, every=5, scene=True).seen.mean() > 0.3
@@ -69,7 +71,7 @@ def test_the_session_calibrates_without_its_truth(tmp_path):
 
 def test_every_placement_has_its_edges_in_the_length_table(session):
     ready = pipeline.prepare(session)
-    table = evaluate.edge_lengths(ready)
+    table = tables.edge_lengths(ready)
     own = table[table.source == session.name]
     assert set(own.placement) == set(session.board_placements)
     assert (own.ends.eq("not measured") == own.measured_mm.isna()).all()
@@ -78,7 +80,7 @@ def test_every_placement_has_its_edges_in_the_length_table(session):
 def test_edge_points_of_a_wide_spot_lie_outside(session, truth):
     """The spot is 40 mm wide at 2 m: the board looks larger, and half a step adds to it."""
     ready = pipeline.prepare(session)
-    table = evaluate.edge_point_table(ready, truth)
+    table = tables.edge_point_table(ready, truth)
     mean = {v: np.average(part.bias_mm, weights=part.n) for v, part in table.groupby("variant")}
     assert mean["half_step"] > mean["last_beam"] > -5.0
     assert table.n.sum() > 50 and (table.sd_mm < 30).all()

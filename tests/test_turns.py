@@ -10,10 +10,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from tiny_sessions import CAMERAS, MODEL, record, rectangle
 
-from lrfcal_lib.camera import project
-from lrfcal_lib.preprocess import image
-from lrfcal_lib.preprocess.turns import alike, decide
-from lrfcal_lib.session import ImageRecord, open_session, transform_from_json
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.preprocess import survey
+from lrfcal_lib.preprocess.survey import alike, decide
+from lrfcal_lib.session.read import ImageRecord, open_session
+from lrfcal_lib.session.stated import transform_from_json
 
 HALF, MIRROR = Rotation.from_rotvec([0, 0, np.pi]), Rotation.from_rotvec([np.pi, 0, 0])
 RECTANGLE = Rotation.concatenate([Rotation.identity(), HALF, MIRROR, MIRROR * HALF])
@@ -77,7 +78,7 @@ def centred(tmp_path_factory):
 def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centred, stated):
     board = centred.board if stated else replace(centred.board, corners=None)
     models = {name: camera.model for name, camera in centred.cameras.items()}
-    found = image.survey(centred.images(), centred.read_image, board, models)
+    found = survey.survey(centred.images(), centred.read_image, board, models)
     truth, turns = json.loads((centred.path / "truth.json").read_text())["images"], {}
     for view in (v for views in found.views.values() for v in views if not v.reason):
         true = transform_from_json(truth[f"images/{view.camera}/{view.file}"]["T_camera_board"])
@@ -103,6 +104,6 @@ def test_a_plain_rectangle_is_turned_alike_in_both_cameras():
             pictures[f"{camera}{placement}"] = cv2.GaussianBlur(picture, (0, 0), 0.7)
             true[camera, placement] = seen.rotation
     records = [ImageRecord(n[:-1], Path(n), int(n[-1]), 0.0, 0.0, "board") for n in pictures]
-    views = image.survey(records, lambda r: pictures[r.file.name], board, dict.fromkeys(CAMERAS, MODEL)).views
+    views = survey.survey(records, lambda r: pictures[r.file.name], board, dict.fromkeys(CAMERAS, MODEL)).views
     off = [[true[c, v.placement].inv() * v.T_camera_board.rotation for v in views[c]] for c in CAMERAS]
     assert max((a.inv() * b).magnitude() for a, b in zip(*off, strict=True)) < 0.1

@@ -4,13 +4,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.camera import project
-from lrfcal_lib.geometry import lrf_to_platform, lrf_to_source, polar_to_points
+from lrfcal_lib.evaluate.uncertainty import (
+    COLUMNS,
+    Chain,
+    beams_to,
+    carried,
+    chain_of,
+    point_sigma,
+    projection_sigma,
+    spread,
+)
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import (
+    lrf_to_platform,
+    lrf_to_source,
+    move_pose,
+    polar_to_points,
+    pose_array,
+    pose_transform,
+)
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_observations import JointObservations
-from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform
-from lrfcal_lib.uncertainty import COLUMNS, Chain, beams_to, carried, chain_of, point_sigma, projection_sigma, spread
 
 HEAD = RigidTransform.from_components([0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03]))
 TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -94,7 +109,7 @@ def test_projection_sigma_is_what_perturbed_calibrations_show(mount):
 
 
 def beams_of(chain, model, u, v, distance, image_pitch):
-    from lrfcal_lib.uncertainty import _beams_of_pixels
+    from lrfcal_lib.evaluate.uncertainty import _beams_of_pixels
 
     bearing, pitch = _beams_of_pixels(chain, model, np.stack([u, v], axis=-1), distance, image_pitch)
     return bearing.ravel(), pitch.ravel()

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from tiny_sessions import record, rectangle
 
-from lrfcal_lib import __main__, verdict
-from lrfcal_lib.export import UNTRUSTED, calibrate_session
-from lrfcal_lib.pipeline import calibrate
-from lrfcal_lib.session import LrfInfo, open_session
-from lrfcal_lib.session.stated import lrf_from_json, lrf_to_json
+from lrfcal_lib import __main__
+from lrfcal_lib.calibrate.pipeline import calibrate
+from lrfcal_lib.evaluate import verdict
+from lrfcal_lib.evaluate.export import UNTRUSTED, calibrate_session
+from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.stated import LrfInfo, lrf_from_json, lrf_to_json
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 

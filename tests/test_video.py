@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lrfcal_lib.drivers import video_sources
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply, PortError
-from lrfcal_lib.drivers.mjpeg import MjpegStream
-from lrfcal_lib.drivers.video import Camera
+from lrfcal_lib.drivers import video
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.video import Camera, MjpegStream
 
 WAIT_S = 20.0  # guard against a hang on a busy machine
 
@@ -366,9 +365,9 @@ def device(monkeypatch):
                   cv2.CAP_PROP_EXPOSURE: 157.0}  # fmt: skip
         there = True
 
-    monkeypatch.setattr(video_sources.cv2, "VideoCapture", Device)
-    monkeypatch.setattr(video_sources.os.path, "exists", lambda path: Device.there)
-    monkeypatch.setattr(video_sources.os, "access", lambda path, mode: True)
+    monkeypatch.setattr(video.cv2, "VideoCapture", Device)
+    monkeypatch.setattr(video.os.path, "exists", lambda path: Device.there)
+    monkeypatch.setattr(video.os, "access", lambda path, mode: True)
     return Device
 
 
@@ -420,7 +419,7 @@ def test_devices_that_cannot_be_opened(device, monkeypatch):
     device.opens = False
     with pytest.raises(PortError, match="/dev/video0 gives no video: close other programs"):
         Camera.open(0, name="left")
-    monkeypatch.setattr(video_sources.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(video.os, "access", lambda path, mode: False)
     with pytest.raises(PortError, match="no permission for /dev/video0: run 'sudo usermod -aG video"):
         Camera.open(0, name="left")
     device.there = False

@@ -8,12 +8,10 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case
 
-from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.solvers.camera import edge_residuals_px, solve_lines
-from lrfcal_lib.solvers.least_squares import whiten
-from lrfcal_lib.solvers.pose import move_pose, pose_array
-from lrfcal_lib.solvers.start import sight_normals
-from lrfcal_lib.solvers.wasielewski_strauss import distance_block, solve_wasielewski_strauss
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import edge_residuals_px, sight_normals
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array
+from lrfcal_lib.solvers.lines import distance_block, solve_lines, solve_wasielewski_strauss
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 

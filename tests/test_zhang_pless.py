@@ -8,23 +8,20 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations, near_lines, random_board_poses, random_rig
 
-from lrfcal_lib.camera import project
-from lrfcal_lib.geometry import DegenerateGeometry, transform_difference
-from lrfcal_lib.solvers import find_outlying_placements
-from lrfcal_lib.solvers.camera import plane_residuals_m
+from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
+from lrfcal_lib.solvers.lines import find_outlying_placements
 from lrfcal_lib.solvers.planes import (
     board_whitener,
+    closed_form,
+    common_plane,
     compress,
     correct_and_compress,
     plane_block,
     plane_sets,
     plane_terms,
     range_weights,
-)
-from lrfcal_lib.solvers.pose import move_pose, pose_array, pose_transform
-from lrfcal_lib.solvers.start import common_plane
-from lrfcal_lib.solvers.zhang_pless import (
-    closed_form,
     solve_zhang_pless,
     solve_zhang_pless_batch,
     solve_zhang_pless_joint,

@@ -7,10 +7,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard
-from lrfcal_lib.camera import CameraModel, project, undistort
-from lrfcal_lib.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.session import CameraInfo, LrfInfo, SessionWriter, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.camera import CameraModel, project, undistort
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.write import SessionWriter
 from lrfcal_lib.simulate.draw import AHEAD
 
 MODEL = CameraModel(480, 360, 500.0, 499.0, 241.0, 178.0, np.array([-0.12, 0.04, 0.001, -0.0005, 0.0]))

@@ -1,9 +1,10 @@
 """Devices in virtual time: no time passes but what a test waits for, so that every run is the same and instant."""
 
 from lrfcal_lib.drivers.host import VirtualHost
-from lrfcal_lib.drivers.lms2xx import split_stream
-from lrfcal_lib.drivers.lms2xx_replies import Configuration
-from lrfcal_lib.emulators import Clock, EmulatedHead, EmulatedLms
+from lrfcal_lib.emulators.head import EmulatedHead
+from lrfcal_lib.emulators.line import Clock
+from lrfcal_lib.emulators.lms2xx import EmulatedLms
+from lrfcal_lib.session.lms2xx_codec import Configuration, split_stream
 
 INDEXED = Configuration().changed(unit="mm", realtime_indices=True)
 

@@ -1,1 +1,1 @@
-"""Devices: pure codecs between bytes and values, which import nothing else of the library, and thin ports."""
+"""Devices: the range finder, the head and cameras, each behind a small class, and rigs made of them."""

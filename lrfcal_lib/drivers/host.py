@@ -10,8 +10,7 @@ import math
 import threading
 import time
 
-from lrfcal_lib.drivers.errors import PortError
-from lrfcal_lib.drivers.serial_port import open_port, set_rate
+from lrfcal_lib.drivers.port import PortError, open_port, set_rate
 
 LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
 

@@ -1,384 +1,559 @@
-"""Telegrams of the SICK LMS2xx laser range finders: bytes to values and back, without a port.
-
-The frame is in `lms2xx_frame`, what a device says about itself in `lms2xx_replies`; here are the scans, telegram 0xB0.
-Everything that can be wanted for a whole recording works on many telegrams at once.
-"""
+"""A SICK LMS200, LMS211, LMS221 or LMS291 on a serial port: found, set up, asked, streaming."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+import math
 
-import numpy as np
-
-from lrfcal_lib.drivers.lms2xx_frame import (
-    CHUNK,
-    DEVICE,
-    OVERHEAD,
-    STX,
-    Stream,
-    Telegram,
+from lrfcal_lib.drivers.host import REAL
+from lrfcal_lib.drivers.lms2xx_link import (
+    CONFIGURATION,
+    CONFIGURE,
+    ERRORS,
+    MODE,
+    ON_REQUEST,
+    POINTS,
+    RATES,
+    STATUS,
+    TRIES,
+    TYPE,
+    VALUES,
+    VARIANT,
+    Assembler,
+    Link,
+    ScanClock,
+    ScanReader,
+)
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.session.lms2xx_codec import (
+    MODES,
+    SCAN,
+    UNITS,
     TelegramError,
-    alike,
-    check_crc,
-    crc16,
-    cut,
-    encode_telegram,
-    parse_telegram,
-    split_stream,
+    parse_configuration,
+    parse_errors,
+    parse_status,
+    parse_type,
 )
 
-__all__ = [
-    "MODES", "OVERHEAD", "REASONS", "STX", "UNITS", "Mode", "Scans", "Stream", "Telegram", "TelegramError",
-    "check_crc", "crc16", "decode_scan", "decode_scans", "decode_values", "encode_scan", "encode_telegram",
-    "encode_values", "encode_words", "parse_telegram", "scan_quarters", "split_stream", "value_reasons",
-]  # fmt: skip
-
-SCAN = 0xB0
-METRES = {"cm": 0.01, "mm": 0.001}
-UNITS = ("cm", "mm")
-
-REASONS = (
-    "valid", "not valid", "dazzled", "overflow", "noise", "channel error", "larger than maximum", "reserved",
-)  # fmt: skip
-BEYOND = REASONS.index("larger than maximum")
-# index: how far a value is below the largest one its bits can hold
-_REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
-_BELOW_TOP = {1: 0, 2: 1, 3: 2, 4: 4, 5: 5, BEYOND: 8}
+logger = logging.getLogger(__name__)
+INSTALLATION = b"\x00"  # data of MODE
+AGAIN_S = 0.1  # between looks for a port that vanished
+FIND_S = 6.0
+CONFIGURED = ("unit", "measuring_mode", "realtime_indices")
+COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
 
 
-@dataclass(frozen=True)
-class Mode:
-    """How a measuring mode shares the 16 bits of a value.
+class LMS2xxSetup:
+    """An LMS2xx that waits for requests; `LMS2xx` adds scans and streaming and is what programs use."""
+
+    def __init__(self, port, *, address=0, password=b"SICK_LMS", clock=None, log=logger, host=REAL):
+        self.port, self.type, self.firmware = port, "", ""
+        self.status = self.configuration = self.variant = None
+        self._address, self._password, self._host, self._log = address, bytes(password), host, log
+        self._clock = clock or host.time
+        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
+        self._link = self._assembler = self._settled = self._scan_clock = None
+
+    @classmethod
+    def open(
+        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=logger, host=REAL,
+        **configuration,
+    ):  # fmt: skip
+        """Find the device at a port whatever it is doing, stop its stream, and read what it is.
+
+        Parameters
+        ----------
+        port : str or Path
+        baudrate : int, optional
+            To switch to afterwards; the one found stays by default.
+        address : int
+            Of the device; 0 reaches any.
+        password : bytes
+            Eight characters, of the installation mode; the factory's by default.
+        find_s : float
+            Longest time to find the rate.
+        clock : callable, optional
+            Seconds, for the instants of scans; time.time() of the host by default.
+        log : logging.Logger
+        host : Host
+            Machine that the driver runs on; tests have a VirtualHost.
+        **configuration
+            Of :meth:`configure`.
+
+        Returns
+        -------
+        LMS2xx
+
+        Raises
+        ------
+        PortError
+            If the port is missing, forbidden, busy, or no serial line.
+        NoReply, WrongDevice
+            If nothing, or something else answers, or a device in a measuring mode without ranges.
+        ValueError
+            For a rate or an address that no LMS2xx has, or a password of another length.
+        """
+        if baudrate is not None:
+            _code_of(baudrate)
+        if not 0 <= address < 0x80 or len(password) != 8:
+            raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
+        device = cls(str(port), address=address, password=password, clock=clock, log=log, host=host)
+        try:
+            device._connect(baudrate or 38400, host.now() + find_s)
+            if baudrate is not None and baudrate != device.baudrate:
+                device._set_rate(baudrate)
+            device.configure(**configuration) if configuration else device._prepare()
+        except BaseException:
+            device._release()
+            raise
+        return device
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """Close the port."""
+        self._release()
+
+    @property
+    def baudrate(self):
+        """Of both ends of the line."""
+        return self._opened().baudrate
+
+    @property
+    def counts(self):
+        """How often what happened since `open`, a dict.
+
+        'telegrams': sound ones; 'crc_errors': damaged ones; 'resyncs': stray bytes skipped; 'dropped': scans that the
+        mirror made between two that came (needs real-time indices), most of them because the line is slow; 'stale':
+        scans that were not newer than the one before; 'reconnects'.
+        """
+        return dict(self._counts)
+
+    # ------------------------------------------------------------------------------------------------- connecting
+
+    def _connect(self, first, end, deadline=math.inf):
+        """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
+        options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted, "host": self._host}
+        self._link, self._scan_clock = Link(self.port, first, self._counts, **options), ScanClock()
+        self._link.deadline = deadline
+        self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
+        self._link.hush()
+        self._read_status()
+        self._link.senders = {0x80, 0x80 | self.status.address}
+        model, *rest = self._told(TYPE, parse_type)
+        if not model.startswith("LMS2"):
+            raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx")
+        self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
+        self._read_configuration()
+        told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
+        self._log.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
+
+    def _prepare(self, interlaced=False):
+        """Expect scans as the device is set now; these settings are those to come back to."""
+        if self.variant not in POINTS:
+            raise WrongDevice(f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does")
+        if (mode := self.configuration.measuring_mode) not in MODES:
+            text = f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are no ranges"
+            raise WrongDevice(f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set")
+        self._settled = (self.baudrate, self.variant, self.configuration)
+        told = self.variant, self.configuration, self.baudrate
+        self._assembler = Assembler(*told, interlaced, self._counts, self._scan_clock)
+
+    def _opened(self):
+        if self._link is None:
+            raise LineLost(f"{self.port} is closed: open it, or call reconnect()")
+        return self._link
+
+    def _ask(self, code, data=b"", **options):
+        return self._opened().ask(code, data, **options)
+
+    def _told(self, code, parse):
+        """What a reply says."""
+        raw = self._ask(code).raw
+        try:
+            return parse(raw)
+        except TelegramError as error:
+            text = f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
+            raise WrongDevice(text) from error
+
+    def _idle(self):
+        """To be overridden: raise where the device is not free for requests."""
+
+    def reconnect(self, deadline=10.0):
+        """Find the device again after the line was lost or the device restarted, and give it the same settings.
+
+        Parameters
+        ----------
+        deadline : float
+            Seconds.
+
+        Raises
+        ------
+        LineLost
+            If the port did not come back.
+        NoReply, WrongDevice, Refused
+            If the port did, but the device does not work as before.
+        """
+        self._idle()
+        self._mend(deadline)
+
+    def _mend(self, deadline):
+        end = self._host.now() + deadline
+        rate, variant, configuration = self._settled
+        self._release()
+        self._reopen(rate, end)
+        if self.variant != variant:
+            self._set_variant(variant)
+        if self.configuration.block != configuration.block:
+            self._write(configuration)
+        if self.baudrate != rate:
+            self._set_rate(rate)
+        self._prepare()
+        self._link.deadline = math.inf
+        self._counts["reconnects"] += 1
+        self._log.warning("%s: the device is back at %d Bd", self.port, rate)
+
+    def _reopen(self, rate, end):
+        """Wait for the port and connect."""
+        while True:
+            try:
+                return self._connect(rate, min(end, self._host.now() + FIND_S), end)
+            except (PortError, LineLost) as error:
+                self._release()
+                if self._interrupted.wait(AGAIN_S) or self._host.now() > end - AGAIN_S:
+                    raise LineLost(f"the line did not come back: {error}") from error
+
+    def _release(self):
+        """Close the port."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    # ------------------------------------------------------------------------------------------------- settings
+
+    def read_status(self):
+        """Read the status reply.
+
+        Returns
+        -------
+        DeviceStatus
+        """
+        self._idle()
+        return self._read_status()
+
+    def _read_status(self):
+        self.status = self._told(STATUS, parse_status)
+        self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
+        return self.status
+
+    def _read_configuration(self):
+        def parse(raw):
+            found = parse_configuration(raw)
+            _ = found.unit  # a unit that no manual lists is seen here
+            return found
+
+        self.configuration = self._told(CONFIGURATION, parse)
+
+    def read_errors(self):
+        """The list of errors: tuples of severity, whether it is over, number (manual, 10.11)."""
+        self._idle()
+        return self._told(ERRORS, parse_errors)
+
+    def set_baudrate(self, rate):
+        """Change the rate of both ends; flash is not written.
+
+        Parameters
+        ----------
+        rate : int
+            9600, 19200, 38400 or 500000.
+
+        Raises
+        ------
+        PortError
+            If the line of this machine cannot; nothing has changed.
+        Refused, NoReply
+            If the device declines, or does not come through at the new rate; the old one holds again.
+        """
+        _code_of(rate)
+        self._idle()
+        if rate != self.baudrate:
+            self._set_rate(rate)
+            self._prepare()
+
+    def _set_rate(self, rate):
+        old = self.baudrate
+        self._link.set_rate(rate)  # before the device is told: raises where this end cannot
+        self._link.set_rate(old)
+        self._mode(bytes([_code_of(rate)]), f"{rate} Bd")
+        self._link.set_rate(rate)
+        try:
+            self._ask(TYPE)
+        except (NoReply, Refused) as error:
+            self._link.find([old, *(r for r in RATES if r not in (old, rate)), rate], FIND_S)
+            need = "RS-422 (a jumper in the plug of the device)" if rate == 500000 else "a shorter cable"
+            text = f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; {self.baudrate} Bd now"
+            raise NoReply(text) from error
+
+    def _mode(self, data, what, sign=None):
+        """Change the operating mode; replies A0 other than 00 are refusals."""
+        reply = self._ask(MODE, data, sign=sign)
+        if reply.code != sign and reply.raw[5]:
+            raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
+
+    def set_variant(self, fov_deg, resolution_deg):
+        """Change field of view and resolution, only if they differ.
+
+        Parameters
+        ----------
+        fov_deg, resolution_deg : float
+            180 with 1 or 0.5; 100 with 1, 0.5 or 0.25.
+
+        Returns
+        -------
+        bool
+            Whether anything was changed.
+        """
+        self._idle()
+        wanted = (float(fov_deg), float(resolution_deg))
+        if wanted not in POINTS:
+            known = ", ".join(f"{fov:g}/{step:g}" for fov, step in POINTS)
+            raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
+        self._read_status()
+        differs = self.variant != wanted
+        if differs:
+            self._set_variant(wanted)
+            self._prepare()
+        return differs
+
+    def _set_variant(self, wanted):
+        words = b"".join(round(v).to_bytes(2, "little") for v in (wanted[0], 100 * wanted[1]))
+        try:
+            self._ask(VARIANT, words)
+        except NoReply as error:  # the reply may be lost and the variant set
+            self._log.warning("%s; reading the variant", error)
+        self._read_status()
+        if self.variant != wanted:
+            have = "{:g} deg in steps of {:g} deg".format(*self.variant)
+            raise Refused(f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}")
+
+    def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
+        """Change settings that are kept in flash (some thousand writes), only if they differ.
+
+        Parameters
+        ----------
+        unit : {'cm', 'mm'}, optional
+        measuring_mode : int, optional
+            Key of `lms2xx.MODES`; tells the largest range, too.
+        realtime_indices : bool, optional
+            Whether scans carry their indices; without them dropped and repeated scans cannot be seen.
+
+        Returns
+        -------
+        bool
+            Whether anything was written.
+
+        Raises
+        ------
+        Refused
+            For a wrong password, or values that the device declines.
+        ValueError
+            For values that no LMS2xx has.
+        """
+        self._idle()
+        if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
+            raise ValueError(f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}")
+        self._read_configuration()
+        options = {"unit": unit, "measuring_mode": measuring_mode, "realtime_indices": realtime_indices}
+        wanted = self.configuration.changed(**options)
+        differs = wanted.block != self.configuration.block
+        if differs:
+            self._write(wanted)
+        self._prepare()
+        return differs
+
+    def _write(self, wanted):
+        """Write a configuration in installation mode, and read it back."""
+        try:
+            self._mode(INSTALLATION + self._password, "the password of the installation mode")
+            self._ask(CONFIGURE, wanted.block)
+        except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
+            self._log.warning("%s; reading the configuration", error)
+        finally:
+            self._mode(ON_REQUEST, "to leave the installation mode")
+        self._read_configuration()
+        if self.configuration.block != wanted.block:
+            raise Refused(f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}")
+
+
+def _code_of(rate):
+    """Data of command 20 that sets a rate."""
+    if rate not in RATES:
+        raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {rate}")
+    return RATES[rate]
+
+
+REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
+STREAM, INTERLACED, ALL_VALUES = b"\x24", b"\x2a", b"\x01"
+
+
+class LMS2xx(LMS2xxSetup):
+    """An LMS2xx; made by :meth:`open`, a context manager.
+
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
+    `counts`, `stop` and `close` may be called.
 
     Attributes
     ----------
-    bits : int
-        Lower bits, the range.
-    flags : tuple of str
-        Names of the upper bits, lowest first; 'reflector' where they hold a level instead.
+    port : str
+    type : str
+        Model and order number.
+    firmware : str
+    status : DeviceStatus
+        As read last.
+    configuration : Configuration
+        As read last.
+    variant : tuple of float
+        Field of view and resolution, degrees.
     """
 
-    bits: int
-    flags: tuple[str, ...]
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self._reader, self._interlaced = None, False
 
-    @property
-    def top(self):
-        """Largest number the range bits hold: 'not valid'."""
-        return (1 << self.bits) - 1
+    def _idle(self):
+        if self._reader is not None:
+            raise DeviceError(f"{self.port}: the device streams; call stop() first")
 
-    @property
-    def largest(self):
-        """Largest number that is a range; the nine above are special."""
-        return self.top - 9
+    def close(self):
+        """Stop streaming, close the port; never raises for a device that is gone."""
+        try:
+            self.stop()
+        except DeviceError as error:
+            self._log.warning("%s: closed without the device's consent: %s", self.port, error)
+        finally:
+            self._release()
 
+    def request(self, timeout=None):
+        """One scan.
 
-MODES = {
-    0: Mode(13, ("field A", "field B", "dazzled")),
-    1: Mode(13, ("reflector",)),
-    2: Mode(13, ("field A", "field B", "field C")),
-    3: Mode(14, ("reflector",)),
-    4: Mode(14, ("field A", "field B")),
-    5: Mode(15, ("reflector",)),
-    6: Mode(15, ("field A",)),
-}
+        Parameters
+        ----------
+        timeout : float, optional
+            Seconds; what three tries need by default.
 
+        Returns
+        -------
+        Reading
+        """
+        self._idle()
+        end = self._host.now() + (self._patience() if timeout is None else timeout)
+        for _ in range(TRIES):
+            left = max(0.0, end - self._host.now())
+            arrival = self._ask(VALUES, ALL_VALUES, limit_s=left)
+            late = arrival.time_s - self._link.asked_s > REPLY_S + self._assembler.duration_s
+            reading = None if late else self._scan(arrival)  # nobody knows the instant of a scan that came late
+            if reading is not None:
+                return reading
+        raise NoReply(f"{self.port}: scans arrive, but too late, not new, or not of the variant {self.variant}")
 
-@dataclass(frozen=True)
-class Scans:
-    """Scans of the same number of values.
+    def _patience(self):
+        return TRIES * (0.5 + 2 * self._assembler.interval_s)
 
-    Attributes
-    ----------
-    rows : ndarray of int, shape (n,)
-        Which of the telegrams asked for these are.
-    words : ndarray of uint16, shape (n, B)
-        As sent, flags included.
-    ranges : ndarray, shape (n, B)
-        Metres; inf where the device says larger than its maximum, NaN for all other special values.
-    unit : {'cm', 'mm'}
-    mode : int
-    partial : ndarray of int, shape (n,)
-        Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
-    scan_index, telegram_index : ndarray of int, shape (n,)
-        Real-time indices, modulo 256; -1 where the device does not send them.
-    status : ndarray of uint8, shape (n,)
-    address : ndarray of uint8, shape (n,)
-    """
+    def _scan(self, arrival):
+        return self._assembler.feed(arrival.raw, arrival.time_s) if arrival.code == SCAN else None
 
-    rows: np.ndarray
-    words: np.ndarray
-    ranges: np.ndarray
-    unit: str
-    mode: int
-    partial: np.ndarray
-    scan_index: np.ndarray
-    telegram_index: np.ndarray
-    status: np.ndarray
-    address: np.ndarray
+    def start(self, interlaced=False):
+        """Stream: a thread reads every scan from now on.
 
-    @property
-    def reasons(self):
-        """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return value_reasons(self.words, self.mode)
+        Parameters
+        ----------
+        interlaced : bool
+            Merge partial scans to 180 deg in steps of 0.25 deg; the variant becomes 100/0.25, which such scans need.
+        """
+        self._idle()
+        self._interlaced = interlaced
+        if interlaced:
+            self.set_variant(100, 0.25)
+        self._stream()
+        interval_s = (4 if interlaced else 1) * self._assembler.interval_s
+        self._reader = ScanReader(self._receive, self._resume, self._clock, interval_s, self._log, self._host)
+        self._reader.start()
 
-    @property
-    def flags(self):
-        """Upper bits of every value, see `MODES`; ndarray of uint8, shape (n, B)."""
-        return (self.words >> MODES[self.mode].bits).astype(np.uint8)
+    def _stream(self):
+        self._prepare(self._interlaced)
+        self._mode(INTERLACED if self._interlaced else STREAM, "to stream", sign=SCAN)
 
+    def _receive(self):
+        return [(one.code, self._scan(one)) for one in self._opened().receive()]
 
-def mode_of(number):
-    """The measuring mode of a number.
+    def _resume(self, seconds):
+        self._mend(seconds)
+        self._stream()
 
-    Raises
-    ------
-    ValueError
-        For modes that send no range with special values.
-    """
-    if number not in MODES:
-        raise ValueError(f"measuring mode {number:#04x} is none of 0x00 to 0x06: set one of those (command 77)")
-    return MODES[number]
+    def newest(self, after=None, timeout=2.0):
+        """The newest scan of the stream.
 
+        Parameters
+        ----------
+        after : float, optional
+            Only a scan whose first beam is later, by the host's clock. By default one that was not handed out
+            before and is not older than the stream needs.
+        timeout : float
 
-def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
-    """Values of a scan as a device sends them.
+        Returns
+        -------
+        Reading
 
-    Parameters
-    ----------
-    ranges : array_like
-        Metres, rounded to the unit. Whatever is larger than the mode can hold, inf included, becomes 'larger than
-        maximum'; NaN becomes 'not valid'.
-    unit : {'cm', 'mm'}
-    mode : int
-        Measuring mode, 0 to 6.
-    reasons : array_like of int, optional
-        Index into `REASONS` for each value; where it is not 0 the range does not count.
-    flags : array_like of int
-        The upper bits.
+        Raises
+        ------
+        NoReply
+            If there is none in time; the message tells what is wrong with the stream.
+        """
+        return self._streaming().newest(after, timeout)
 
-    Returns
-    -------
-    ndarray of uint16
-        In the shape of `ranges`.
+    def take(self, count, after=None, timeout=None):
+        """Consecutive scans of the stream.
 
-    Raises
-    ------
-    ValueError
-        For negative ranges, flags that the mode has no bits for, an unknown unit, mode or reason.
-    """
-    ranges, mode, flags = np.asarray(ranges, float), mode_of(mode), np.asarray(flags)
-    if np.any(ranges < 0):
-        raise ValueError(f"a range is {np.nanmin(ranges):g} m: ranges are positive, use NaN for no return")
-    if np.any(flags < 0) or np.any(flags >> (16 - mode.bits)):
-        raise ValueError(f"flags must be 0 to {(1 << (16 - mode.bits)) - 1} in this mode, got up to {flags.max()}")
-    counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[_unit(unit)])
-    words = np.where(counts > mode.largest, mode.top - _BELOW_TOP[BEYOND], counts).astype(np.uint16)
-    words = np.where(np.isnan(ranges), np.uint16(mode.top), words)
-    reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons)
-    if unknown := set(np.unique(reasons).tolist()) - {0, *_BELOW_TOP}:
-        raise ValueError(f"reasons are 1 to {BEYOND}, 0 for a range, got {sorted(unknown)}")
-    for reason, below in _BELOW_TOP.items():
-        words = np.where(reasons == reason, np.uint16(mode.top - below), words)
-    return words | (flags.astype(np.uint16) << np.uint16(mode.bits))
+        Parameters
+        ----------
+        count : int
+        after : float, optional
+            Instant that all must be later than; the call by default. The last 256 scans are kept, so that with the
+            instant of the last scan of one call the next call goes on without a gap.
+        timeout : float, optional
+            For all of them; what the line needs and 2 s by default.
 
+        Returns
+        -------
+        list of Reading
+        """
+        reader, after = self._streaming(), self._clock() if after is None else after
+        limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout
+        end, found = self._host.now() + limit, []
+        while len(found) < count:
+            found.append(reader.next(after, max(0.0, end - self._host.now())))
+            after = found[-1].time_s
+        return found
 
-def _unit(unit):
-    if unit not in METRES:
-        raise ValueError(f"unit is one of {', '.join(METRES)}, got {unit!r}")
-    return unit
+    def _streaming(self):
+        if self._reader is None:
+            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
+        return self._reader
 
-
-def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE):
-    """Telegram 0xB0 of values that are encoded already.
-
-    Parameters
-    ----------
-    words : array_like of uint16, shape (B,)
-    unit : {'cm', 'mm'}
-    partial : int
-        0 to 3 for the quarters of a degree of an interlaced scan, -1 for a whole scan.
-    indices : tuple of int, optional
-        Real-time indices: scan and telegram, modulo 256.
-    status, address : int
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ValueError
-        For more values or another partial scan than a telegram can state.
-    """
-    words = np.asarray(words)
-    if np.any(words < 0) or np.any(words > 0xFFFF):
-        raise ValueError(f"values are 16 bits, 0 to 65535, got {words.min()} to {words.max()}")
-    if words.ndim != 1 or len(words) > 401:
-        raise ValueError(f"a scan has up to 401 values in one row, got shape {words.shape}")
-    if partial not in (-1, 0, 1, 2, 3):
-        raise ValueError(f"partial is 0 to 3, or -1 for a whole scan, got {partial}")
-    count = len(words) | UNITS.index(_unit(unit)) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
-    tail = b"" if indices is None else bytes(i % 256 for i in indices)
-    data = count.to_bytes(2, "little") + words.astype("<u2").tobytes() + tail
-    return encode_telegram(SCAN, data, status=status, address=address)
-
-
-def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, flags=0, **options):
-    """Telegram 0xB0 of a scan: :func:`encode_values`, then :func:`encode_words` with the other options.
-
-    Examples
-    --------
-    >>> encode_scan([4.0, np.inf, np.nan], unit="cm").hex(" ")
-    '02 80 0a 00 b0 03 00 90 01 f7 1f ff 1f 10 a2 f5'
-    """
-    return encode_words(encode_values(ranges, unit=unit, mode=mode, reasons=reasons, flags=flags), unit=unit, **options)
-
-
-def decode_scan(raw, mode=0):
-    """One scan out of the telegram 0xB0.
-
-    Parameters
-    ----------
-    raw : bytes-like
-        The whole telegram.
-    mode : int
-        Measuring mode, which the telegram does not tell; 0 is the factory's.
-
-    Returns
-    -------
-    Scans
-        With one row.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another telegram, or its number of values does not fit its length.
-    """
-    telegram = parse_telegram(raw)
-    if telegram.code != SCAN:
-        raise TelegramError(f"code {telegram.code:02X} is no scan (B0)")
-    found = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
-    if not found:
-        raise TelegramError(f"{len(raw)} bytes do not fit the number of values {telegram.data[:2].hex(' ') or 'none'}")
-    return found[0]
-
-
-def decode_scans(data, offset, length, mode=0):
-    """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
-
-    Parameters
-    ----------
-    data : bytes-like
-    offset, length : ndarray of int, shape (n,)
-        As of :func:`split_stream`.
-    mode : int
-        Measuring mode.
-
-    Returns
-    -------
-    list of Scans
-        One for each number of values, unit, and kind (whole or partial, with or without indices). Telegrams with
-        another code, or with a length that does not fit the number of values, are in none of them.
-    """
-    mode_of(mode)
-    data, length = np.frombuffer(data, np.uint8), np.asarray(length)
-    rows = np.flatnonzero(length >= 10)
-    rows = rows[data[offset[rows] + 4] == SCAN]
-    at = offset[rows]
-    word = data[at + 5] | (data[at + 6].astype(int) << 8)
-    extra = length[rows] - 10 - 2 * (word & 0x3FF)
-    sound = ((extra == 0) | (extra == 2)) & (word < 1 << 15)
-    rows, word, extra = rows[sound], word[sound], extra[sound]
-    groups = alike(word & 0xE3FF, extra)
-    return [_decode_alike(data, offset, rows[g], word[g], bool(extra[g[0]]), mode) for g in groups]
-
-
-def _decode_alike(data, offset, rows, word, indexed, mode):
-    values, unit = int(word[0] & 0x3FF), UNITS[word[0] >> 14]
-    words, ranges = np.empty((len(rows), values), np.uint16), np.empty((len(rows), values))
-    for first in range(0, len(rows), CHUNK):
-        some = slice(first, first + CHUNK)
-        words[some] = cut(data, offset[rows[some]] + 7, 2 * values).view("<u2")
-        ranges[some] = decode_values(words[some], unit=unit, mode=mode)
-    last = offset[rows] + 7 + 2 * values + 2 * indexed
-    scan, telegram = (data[last - k].astype(int) if indexed else np.full(len(rows), -1) for k in (2, 1))
-    partial = np.where(word >> 13 & 1, word >> 11 & 3, -1)
-    return Scans(rows, words, ranges, unit, mode, partial, scan, telegram, data[last], data[offset[rows] + 1])
-
-
-def decode_values(words, *, unit="mm", mode=0):
-    """Ranges of values as a device sends them.
-
-    Parameters
-    ----------
-    words : ndarray of uint16
-    unit : {'cm', 'mm'}
-    mode : int
-
-    Returns
-    -------
-    ndarray
-        Metres; inf where larger than maximum, NaN for all other special values.
-    """
-    mode = mode_of(mode)
-    counts = words & np.uint16(mode.top)
-    ranges = counts * METRES[_unit(unit)]
-    special = np.nonzero(counts > mode.largest)  # few, so they are looked up one by one
-    ranges[special] = np.where(_REASON_BELOW_TOP[mode.top - counts[special]] == BEYOND, np.inf, np.nan)
-    return ranges
-
-
-def value_reasons(words, mode=0):
-    """Why values are no ranges.
-
-    Parameters
-    ----------
-    words : ndarray of uint16
-    mode : int
-
-    Returns
-    -------
-    ndarray of uint8
-        Index into `REASONS`; 0 for a range.
-    """
-    mode = mode_of(mode)
-    counts = words & np.uint16(mode.top)
-    reasons = np.zeros(counts.shape, np.uint8)
-    special = np.nonzero(counts > mode.largest)
-    reasons[special] = _REASON_BELOW_TOP[mode.top - counts[special]]
-    return reasons
-
-
-# values of a whole scan -> first bearing and step in quarters of a degree
-_GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
-
-
-def scan_quarters(values, partial=-1):
-    """Bearings of the values of a scan, in quarters of a degree.
-
-    Parameters
-    ----------
-    values : int
-        How many there are; tells the variant (angle and resolution) of the device.
-    partial : int
-        -1 for a whole scan.
-
-    Returns
-    -------
-    ndarray of int, shape (values,)
-        0 at the right, 360 ahead; ascending. The 100 deg variants begin at 40 deg.
-
-    Raises
-    ------
-    TelegramError
-        If no variant sends that many values.
-    """
-    if partial >= 0:
-        if values != 181 - (partial > 0):
-            raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
-        return 4 * np.arange(values) + partial
-    if values not in _GRIDS:
-        known = ", ".join(map(str, sorted(_GRIDS)))
-        raise TelegramError(f"a whole scan has {known} values, got {values}: only a sub-range was asked for?")
-    first, step = _GRIDS[values]
-    return first + step * np.arange(values)
+    def stop(self):
+        """Stop streaming; nothing happens where the device does not."""
+        if self._reader is None:
+            return
+        self._interrupted.set()
+        self._reader.quit()
+        self._reader = None
+        self._interrupted.clear()
+        if self._link is None:
+            raise LineLost(f"{self.port}: the line is lost; the device may still stream")
+        self._link.stop()
+        self._prepare()

@@ -1,4 +1,4 @@
-"""A rig: its devices opened together, and what they record while the board stays where it is, as a stream of events."""
+"""What happens while a rig records, one event after the other."""
 
 from __future__ import annotations
 
@@ -6,19 +6,101 @@ import contextlib
 import logging
 import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.drivers.control import ask
-from lrfcal_lib.drivers.errors import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.lms2xx import METRES, mode_of
-from lrfcal_lib.drivers.lms2xx_replies import encode_configuration
-from lrfcal_lib.drivers.rig_events import Moved, Photographed, Scanned, Tracked
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, ask
 from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of
 
-__all__ = ["Moved", "Photographed", "Rig", "Scanned", "Tracked"]
+
+@dataclass(frozen=True)
+class Moved:
+    """The head rests at a stop.
+
+    Attributes
+    ----------
+    placement : int
+    time_s : float
+        Host clock; what is recorded at this stop is later.
+    commanded, pitch : float
+        Radians.
+    measured : bool
+        False where the head does not tell its pitch: dead reckoning.
+    number, of : int
+        This stop and how many there are.
+    """
+
+    placement: int
+    time_s: float
+    commanded: float
+    pitch: float
+    measured: bool
+    number: int
+    of: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scanned:
+    """Scans, each with its pitch.
+
+    Attributes
+    ----------
+    placement : int
+    readings : tuple of Reading
+    pitch : ndarray, shape (len(readings),)
+        Radians.
+    share : float
+        Of a continuous sweep that is done, 0 to 1; NaN at a stop.
+    """
+
+    placement: int
+    readings: tuple
+    pitch: np.ndarray
+    share: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """An image.
+
+    Attributes
+    ----------
+    placement : int
+        -1 for the board held close.
+    camera : str
+    frame : Frame
+    pitch : float
+        Radians.
+    purpose : {'board', 'scene', 'intrinsics'}
+    """
+
+    placement: int
+    camera: str
+    frame: object
+    pitch: float
+    purpose: str
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The pitch over a continuous sweep.
+
+    Attributes
+    ----------
+    placement : int
+    commanded : float
+        Where the sweep was sent, radians.
+    track : tuple of (float, float, bool)
+        Host time, pitch in radians, measured.
+    """
+
+    placement: int
+    commanded: float
+    track: tuple
+
 
 LOG = logging.getLogger(__name__)
 SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
@@ -358,14 +440,13 @@ def _named(device, opener, *arguments, **options):
 
 
 def _open_head(stated, **options):
-    from lrfcal_lib.drivers.pan_tilt import PanTilt
+    from lrfcal_lib.drivers.head import PanTilt
 
     return PanTilt.open(stated.head_device, stated.head_settings, **options)
 
 
 def _open_lrf(stated, **given):
-    from lrfcal_lib.drivers.lms2xx_device import LMS2xx
-    from lrfcal_lib.drivers.lms2xx_setup import CONFIGURED
+    from lrfcal_lib.drivers.lms2xx import CONFIGURED, LMS2xx
 
     asked = stated.lrf_device
     options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.board import Board
-from lrfcal_lib.drivers.head_settings import ANGLE, HEAD, HeadSettings
+from lrfcal_lib.drivers.head import ANGLE, HEAD, HeadSettings
 from lrfcal_lib.drivers.stated import FLAG, OBJECT, TEXT, Kind, check, either, listed, need, number, one_of, whole
-from lrfcal_lib.session import CameraInfo, LrfInfo
-from lrfcal_lib.session.stated import parse_session
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, parse_session
 
 MODES = ("stop-and-go", "continuous")
 PURPOSES = ("board", "scene")

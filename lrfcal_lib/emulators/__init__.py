@@ -3,12 +3,6 @@
 With ``Clock(machine=VirtualHost())`` a device lives in virtual time instead, for tests of drivers (`drivers.host`).
 """
 
-from lrfcal_lib.emulators.head import EmulatedHead, Head
-from lrfcal_lib.emulators.line import FAULTS, Clock, Faults
-from lrfcal_lib.emulators.lms2xx import EmulatedLms, ScanRecord, SyntheticSource
-
-__all__ = ["FAULTS", "Clock", "EmulatedHead", "EmulatedLms", "EmulatedRig", "Faults", "Head", "ScanRecord",
-           "SyntheticSource"]  # fmt: skip
 
 
 def __getattr__(name):

@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.errors import PortError
 from lrfcal_lib.drivers.host import REAL, VirtualHost
+from lrfcal_lib.drivers.port import PortError
 
 RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CHUNK_S = 0.005  # bytes that are due within this time are written at once
@@ -66,9 +66,6 @@ class Clock:
     def device(self, time_s):
         """Inverse of :meth:`host`."""
         return (np.asarray(time_s) - self._host_zero) * self.scale
-
-
-# ------------------------------------------------------------------------------------------------------ faults
 
 
 class Fault(NamedTuple):
@@ -226,9 +223,6 @@ class Faults:
         if name not in FAULTS or self.device not in FAULTS[name].devices:
             known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
             raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
-
-
-# ------------------------------------------------------------------------------------------------------ the device
 
 
 def resample(data, sent, read):

@@ -10,9 +10,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx import (
+from lrfcal_lib.emulators.line import Clock, SerialDevice
+from lrfcal_lib.session.lms2xx_codec import (
+    BAUD,
+    CONFIGURATION_BYTES,
     MODES,
     UNITS,
+    Configuration,
     TelegramError,
     crc16,
     encode_telegram,
@@ -22,8 +26,6 @@ from lrfcal_lib.drivers.lms2xx import (
     scan_quarters,
     split_stream,
 )
-from lrfcal_lib.drivers.lms2xx_replies import BAUD, CONFIGURATION_BYTES, Configuration
-from lrfcal_lib.emulators.line import Clock, SerialDevice
 
 LOG = logging.getLogger(__name__)
 ACK, NAK = b"\x06", b"\x15"

@@ -26,8 +26,16 @@ from lrfcal_lib.emulators.head import FEEDBACK, REPLIES, EmulatedHead
 from lrfcal_lib.emulators.line import FAULTS, Clock
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
-from lrfcal_lib.session import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
-from lrfcal_lib.session.stated import SCHEMA, camera_to_json, lrf_to_json
+from lrfcal_lib.session.stated import (
+    SCHEMA,
+    CameraInfo,
+    LrfInfo,
+    board_to_json,
+    camera_to_json,
+    lrf_to_json,
+    model_to_json,
+    transform_to_json,
+)
 from lrfcal_lib.simulate.beam import LARGEST_WORD
 from lrfcal_lib.simulate.rig import PLACES, SETUPS, pairs, random, sim_quick
 
@@ -230,9 +238,6 @@ def _lrf_info(beam):
     )  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------------------------ control
-
-
 def _faults_of(rig, device):
     if device not in rig.faults:
         raise ValueError(f"no device '{device}'; there are {', '.join(rig.faults)}")
@@ -315,9 +320,6 @@ class _Obedient(socketserver.StreamRequestHandler):
                 self.wfile.write(json.dumps(answer).encode() + b"\n")
 
 
-# ------------------------------------------------------------------------------------------------------ practice
-
-
 def practice_setup():
     """A rig and placements that are recorded in a minute: coarse sweeps, small images, intrinsics stated.
 
@@ -372,9 +374,6 @@ def quick_file(rig):
     for camera in rig.setup.rig.cameras:
         data["rig"]["cameras"][camera.name]["intrinsics"] = model_to_json(camera.model)
     return data
-
-
-# ------------------------------------------------------------------------------------------------------ command line
 
 
 def parser():

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.session import board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.stated import board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import VIEWS, world_of
 from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
@@ -161,9 +161,6 @@ class EmulatedWorld:
             "place": list(self.place.key),
             "pitch_deg": math.degrees(float(self.head.pitch(self.clock.now()))),
         }
-
-
-# ------------------------------------------------------------------------------------------------------ cameras
 
 
 def scaled(rig, width):

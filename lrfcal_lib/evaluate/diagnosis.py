@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.geometry import lrf_to_source
-from lrfcal_lib.pairing import platform_of, rough_poses
+from lrfcal_lib.calibrate.observe import platform_of, rough_poses
+from lrfcal_lib.model.geometry import lrf_to_source
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.steadiness import camera_steadiness
 
@@ -44,7 +44,7 @@ def diagnose(prepared, pitch_errors=None):
     ----------
     prepared : Prepared
     pitch_errors : PitchErrors, optional
-        Of :func:`lrfcal_lib.pipeline.find_pitch_errors`.
+        Of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
 
     Returns
     -------

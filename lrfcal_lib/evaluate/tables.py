@@ -1,20 +1,141 @@
-"""Tables that judge a calibration: residuals, left-out placements, stereo check, edge lengths."""
+"""Tables that judge a calibration, and the truth of simulated sessions."""
 
 from __future__ import annotations
+
+import os
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
-from lrfcal_lib.fused_outline import fused_outline_of
-from lrfcal_lib.geometry import DegenerateGeometry, paper_parameters, transform_difference
-from lrfcal_lib.joint_calibration import left_out_residuals as jointly_left_out
-from lrfcal_lib.pairing import likely_outline_of, outline_of
-from lrfcal_lib.prepared import VARIANTS
+from lrfcal_lib.calibrate.observe import likely_outline_of, outline_of
+from lrfcal_lib.calibrate.outline import fused_outline_of
+from lrfcal_lib.calibrate.pipeline import left_out_residuals as jointly_left_out
+from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    axis_difference,
+    axis_of,
+    lrf_to_platform,
+    paper_parameters,
+    transform_difference,
+)
+from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
 from lrfcal_lib.solvers import METHODS
-from lrfcal_lib.solvers.camera import edge_residuals_px, plane_residuals_m
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulated session was made with.
+
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+    cameras : dict of str to RigidTransform
+        ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base.
+    board : Board
+    boards : dict of int to RigidTransform
+        ``T_platform_board`` by placement.
+    pitch : dict of int to ndarray, shape (n_scan_lines,)
+        Of every scan line, radians.
+    """
+
+    T_head_lrf: RigidTransform
+    cameras: dict
+    board: Board
+    boards: dict
+    pitch: dict
+
+
+def read_truth(session):
+    """The truth of a session, None for a recording.
+
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    Truth or None
+
+    Raises
+    ------
+    SessionError
+        If ``truth.json`` is damaged.
+    """
+    file = session.path / "truth.json"
+    if not os.path.lexists(file):
+        return None
+    data = read_json(file, session.path)
+    with naming(f"{file} (simulate the session again)"):
+        return Truth(
+            transform_from_json(data["T_head_lrf"]),
+            {name: _camera(entry) for name, entry in data["cameras"].items()},
+            board_from_json(data["board"]),
+            {int(n): transform_from_json(entry["T_platform_board"]) for n, entry in data["boards"].items()},
+            {int(n): np.asarray(entry["pitch_rad"], float) for n, entry in data["sweeps"].items()},
+        )
+
+
+def _camera(entry):
+    return transform_from_json(entry["T_camera_lrf"] if "T_camera_lrf" in entry else entry["T_camera_platform"])
+
+
+def camera_errors(solution, truth, camera):
+    """Rotation (degrees) and translation error (millimetres) of a camera, NaN without truth."""
+    if truth is None:
+        return {}
+    angle, distance = transform_difference(solution.transform, truth.cameras[camera])
+    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+
+
+def axis_errors(T_head_lrf, truth):
+    """Direction (degrees) and offset error (millimetres) of a tilt axis, NaN without truth."""
+    if truth is None:
+        return np.nan, np.nan
+    angle, offset = axis_difference(axis_of(T_head_lrf), axis_of(truth.T_head_lrf))
+    return np.rad2deg(angle), 1000 * offset
+
+
+def edge_point_table(prepared, truth):
+    """Bias of each rule for the edge point against the true edge, across the edge within the board's plane.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    truth : Truth
+
+    Returns
+    -------
+    DataFrame
+        variant, edge, n, bias_mm (positive outside the board), sd_mm.
+    """
+    rows = []
+    for variant in VARIANTS:
+        misses = {edge: [] for edge in truth.board.edges}
+        for placement, names in prepared.names.items():
+            found = prepared.edges[variant][placement]
+            for side, edge in names.items():
+                misses[edge].append(_miss(found, found.side == side, edge, truth, placement))
+        for edge, parts in misses.items():
+            miss = 1000 * np.concatenate([*parts, np.zeros(0)])
+            bias, spread = (miss.mean(), miss.std(ddof=1)) if len(miss) > 1 else (np.nan, np.nan)
+            rows.append((variant, edge, len(miss), bias, spread))
+    return pd.DataFrame(rows, columns=["variant", "edge", "n", "bias_mm", "sd_mm"])
+
+
+def _miss(found, rows, edge, truth, placement):
+    """Signed distances of edge points from the true edge, metres."""
+    pitch = truth.pitch[placement][found.line[rows]]
+    p_platform = lrf_to_platform(found.points[rows], pitch, truth.T_head_lrf)
+    p_board = truth.boards[placement].inv().apply(p_platform)
+    line = truth.board.lines()[truth.board.edges.index(edge)]
+    return p_board[:, :2] @ line[:2] + line[2]
+
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
@@ -164,7 +285,7 @@ def method_comparison(observations, solutions, left_out=True, truth=None, joint=
     truth : Truth, optional
         Of a simulated session.
     joint : JointCalibration, optional
-        With its estimates without each placement (:func:`lrfcal_lib.joint_calibration.leave_out`): the left-out
+        With its estimates without each placement (:func:`lrfcal_lib.calibrate.pipeline.leave_out`): the left-out
         columns of the method 'joint'. It is judged on the same beams, with its own platform and range offset.
 
     Returns

@@ -1,1 +1,1 @@
-"""From raw scans and images to the edges and planes the solvers work on."""
+"""From sweeps and images to boards, edges, views and intrinsics."""

@@ -15,10 +15,9 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import f as f_distribution
 
-from lrfcal_lib.camera import project, project_jacobians
-from lrfcal_lib.geometry import lrf_to_platform
-from lrfcal_lib.preprocess.board_scan import face_points
-from lrfcal_lib.preprocess.segment import plane_axes
+from lrfcal_lib.model.camera import project, project_jacobians
+from lrfcal_lib.model.geometry import lrf_to_platform
+from lrfcal_lib.preprocess.board_in_scan import face_points, plane_axes
 
 MOST_POINTS = 12000  # a placement; more of them only cost time, since parts of the board count
 MARGIN = 0.02  # of a scan line and of a column, left out at either end: mixed pixels

@@ -1,17 +1,256 @@
-"""session.json: what is stated about the rig, the board and the recording; units are part of the keys."""
+"""session.json and how files of a session are opened: within its folder, bounded, by one writer at a time."""
 
 from __future__ import annotations
 
+import csv
+import fcntl
+import html
+import json
 import math
+import os
 import re
+import socket
+import stat
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard
-from lrfcal_lib.camera import CameraModel
-from lrfcal_lib.session.common import short
+from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.camera import CameraModel
+
+
+def escape(text):
+    """Anything as HTML that shows it as text; all that becomes HTML comes through here, see also the report's template.
+
+    Parameters
+    ----------
+    text : object
+        Names and remarks of a session may be somebody else's.
+
+    Returns
+    -------
+    str
+        Without tags and entities, and without formulas: MathJax, which searches pages for them, finds no pair of
+        signs in one piece of text.
+    """
+    return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
+
+
+LARGEST_FILE = 64_000_000  # bytes of any file of a session
+SPLIT = "split the recording into several sessions"
+LOCK = "writer.lock"
+FILES = (  # of any session, besides its images
+    "session.json", "lrf/scans.npz", "lrf/telegrams.bin", "lrf/index.csv", "images.csv", "edges.csv", "platform.csv",
+    "truth.json",
+)  # fmt: skip
+KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "b": "a device", "c": "a device"}
+
+
+class SessionError(ValueError):
+    """A session on disk that cannot be used: the message names the file, the value and what to do about it."""
+
+    def __init__(self, text):
+        super().__init__(text if len(text) < 2000 else f"{text[:1000]} [...] {text[-500:]}")
+
+
+@contextmanager
+def folder(file, within, make=False):
+    """Descriptor of the folder that holds a file of a session, reached without following a link."""
+    where, handle = Path(within), os.open(within, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        for part in Path(file).relative_to(within).parts[:-1]:
+            where /= part
+            if make:
+                with suppress(FileExistsError):
+                    os.mkdir(part, dir_fd=handle)
+            _refuse_other(where, os.stat(part, dir_fd=handle, follow_symlinks=False), "d", "a folder")
+            outer, handle = handle, os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=handle)
+            os.close(outer)
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def listed(path, within):
+    """Names in a folder of a session."""
+    with folder(Path(path) / "any", within) as handle:
+        return sorted(os.listdir(handle))
+
+
+def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
+    """Binary stream of a file in a session.
+
+    Parameters
+    ----------
+    file : path-like
+    within : path-like, optional
+        The session's folder; without, the file is somebody else's, who may have links to it.
+    flags : int
+        Of ``os.open``; any but O_RDONLY writes.
+    most : int
+        Bytes that are read.
+
+    Returns
+    -------
+    file object
+
+    Raises
+    ------
+    SessionError
+        If the file, or a folder between it and the session's, is a link, or the file is none (a pipe, a device) or too
+        large to be read.
+    OSError
+        If it cannot be opened.
+    """
+    file = Path(file).resolve() if within is None else Path(file)
+    with folder(file, within or file.parent) as handle:
+        with suppress(FileNotFoundError):  # a device is not even opened
+            _refuse_other(file, os.stat(file.name, dir_fd=handle, follow_symlinks=False), "-", "a file")
+        inner = os.open(file.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666, dir_fd=handle)
+    stream = os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
+    try:
+        status = os.fstat(inner)
+        _refuse_other(file, status, "-", "a file")
+        if flags == os.O_RDONLY and status.st_size > most:
+            raise SessionError(f"{file}: {status.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _refuse_other(file, status, kind, wanted):
+    """Refuse what is no plain file (or folder), such as a link."""
+    found = stat.filemode(status.st_mode)[0]
+    if found != kind:
+        what = KINDS.get(found, "a file")
+        raise SessionError(f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its place")
+
+
+@contextmanager
+def alone(path):
+    """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
+    with _locked(Path(path)) as stream:
+        stream.truncate()
+        stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
+        stream.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError), folder(Path(path) / LOCK, path) as handle:  # gone with its session?
+                os.unlink(LOCK, dir_fd=handle)
+
+
+def _locked(path):
+    """The lock file, locked; who removes one holds its lock, so one that was removed meanwhile is opened anew."""
+    while True:
+        stream = opened(path / LOCK, path, os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with stream:
+                holder = stream.read(200).decode(errors="replace") or "another process"
+            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+        except BaseException:
+            stream.close()
+            raise
+        if os.fstat(stream.fileno()).st_nlink:
+            return stream
+        stream.close()
+
+
+MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
+LARGEST_TEXT, DEEPEST_JSON, MOST_ROWS = 8_000_000, 30, 200_000  # bytes of a JSON or CSV file, levels
+
+
+@contextmanager
+def reading(file, remedy):
+    """Turn whatever other people's code says about the content of a file into a SessionError.
+
+    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to show its mistakes.
+    """
+    try:
+        yield
+    except SessionError:
+        raise
+    except Exception as error:
+        raise SessionError(f"{file}: {remedy.format(str(error) or type(error).__name__)}") from error
+
+
+@contextmanager
+def naming(file):
+    """Turn whatever goes wrong with values of a file into a SessionError that begins with the file's name."""
+    try:
+        yield
+    except SessionError:
+        raise
+    except KeyError as error:
+        raise SessionError(f"{file}: key {error} is missing") from error
+    except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise SessionError(f"{file}: {error}") from error
+
+
+def read_bytes(file, within=None, most=LARGEST_FILE):
+    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
+    try:
+        with opened(file, within, most=most) as stream:
+            return stream.read()
+    except OSError as error:
+        raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
+
+
+def read_json(file, within):
+    """The object in a JSON file."""
+    text = read_bytes(file, within, LARGEST_TEXT)
+    with reading(file, "not JSON ({}); truncated, or edited by hand?"):
+        data = json.loads(text.decode())
+    if not isinstance(data, dict):
+        raise SessionError(f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'")
+    inner = [data]
+    for _ in range(DEEPEST_JSON):
+        inner = [v for x in inner if isinstance(x, dict | list) for v in (x.values() if isinstance(x, dict) else x)]
+    if inner:
+        raise SessionError(f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?")
+    return data
+
+
+def read_table(file, columns, within, torn=False):
+    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly `columns`.
+
+    With `torn`, a last row without its line end (cut off by a crash) is left out.
+    """
+    data = read_bytes(file, within, LARGEST_TEXT)
+    with reading(file, "not a CSV file in UTF-8 ({})"):
+        text = data.decode()
+        cut = torn and not text.endswith("\n")
+        lines = (text.rpartition("\n")[0] if cut else text).splitlines()
+        if len(lines) > MOST_ROWS:
+            raise SessionError(f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}")
+        rows = list(csv.reader(lines))
+    if not rows or tuple(rows[0]) != columns:
+        got = ", ".join(rows[0]) if rows else "an empty file"
+        raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(columns):
+            raise SessionError(f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?")
+    return [dict(zip(columns, row, strict=True)) for row in rows[1:]], cut
+
+
+def check_amount(values):
+    """Refuse more ranges and other values of scan lines than reading has memory for."""
+    if values > MOST_VALUES:
+        raise ValueError(f"{values} values of scan lines, more than {MOST_VALUES}; {SPLIT}")
+
+
+def short(values):
+    """Values as text for a message, the middle of long lists left out."""
+    values = [str(v) for v in values]
+    return ", ".join(values if len(values) < 13 else [*values[:6], "...", *values[-3:]]) or "none"
+
 
 SCHEMA = "lrfcal-session/1"
 MOUNTS = ("head", "platform")

@@ -8,10 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx import OVERHEAD, REASONS, STX, TelegramError, check_crc, decode_scans, scan_quarters
-from lrfcal_lib.drivers.lms2xx_replies import CONFIGURATION, CONFIGURED, STATUS, parse_configuration, parse_status
-from lrfcal_lib.session.common import SessionError, check_amount, naming, read_bytes, read_table, short
-from lrfcal_lib.session.opened import LARGEST_FILE
+from lrfcal_lib.session.lms2xx_codec import (
+    CONFIGURATION,
+    CONFIGURED,
+    OVERHEAD,
+    REASONS,
+    STATUS,
+    STX,
+    TelegramError,
+    check_crc,
+    decode_scans,
+    parse_configuration,
+    parse_status,
+    scan_quarters,
+)
+from lrfcal_lib.session.stated import LARGEST_FILE, SessionError, check_amount, naming, read_bytes, read_table, short
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
@@ -34,7 +45,7 @@ class TelegramLog:
     outcome : ndarray of uint8, shape (n,)
         Index into `OUTCOMES`; 'other' is every sound telegram that holds no whole or partial scan.
     values : ndarray of int, shape (n, len(REASONS))
-        How many values of a scan had each reason, see ``lrfcal_lib.drivers.lms2xx.REASONS``.
+        How many values of a scan had each reason, see ``lrfcal_lib.session.lms2xx_codec.REASONS``.
     problems : tuple of str
     """
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.geometry import tilt
+from lrfcal_lib.model.geometry import tilt
 
 MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
 NOT_VALID, DAZZLED, WEAK, TOO_FAR = 8191, 8190, 8187, 8183  # 13-bit words that are no ranges (listing, 10.8)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard, triangle_board
-from lrfcal_lib.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.geometry import polar_to_points, tilt
+from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
+from lrfcal_lib.model.geometry import polar_to_points, tilt
 
 CORNERS = np.array([[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7])
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # axes of a camera, or a board, ahead of the LRF
@@ -112,7 +112,7 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0, reach=2):
     Returns
     -------
     dict
-        Keyword arguments of :class:`lrfcal_lib.solvers.joint_observations.JointObservations`.
+        Keyword arguments of :class:`lrfcal_lib.model.observations.JointObservations`.
     """
     parts, out, count = [], {}, len(poses)
     for pose in poses:

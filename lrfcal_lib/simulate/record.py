@@ -18,17 +18,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.drivers.lms2xx import encode_words
-from lrfcal_lib.drivers.lms2xx_replies import Configuration, encode_configuration
-from lrfcal_lib.session import (
-    CameraInfo,
-    LrfInfo,
-    SessionWriter,
-    board_to_json,
-    model_to_json,
-    transform_to_json,
-)
-from lrfcal_lib.session.writer import write_file
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_words
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
 from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.board import Board, Chessboard, triangle_board
-from lrfcal_lib.camera import CameraModel, project
-from lrfcal_lib.geometry import tilt
+from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scene import Exposure
 

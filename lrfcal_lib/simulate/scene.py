@@ -18,7 +18,7 @@ import open3d as o3d
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.camera import CameraModel, distort, undistort
+from lrfcal_lib.model.camera import CameraModel, distort, undistort
 
 FLOOR = -1.1  # metres, below the platform
 SKY = (0.95, 0.98, 1.0)  # light from where there is nothing
@@ -27,9 +27,6 @@ BLOCK = 2  # pixels
 BATCH = 1 << 19  # rays that are cast at once
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)  # random values that textures are made of
 TEXTURES = {}  # by name, for room.json
-
-
-# Shapes: triangle meshes of simple bodies, (vertices (n, 3), faces (m, 3)), metres
 
 
 def polygon(corners):
@@ -99,8 +96,6 @@ def curtain(width, height, depth, folds):
 
 
 SHAPES = {f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)}
-
-# Textures: of their settings, to functions of points (n, 3) in a thing's own frame that give the albedo (n, 3)
 
 
 def _texture(function):
@@ -218,9 +213,6 @@ def chessboard(points, board, dark, light, ring=0.5):
         inside = np.all((at > -ring) & (at < np.array([pattern.columns, pattern.rows]) - 1 + ring), axis=1)
         grey[inside & (np.floor(at).astype(int).sum(axis=1) % 2 == 0)] = light
     return np.repeat(grey[:, None], 3, axis=1)
-
-
-# The world
 
 
 @dataclass(frozen=True)
@@ -377,9 +369,6 @@ def board_on_stand(board, T_platform_board, ring):
         rods.append((knee, [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR], 0.010))
     sheet = Thing(polygon(board.corners), chessboard(board, 0.07, 0.75, ring), T_platform_board)
     return [sheet, *(Thing(rod(*each), plain((0.4, 0.41, 0.43))) for each in rods)]
-
-
-# Pictures
 
 
 @dataclass(frozen=True)

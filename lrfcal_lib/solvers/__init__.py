@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from lrfcal_lib.geometry import DegenerateGeometry
-from lrfcal_lib.solvers.bauermann import solve_bauermann
-from lrfcal_lib.solvers.camera import edge_residuals_px, plane_residuals_m, solve_lines, solve_paper_lines
-from lrfcal_lib.solvers.line_ml import edge_bias, solve_line_ml
-from lrfcal_lib.solvers.outliers import find_outlying_placements
-from lrfcal_lib.solvers.pitch_errors import SweepPoints, estimate_pitch_errors
-from lrfcal_lib.solvers.platform import PlatformObservations, PlatformPrior, PlatformSolution, solve_platform
-from lrfcal_lib.solvers.projected import solve_projected
-from lrfcal_lib.solvers.solution import Solution
-from lrfcal_lib.solvers.start import starting_transform
-from lrfcal_lib.solvers.wasielewski_strauss import solve_wasielewski_strauss
-from lrfcal_lib.solvers.zhang_pless import solve_zhang_pless, solve_zhang_pless_joint
+from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.solvers.lines import (
+    solve_bauermann,
+    solve_line_ml,
+    solve_lines,
+    solve_paper_lines,
+    solve_wasielewski_strauss,
+)
+from lrfcal_lib.solvers.planes import solve_zhang_pless, solve_zhang_pless_joint
 
 
 @dataclass(frozen=True)
@@ -50,29 +47,3 @@ METHODS = {
     "wasielewski_strauss": Method("half_step", solve_wasielewski_strauss, "crossing", "Wasielewski-Strauss"),
     "bauermann": Method("half_step", solve_bauermann, "scene", "Bauermann"),
 }
-
-__all__ = [
-    "METHODS",
-    "DegenerateGeometry",
-    "Method",
-    "PlatformObservations",
-    "PlatformPrior",
-    "PlatformSolution",
-    "Solution",
-    "SweepPoints",
-    "edge_bias",
-    "edge_residuals_px",
-    "estimate_pitch_errors",
-    "find_outlying_placements",
-    "plane_residuals_m",
-    "solve_bauermann",
-    "solve_line_ml",
-    "solve_lines",
-    "solve_paper_lines",
-    "solve_platform",
-    "solve_projected",
-    "solve_wasielewski_strauss",
-    "solve_zhang_pless",
-    "solve_zhang_pless_joint",
-    "starting_transform",
-]

@@ -7,19 +7,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.geometry import DegenerateGeometry, TiltAxis, axis_of, head_from_axis
-from lrfcal_lib.solvers.edge_likelihood import disc_edge
-from lrfcal_lib.solvers.joint_blocks import (
+from lrfcal_lib.fit.least_squares import minimise, solve, whiten
+from lrfcal_lib.fit.residuals import (
     SENSOR,
     JointData,
     JointState,
     Unknowns,
+    chart_parameters,
+    disc_edge,
     gather,
     joint_blocks,
     move_state,
     named_blocks,
 )
-from lrfcal_lib.solvers.joint_lens import lens_covariance
+from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    DegenerateGeometry,
+    TiltAxis,
+    axis_of,
+    head_from_axis,
+    motion_words,
+    pose_array,
+    pose_parameters,
+    pose_transform,
+)
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers.joint_noise import (
     CONTRADICTION,
     LARGEST_SHARE,
@@ -27,19 +40,14 @@ from lrfcal_lib.solvers.joint_noise import (
     ROUGH_MISS,
     estimate_noise,
     image_misses,
+    joint_warnings,
+    lens_covariance,
     misfits,
     rough_misses,
     same_levels,
     view_misses,
 )
-from lrfcal_lib.solvers.joint_observations import JointObservations
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
-from lrfcal_lib.solvers.joint_warnings import joint_warnings
-from lrfcal_lib.solvers.least_squares import minimise, solve, whiten
-from lrfcal_lib.solvers.platform import AXIS_NAMES, AXIS_WORDS
-from lrfcal_lib.solvers.platform_blocks import chart_parameters
-from lrfcal_lib.solvers.pose import POSE_NAMES, motion_words, pose_array, pose_parameters, pose_transform
-from lrfcal_lib.solvers.solution import Solution
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 START_STEPS = 8
@@ -210,7 +218,7 @@ def solve_joint(
     axis : bool
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
-        Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_blocks.SENSOR`; others stay zero (softness: 0.2).
+        Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero (softness: 0.2).
     size : bool
         Estimate the board's size: one offset an edge.
     sides : bool

@@ -1,8 +1,4 @@
-"""Noise levels of the joint estimate from its own residuals, and placements that contradict all others.
-
-Real devices err alike at neighbouring points: a board bends, print reads nearer or farther than paper. Residuals
-averaged over parts of a board then scatter more than independent ones would; the observations count accordingly less.
-"""
+"""Noise levels of the joint estimate, contradictions, the share of the intrinsics, and what is suspicious, in words."""
 
 from __future__ import annotations
 
@@ -10,17 +6,83 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.solvers.joint_blocks import (
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import (
     SIDE_FREEDOM,
     SWEEPS,
     Unknowns,
     edge_distance,
     named_blocks,
+    pad,
     rays,
     view_block,
     view_whitener,
 )
-from lrfcal_lib.solvers.least_squares import whiten
+from lrfcal_lib.model.camera import project_jacobians
+
+LENS = 9  # intrinsics of a camera, see CameraModel.parameters
+LEAST_CORNERS = 6
+
+
+def pose_by_intrinsics(T_camera_board, corners, model):
+    """How the pose of a board that fits given pixels changes with the intrinsics.
+
+    Parameters
+    ----------
+    T_camera_board : RigidTransform
+    corners : ndarray, shape (k, 3)
+        Of the pattern, board frame, metres.
+    model : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (6, 9)
+        Derivative of the increments ``[w, v]`` by the intrinsics; zeros with fewer than six corners.
+    """
+    if len(corners) < LEAST_CORNERS:
+        return np.zeros((6, LENS))
+    turned = T_camera_board.rotation.apply(corners)
+    by_point, by_lens = project_jacobians(turned + T_camera_board.translation, model)
+    by_pose = np.concatenate([np.cross(turned[:, None, :], by_point), by_point], axis=-1)
+    return -np.linalg.lstsq(by_pose.reshape(-1, 6), by_lens.reshape(-1, LENS), rcond=None)[0]
+
+
+def lens_covariance(obs, found, data, unknowns):
+    """Covariance of the shared unknowns from the covariances of the intrinsics.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        With `view_lens` and `lens_covariance`.
+    found : Solution
+        Of the joint estimate, with ``jacobian`` and ``covariance`` of all blocks.
+    data : JointData
+    unknowns : Unknowns
+
+    Returns
+    -------
+    ndarray, shape (c, c)
+        Zeros where the intrinsics are taken to be exact.
+    """
+    c = unknowns.shared
+    total = np.zeros((c, c))
+    if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
+        return total
+    J = whiten(view_block(found.state, data, unknowns))[1]
+    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(obs.placements))["lens"]
+    whitener = view_block(found.state, data, unknowns).whitener
+    weighted = np.sqrt(found.weights[..., None]) * found.jacobian
+    hessian = np.swapaxes(weighted, -1, -2) @ weighted
+    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
+    reduced = J[..., :c] - J[..., c:] @ inverse @ hessian[:, c:, :c]
+    finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
+    for camera, spread in enumerate(obs.lens_covariance):
+        mine = (data.view["used"] & (data.view["camera"] == camera))[..., None, None]
+        shift = (whitener @ (lens * mine)).reshape(J.shape[:2] + (LENS,))
+        gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
+        total = total + gain @ spread @ gain.T
+    return total
+
 
 PARTS = 3  # of a board in x and y, and of an edge
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
@@ -213,3 +275,110 @@ def same_levels(before, after):
     ratios = [getattr(after, name) / getattr(before, name) for name in ("face_scale", "face_share", "beam_share")]
     ratios += (after.view_scale / before.view_scale).tolist()
     return bool(np.all(np.abs(np.log(ratios)) < SETTLED))
+
+
+NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
+ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
+WEAK_DIRECTION, WEAK_OFFSET = np.radians(1.0), 0.020  # standard deviations of an axis nobody should rely on
+TERMS = {
+    "pitch_scale": (0.001, "the scale of the pitch", 100.0, "%"),
+    "pitch_by_direction": (np.radians(0.01), "a pitch offset by sweep direction", np.degrees(1.0), "deg"),
+}
+
+
+def joint_warnings(blocks, data, unknowns, found, names):
+    """Warnings about a joint estimate.
+
+    Parameters
+    ----------
+    blocks : dict of str to Block
+        Of :func:`lrfcal_lib.fit.residuals.named_blocks` at the solution.
+    data : JointData
+    unknowns : Unknowns
+    found : Solution
+    names : tuple of str
+        Of the cameras.
+
+    Returns
+    -------
+    tuple of str
+    """
+    words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
+    words += [f"the data do not determine {motion}" for motion in found.unobservable]
+    words += noise_words(blocks, data, names)
+    words += weak_words(found)
+    return tuple(words + asked_words(found.state, data, unknowns))
+
+
+def noise_words(blocks, data, names):
+    """Groups of observations that scatter more or less than stated."""
+    scatter = {}
+    if "face" in blocks:
+        z = whiten(blocks["face"], False)[0][data.face["used"]] / np.sqrt(data.face_share)
+        scatter["ranges", "face_sigma"] = np.sqrt(np.mean(z**2))
+    if "view" in blocks:
+        z = whiten(blocks["view"], False)[0].reshape(data.view["used"].shape + (6,))
+        for number, name in enumerate(names):
+            mine = data.view["used"] & (data.view["camera"] == number)
+            if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
+                scatter[f"poses of the board in camera '{name}'", "view_covariance"] = np.sqrt(np.mean(z[mine] ** 2))
+    low, high = NOISE_LIMITS
+    return [
+        f"the {what} scatter {level:.2g} times what is stated ({field}): standard deviations of the result are off "
+        "alike; noise='estimate' takes the level from the residuals"
+        for (what, field), level in scatter.items()
+        if not low < level < high
+    ]
+
+
+def weak_words(found):
+    """A tilt axis that is hardly known."""
+    sigma = dict(zip(found.names, found.sigma, strict=True))
+    axis = [value for name, value in sigma.items() if name.startswith("axis_")]
+    offset = [value for name, value in sigma.items() if name.startswith("offset_")]
+    if not axis:
+        return []
+    turn, shift = np.linalg.norm(axis), np.linalg.norm(offset)
+    if turn < WEAK_DIRECTION and shift < WEAK_OFFSET:
+        return []
+    return [
+        f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger pitch "
+        "range, take images at more pitch angles, or state the platform with its accuracy"
+    ]
+
+
+def asked_words(state, data, unknowns):
+    """Errors of the pitch that were held at zero although the residuals ask for them (a score test)."""
+    held = [name for name in TERMS if name not in unknowns.sensor]
+    if not held:
+        return []
+    words, wider = [], replace(unknowns, sensor=(*unknowns.sensor, *held))
+    for name, (square, value) in score_tests(state, data, wider, held).items():
+        least, what, factor, unit = TERMS[name]
+        if square > ASKED and abs(value) > least:
+            words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
+    return words
+
+
+def score_tests(state, data, unknowns, held):
+    """Squared scores of shared unknowns held at zero, in standard deviations, and the values they would take.
+
+    Each one is tested by itself, with all that was estimated free.
+    """
+    c, hessian, gradient = unknowns.shared, 0.0, 0.0
+    for block in named_blocks(state, data, unknowns).values():
+        r, J = whiten(block)
+        transposed = np.swapaxes(J, -1, -2)
+        hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
+    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-12, hermitian=True)
+    back = hessian[:, :c, c:] @ inverse
+    whole = np.sum(hessian[:, :c, :c] - back @ hessian[:, c:, :c], axis=0)
+    score = np.sum(gradient[:, :c] - (back @ gradient[:, c:, None])[..., 0], axis=0)
+    names = unknowns.names(range(unknowns.cameras), range(unknowns.edges))
+    others, out = [i for i, name in enumerate(names) if name not in held], {}
+    for name in held:
+        free = [*others, names.index(name)]
+        covariance = np.linalg.pinv(whole[np.ix_(free, free)], rcond=1e-14, hermitian=True)
+        step = -(covariance @ score[free])[-1]
+        out[name] = float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
+    return out

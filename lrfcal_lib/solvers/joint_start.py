@@ -7,10 +7,18 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.geometry import DegenerateGeometry, TiltAxis, head_from_axis, lrf_to_platform, polar_to_points, tilt
-from lrfcal_lib.solvers.joint_blocks import JointState
-from lrfcal_lib.solvers.pose import exp_rotation, pose_array
-from lrfcal_lib.solvers.start import start_from_planes
+from lrfcal_lib.fit.residuals import JointState
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    TiltAxis,
+    exp_rotation,
+    head_from_axis,
+    lrf_to_platform,
+    polar_to_points,
+    pose_array,
+    tilt,
+)
+from lrfcal_lib.solvers.planes import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
 LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
@@ -254,4 +262,3 @@ def _turn_in_plane(obs, placement, head, axes, centre):
     full = np.eye(3)
     full[:2, :2] = R
     return full, shift
-

@@ -1,0 +1,1 @@
+"""The stages in order: observations, platform, cameras, joint estimate, coloured cloud."""

@@ -1,0 +1,232 @@
+"""Ports that open with errors that say what to do, what can go wrong, and heads that stop on every exit."""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import json
+import os
+import signal
+import socket
+import termios
+import threading
+import weakref
+from contextlib import contextmanager
+from pathlib import Path
+
+import serial
+
+
+class DeviceError(RuntimeError):
+    """Any failure of a device or of the line to it."""
+
+
+class PortError(DeviceError):
+    """The port cannot be opened or set: missing, no permission, busy, no serial line, rate not possible."""
+
+
+class NoReply(DeviceError):
+    """Nothing sensible arrived before the deadline."""
+
+
+class WrongDevice(DeviceError):
+    """Something answers, but not the device that was expected."""
+
+
+class Refused(DeviceError):
+    """The device understood and declined."""
+
+
+class LineLost(DeviceError):
+    """The port vanished; it can come back."""
+
+
+class OutOfRange(DeviceError, ValueError):
+    """A device was asked for more than it can do, such as a pitch beyond the limits of its head."""
+
+
+_moving_things = weakref.WeakSet()
+_before = {}
+
+
+def guard(device):
+    """Call ``device.emergency_stop()`` at exit, and on SIGTERM and SIGHUP if this is the main thread.
+
+    Parameters
+    ----------
+    device
+        Kept by a weak reference, until :func:`release`.
+    """
+    _moving_things.add(device)
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) not in (_on_signal, signal.SIG_IGN):  # nohup ignores SIGHUP: go on
+                _before[number] = signal.signal(number, _on_signal)
+
+
+def release(device):
+    """Forget a device that was closed."""
+    _moving_things.discard(device)
+    if not _moving_things and threading.current_thread() is threading.main_thread():
+        while _before:
+            number, handler = _before.popitem()
+            if signal.getsignal(number) is _on_signal:
+                signal.signal(number, handler or signal.SIG_DFL)
+
+
+def _stop_all():
+    for device in list(_moving_things):
+        device.emergency_stop()
+
+
+def _on_signal(number, frame):
+    """Stop, then do what would have been done; what would kill becomes an exit that closes files."""
+    _stop_all()
+    before = _before.get(number)
+    if callable(before):
+        before(number, frame)
+    elif before != signal.SIG_IGN:
+        raise SystemExit(128 + number)
+
+
+atexit.register(_stop_all)
+os.register_at_fork(after_in_child=_moving_things.clear)
+WRITE_S = 1.0  # longest time a write may block
+
+
+def open_port(path, baudrate, *, timeout):
+    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit, no flow control.
+
+    Parameters
+    ----------
+    path : str or Path
+        Such as /dev/ttyUSB0.
+    baudrate : int
+    timeout : float
+        Seconds that a read waits for its bytes.
+
+    Returns
+    -------
+    serial.Serial
+        A write blocks for 1 s at most.
+
+    Raises
+    ------
+    PortError
+        If the port is missing, forbidden, busy, no serial line, or cannot do this rate.
+    """
+    path = os.fspath(path)
+    try:
+        port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
+    except (OSError, ValueError, termios.error) as error:
+        raise PortError(_reason(path, error)) from error
+    try:
+        set_rate(port, baudrate)
+    except BaseException:
+        port.close()
+        raise
+    return port
+
+
+def set_rate(port, baudrate):
+    """Change the rate of an open port and read it back.
+
+    Parameters
+    ----------
+    port : serial.Serial
+    baudrate : int
+
+    Raises
+    ------
+    PortError
+        If the line cannot do this rate; the old one holds.
+    LineLost
+        If the port vanished.
+    """
+    old = port.baudrate
+    try:
+        with line_lost(port.port):
+            port.baudrate = baudrate
+            got = set(termios.tcgetattr(port.fd)[4:6])
+    except ValueError as error:
+        port.baudrate = old
+        raise PortError(f"{port.port} cannot do {baudrate} Bd: {error}") from error
+    if got != {getattr(termios, f"B{baudrate}", None)}:
+        port.baudrate = old
+        raise PortError(
+            f"{port.port} does not take {baudrate} Bd: its driver set another rate; "
+            "500000 Bd needs an RS-422 interface whose clock divides to it, else use 38400"
+        )
+
+
+@contextmanager
+def line_lost(path):
+    """Turn what pyserial raises when a port vanishes into LineLost."""
+    try:
+        yield
+    except (OSError, termios.error) as error:
+        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
+
+
+def _reason(path, error):
+    """Why a port could not be opened, and what to do."""
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"there is no port {path}: check cable and power; present are {', '.join(_present()) or 'none'}"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return f"the port {path} is busy, held by {_holder(path)}: close that program"
+    return f"{path} is no serial line ({error}): name the port of the device"
+
+
+def _present():
+    """Ports of this machine."""
+    from serial.tools.list_ports import comports
+
+    return sorted(one.device for one in comports())
+
+
+def _holder(path):
+    """The processes that have a port open, as far as this user may see."""
+    found, real = set(), os.path.realpath(path)
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if os.readlink(link) == real:
+                found.add(f"{(link.parents[1] / 'comm').read_text().strip()} (process {link.parts[2]})")
+        except OSError:  # that process ended, or belongs to somebody else
+            continue
+    return ", ".join(sorted(found)) or "another program"
+
+
+def ask(path, line, timeout=10.0):
+    """Send one command to the control socket of an emulated rig.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the socket.
+    line : str or dict
+    timeout : float
+        Seconds.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ValueError
+        If the rig refuses, with its reason.
+    OSError
+        If nobody serves the socket.
+    """
+    line = json.dumps(line) if isinstance(line, dict) else line
+    with socket.socket(socket.AF_UNIX) as link:
+        link.settimeout(timeout)
+        link.connect(str(path))
+        link.sendall(line.encode() + b"\n")
+        answer = json.loads(link.makefile().readline())
+    if not answer.pop("ok"):
+        raise ValueError(f"the emulated rig refuses '{line}': {answer['error']}")
+    return answer

@@ -1,0 +1,1 @@
+"""One least-squares core: residuals with their derivatives, minimisation, results."""

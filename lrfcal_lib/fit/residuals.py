@@ -1,0 +1,878 @@
+"""Residuals with analytic Jacobians: beams about edges, lines of sight, planes, views, priors; padded by placement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import log_ndtr
+
+from lrfcal_lib.fit.least_squares import Block
+from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.model.camera import distort, line_through, undistort
+from lrfcal_lib.model.geometry import (
+    POSE_NAMES,
+    axis_of,
+    cross,
+    gradient_by_pose,
+    head_from_axis,
+    move_pose,
+    moved_noise,
+    noise_correction,
+    pose_array,
+    pose_parameters,
+    pose_transform,
+    rotate_points,
+)
+
+
+def line_block(pose, points, covariance, lines, line_sigma, model):
+    """Whitened-to-be distances d(e, ab) of projected crossings from their image lines.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+        ``T_camera_source``.
+    points : ndarray, shape (..., n, 3)
+        Crossings, source frame, metres.
+    covariance : ndarray, shape (..., n, 3, 3)
+    lines : ndarray, shape (..., n, 3)
+        Undistorted pixel lines with unit normal.
+    line_sigma : ndarray, shape (..., n)
+        Pixels.
+    model : CameraModel
+
+    Returns
+    -------
+    Block
+        Residuals in pixels; the whitener holds the crossing's covariance projected through the pinhole and the line's.
+
+    Notes
+    -----
+    Equations (16), (19) and (20), with the sign of the distance. Behind the camera the formula goes on (mirrored), so
+    that a poor start value can still find its way.
+    """
+    rotated = rotate_points(pose, points)
+    q = rotated + pose[..., None, :, 3]
+    a, b = lines[..., 0] * model.fx, lines[..., 1] * model.fy
+    x, y, z = q[..., 0], q[..., 1], q[..., 2]
+    slope = (a * x + b * y) / z
+    residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
+    gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
+    shift = moved_noise(pose, gradient, covariance)
+    variance = np.sum(shift * gradient, axis=-1) + np.asarray(line_sigma) ** 2
+    jacobian = gradient_by_pose(rotated, gradient)
+    corrected = jacobian - noise_correction(rotated, q, gradient, shift, residuals / variance)
+    return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
+
+
+def read_pose(pose):
+    """Transform and parameters of a pose state."""
+    return pose_transform(pose), pose_parameters(pose)
+
+
+def edge_residuals_px(obs, transform, model=None):
+    """Signed distances of the projected crossings from their image lines, equation (20).
+
+    Parameters
+    ----------
+    obs : CameraObservations
+    transform : RigidTransform
+        ``T_camera_source``.
+    model : CameraModel, optional
+        Other intrinsics than ``obs.model``: the image lines are then moved there (two points of each are distorted with
+        the old model and undistorted with the new one).
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Undistorted pixels; positive outside the board.
+    """
+    lines = obs.crossing_lines if model is None else _moved_lines(obs, transform, model)
+    sigma = np.ones(len(obs.crossing_points))
+    return line_block(
+        pose_array(transform), obs.crossing_points, obs.crossing_covariance, lines, sigma, model or obs.model
+    ).residuals
+
+
+def _moved_lines(obs, transform, model):
+    """The image lines of the crossings under other intrinsics."""
+    if len(obs.crossing_points) == 0:
+        return obs.crossing_lines
+    old, lines = obs.model, obs.crossing_lines
+    q = transform.apply(obs.crossing_points)
+    uv = q[:, :2] / q[:, 2:] * [old.fx, old.fy] + [old.cx, old.cy]
+    foot = uv - (np.sum(uv * lines[:, :2], axis=1) + lines[:, 2])[:, None] * lines[:, :2]
+    along = np.stack([-lines[:, 1], lines[:, 0]], axis=1) * 10.0
+    focal, centre = np.array([old.fx, old.fy]), np.array([old.cx, old.cy])
+    ends = [
+        undistort(distort((p - centre) / focal, old.distortion) * focal + centre, model)
+        for p in (foot - along, foot + along)
+    ]
+    found = line_through(*ends)
+    return found * np.sign(np.sum(found[:, :2] * lines[:, :2], axis=1))[:, None]
+
+
+def plane_residuals_m(obs, transform, board_poses=None):
+    """Signed distances of the board-face points from the planes the camera sees.
+
+    Parameters
+    ----------
+    obs : CameraObservations
+    transform : RigidTransform
+        ``T_camera_source``.
+    board_poses : ndarray, shape (p, 4, 4), optional
+        Other poses than ``obs.board_poses`` (of a joint refinement).
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Metres, along the board's z; NaN for placements whose board pose the camera does not know.
+    """
+    poses = obs.board_poses if board_poses is None else board_poses
+    out = np.full(len(obs.plane_points), np.nan)
+    if len(obs.placements) == 0 or len(out) == 0:
+        return out
+    index = np.searchsorted(obs.placements, obs.plane_placement, sorter=np.argsort(obs.placements))
+    index = np.argsort(obs.placements)[np.minimum(index, len(obs.placements) - 1)]
+    known = obs.placements[index] == obs.plane_placement
+    normal, point = poses[index, :3, 2], poses[index, :3, 3]
+    distance = np.sum(normal * (transform.apply(obs.plane_points) - point), axis=1)
+    out[known] = distance[known]
+    return out
+
+
+ROOT_2PI = np.sqrt(2 * np.pi)
+LEAST_STEP = 0.15  # of a beam step: least softness, so that an edge between two beams is put into their middle
+_X = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]  # dense where the share of a disc changes least
+
+
+def disc_share(x):
+    """Share of a unit disc that lies inside a straight edge.
+
+    Parameters
+    ----------
+    x : array_like
+        Signed distance of the disc's centre from the edge in radii, positive outside.
+
+    Returns
+    -------
+    ndarray
+        1 for x <= -1, 0 for x >= 1.
+    """
+    x = np.clip(np.asarray(x, float), -1.0, 1.0)
+    return (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
+
+
+_LOG_ODDS = np.log(disc_share(_X)) - np.log(disc_share(-_X))
+
+
+def disc_edge(log_odds):
+    """Where an edge cuts a unit disc so that its inner share has given log odds; inverts :func:`disc_share`.
+
+    Parameters
+    ----------
+    log_odds : array_like
+        ``ln(share / (1 - share))``.
+
+    Returns
+    -------
+    x : ndarray
+        Distance of the disc's centre from the edge in radii, positive outside; between -1 and 1.
+    slope : ndarray
+        ``dx / dlog_odds`` (negative).
+    """
+    log_odds = np.asarray(log_odds, float)
+    x = np.interp(-log_odds, -_LOG_ODDS, _X)
+    slope, here = _slope(x)
+    refined = x + slope * np.clip(log_odds - here, -1e-4, 1e-4)  # value and slope must agree for steps to converge
+    return refined, _slope(refined)[0]
+
+
+def _slope(x):
+    """``dx / dlog_odds`` and the log odds of the share inside, at a distance of the edge in radii."""
+    inside, outside = (np.maximum(disc_share(v), 1e-12) for v in (x, -x))
+    slope = -inside * outside * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
+    return slope, np.log(inside / outside)
+
+
+def edge_shift(log_odds, radius, background=0.0):
+    """By how much a spot's centre may lie outside an edge and still read the board.
+
+    Parameters
+    ----------
+    log_odds : float
+        Of the sensor, for a background as far and as bright as the board.
+    radius : array_like
+        Of the spot, metres.
+    background : array_like
+        What the background adds to the log odds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
+
+    Returns
+    -------
+    shift : ndarray
+        Metres; positive where boards look larger.
+    slope : ndarray
+        Its derivative by `log_odds`.
+    """
+    x, slope = disc_edge(log_odds + np.asarray(background, float))
+    return radius * x, radius * slope
+
+
+def flip_sigma(softness, radius, step):
+    """Standard deviation of where readings flip, with a floor: beams a step apart cannot show a sharper edge.
+
+    Parameters
+    ----------
+    softness : array_like
+        Standard deviation in spot radii.
+    radius, step : array_like
+        Of the spot, and between neighbouring beams at the board, metres.
+
+    Returns
+    -------
+    sigma : ndarray
+        Metres.
+    share : ndarray
+        ``d ln sigma / d ln softness``, between 0 (all floor) and 1.
+    """
+    soft = softness * np.asarray(radius, float)
+    sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
+    return sigma, (soft / sigma) ** 2
+
+
+def _mills(z):
+    """``phi(z) / Phi(z)`` without overflow."""
+    return np.exp(-0.5 * z**2 - log_ndtr(z)) / ROOT_2PI
+
+
+def beam_terms(margin, sigma, hit, lapse=0.0):
+    """Negative log likelihood of single beams near an edge.
+
+    Parameters
+    ----------
+    margin : ndarray
+        How far inside the place where readings flip the beam's centre lies, metres (shift - distance from the edge).
+    sigma : array_like
+        Standard deviation of where a reading flips, metres.
+    hit : ndarray of bool
+        Whether the board was read.
+    lapse : float
+        Share of beams that say nothing (something hid or bent the edge there); their pull fades with distance.
+
+    Returns
+    -------
+    cost, score, information : ndarray
+        Negative log likelihood, its derivative by the margin, and the observed information on the margin (never
+        negative; with `lapse` that of the majorising function of an EM step).
+    by_log_sigma : ndarray
+        Derivative of the cost by ``ln sigma``.
+
+    Notes
+    -----
+    ``P(hit) = Phi(margin / sigma)``, a probit.
+    """
+    sign = np.where(hit, 1.0, -1.0)
+    z = sign * np.asarray(margin, float) / sigma
+    log_p = log_ndtr(z)
+    mills = _mills(z)
+    weight = 1.0
+    cost = -log_p
+    if lapse:
+        cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
+        weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
+    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2, weight * mills * z
+
+
+def interval_terms(inner, outer, sigma):
+    """Negative log likelihood that readings flip between two neighbouring beams.
+
+    Parameters
+    ----------
+    inner, outer : ndarray
+        Margins (see :func:`beam_terms`) of the last beam on the board and the first beam off it, metres;
+        ``inner > outer``.
+    sigma : array_like
+        Standard deviation of what both have in common (where the edge is), metres.
+
+    Returns
+    -------
+    cost, score, information : ndarray
+        Negative log likelihood, and its derivatives by a shift of both margins; the information is the observed one.
+    by_log_sigma : ndarray
+        Derivative of the cost by ``ln sigma``.
+
+    Notes
+    -----
+    ``P = Phi(inner / sigma) - Phi(outer / sigma)``: a uniform distribution over the interval, blurred.
+    """
+    a, b = np.asarray(outer, float) / sigma, np.asarray(inner, float) / sigma
+    flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    log_p = upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-15)))
+    pb, pa = (np.exp(-0.5 * z**2 - log_p) / ROOT_2PI for z in (b, a))
+    ratio = pb - pa
+    curvature = ratio**2 + (b * pb - a * pa)
+    score = np.where(flip, 1.0, -1.0) * ratio / sigma
+    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2, b * pb - a * pa
+
+
+SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the beam has no range noise across it
+SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
+EXTRA = ("size",)  # one unknown an edge
+SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
+LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
+USUAL = {"edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}  # and how widely they may differ
+SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
+AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Everything that moves.
+
+    Attributes
+    ----------
+    head : ndarray, shape (3, 4)
+        ``T_head_lrf``.
+    cameras : ndarray, shape (c, 3, 4)
+        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+    sensor : ndarray, shape (5,)
+        In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
+    size : ndarray, shape (e,)
+        By how much each edge lies outside the stated one, metres.
+    boards : ndarray, shape (p, 3, 4)
+        ``T_platform_board``.
+    sweeps : ndarray, shape (p, 2)
+        Offset (radians) and stretch of the recorded pitch of each sweep.
+    sides : ndarray, shape (p, e)
+        By how much the log odds of each side differ from the sensor's: what stands behind it is darker or brighter.
+    """
+
+    head: np.ndarray
+    cameras: np.ndarray
+    sensor: np.ndarray
+    size: np.ndarray
+    boards: np.ndarray
+    sweeps: np.ndarray
+    sides: np.ndarray
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Which columns of the full Jacobian are unknown.
+
+    Attributes
+    ----------
+    cameras, edges : int
+        How many there are.
+    axis, size : bool
+    sensor : tuple of str
+        Of `SENSOR`.
+    sweep : {'none', 'offset', 'offset_stretch'}
+    poses : bool
+        Whether the cameras' poses are unknown.
+    sides : bool
+        Whether every side of every placement has a deviation of its own from the sensor's edge bias.
+    """
+
+    cameras: int
+    edges: int
+    axis: bool = True
+    sensor: tuple = ("range_offset", "edge_log_odds", "edge_log_softness")
+    size: bool = False
+    sweep: str = "none"
+    poses: bool = True
+    sides: bool = False
+
+    @property
+    def mask(self):
+        """Of the full set of shared columns, those that are unknown."""
+        poses, size = [self.poses] * 6 * self.cameras, [self.size] * self.edges
+        return np.array([self.axis] * 4 + poses + [name in self.sensor for name in SENSOR] + size)
+
+    @property
+    def shared(self):
+        """Number of unknowns common to all placements."""
+        return int(self.mask.sum())
+
+    @property
+    def own(self):
+        """Number of unknowns of one placement."""
+        return 6 + SWEEPS[self.sweep] + self.edges * self.sides
+
+    def names(self, cameras, edges):
+        """Names of the shared unknowns."""
+        poses = [f"{c}_{n}" for c in cameras for n in POSE_NAMES]
+        every = [*AXIS_NAMES, *poses, *SENSOR, *(f"size_{e}" for e in edges)]
+        return tuple(np.array(every)[self.mask].tolist())
+
+
+@dataclass(frozen=True)
+class JointData:
+    """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
+
+    Attributes
+    ----------
+    face, beam, view : dict of str to ndarray
+        Fields of a group of :class:`lrfcal_lib.model.observations.JointObservations`, with `used` and ``ray``
+        (LRF frame) or, for views, ``whitener`` (p, v, 6, 6).
+    lines : ndarray, shape (e, 3)
+    middle, direction : ndarray, shape (p,)
+    on_head : ndarray of bool, shape (c,)
+    face_scale, view_scale : float, and ndarray, shape (c,)
+        Factors on the stated standard deviations.
+    sigma_pitch : float
+        Standard deviation of the recorded pitch of a single image, radians: what a head at rest is off by.
+    face_share, beam_share : float
+        Independent errors per observation: below one where neighbours repeat each other's errors.
+    lapse : float
+        See :func:`lrfcal_lib.fit.residuals.beam_terms`.
+    sweep_sigma : tuple of float
+        Standard deviation of the sweeps' own offset (radians) and stretch.
+    side_sigma : float
+        Scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom: most
+        backgrounds are alike, some are dark).
+    prior : PlatformPrior or None
+        The stated platform; it yields where the data contradict it.
+    """
+
+    face: dict
+    beam: dict
+    view: dict
+    lines: np.ndarray
+    middle: np.ndarray
+    direction: np.ndarray
+    on_head: np.ndarray
+    face_scale: float = 1.0
+    view_scale: np.ndarray | None = None
+    sigma_pitch: float = 0.0
+    face_share: float = 1.0
+    beam_share: float = 1.0
+    lapse: float = 0.0
+    sweep_sigma: tuple = (np.radians(0.5), 0.05)
+    side_sigma: float = 0.35
+    prior: PlatformPrior | None = None
+
+
+def pad(group, count):
+    """Rows of a group sorted into a rectangle by placement."""
+    place = group["placement"]
+    order = np.argsort(place, kind="stable")
+    number = np.bincount(place, minlength=count)
+    width = max(1, int(number.max(initial=0)))
+    slot = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
+    out = {}
+    for key, value in group.items():
+        if key != "placement":
+            filled = np.zeros((count, width) + value.shape[1:], value.dtype)
+            filled[place[order], slot] = value[order]
+            out[key] = filled
+    used = np.zeros((count, width), bool)
+    used[place[order], slot] = True
+    return out | {"used": used}
+
+
+def gather(obs):
+    """Observations as padded arrays.
+
+    Parameters
+    ----------
+    obs : JointObservations
+
+    Returns
+    -------
+    JointData
+    """
+    count = len(obs.placements)
+    face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
+    for group in (face, beam):
+        b = group["bearing"]
+        group["ray"] = np.stack([np.cos(b), np.sin(b), 0 * b], axis=-1)
+    view["covariance"] = np.where(view["used"][..., None, None], view["covariance"], np.eye(6))
+    view["whitener"] = np.linalg.inv(np.linalg.cholesky(view["covariance"])) * view["used"][..., None, None]
+    view["pose"] = np.where(view["used"][..., None, None], view["pose"], np.eye(4))
+    on_head = np.array([m == "head" for m in obs.mounts], bool)
+    return JointData(
+        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, view_scale=np.ones(len(obs.cameras))
+    )
+
+
+def true_pitch(state, data, pitch):
+    """Corrected pitch (p, n) and its derivatives by (scale, direction, offset, stretch), (p, n, 4)."""
+    scale, by_direction = state.sensor[3:5]
+    offset, stretch = state.sweeps[:, :1], state.sweeps[:, 1:]
+    away, turn = pitch - data.middle[:, None], np.broadcast_to(data.direction[:, None], pitch.shape)
+    corrected = pitch * (1 + scale) + by_direction * turn + offset + stretch * away
+    return corrected, np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
+
+
+def tilted(vectors, pitch, sign=1.0):
+    """``Rx(sign pitch) v`` of vectors (p, n, 3) or (3,) at angles (p, n)."""
+    c, s = np.cos(pitch), sign * np.sin(pitch)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return np.stack([x + 0 * c, c * y - s * z, s * y + c * z], axis=-1)
+
+
+def rays(state, data, group):
+    """Origins and directions (p, n, 3) of the beams of a group in the platform frame, pitch and its derivatives."""
+    pitch, by_parts = true_pitch(state, data, group["pitch"])
+    d_head = group["ray"] @ state.head[:, :3].T
+    return tilted(state.head[:, 3], pitch), tilted(d_head, pitch), d_head, pitch, by_parts
+
+
+def ray_columns(by_o, by_d, ray):
+    """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and direction."""
+    o, d, d_head, pitch, by_parts = ray
+    back_o, back_d = tilted(by_o, pitch, -1.0), tilted(by_d, pitch, -1.0)
+    head = np.concatenate([cross(d_head, back_d), back_o], axis=-1)[..., AXIS_COLUMNS]
+    turn = (cross(o, by_o) + cross(d, by_d))[..., :1]
+    return head, turn * by_parts
+
+
+def assemble(unknowns, head, parts, board, *, cameras=None, sensor=None, size=None, sides=None):
+    """Columns side by side, only those that are unknown: shared ones first, then the placement's own.
+
+    `sensor` are the columns of the first three of `SENSOR` (None for zeros), `parts` those of the pitch: scale and
+    offset by direction are shared, offset and stretch of the sweep its own.
+    """
+    sensors = [None if sensor is None else sensor[..., i] for i in range(3)] + [parts[..., 0], parts[..., 1]]
+    pieces = [(head, 4)] * unknowns.axis + [(cameras, 6 * unknowns.cameras)] * unknowns.poses
+    pieces += [(sensors[SENSOR.index(name)], 1) for name in SENSOR if name in unknowns.sensor]
+    pieces += [(size, unknowns.edges)] * unknowns.size + [(board, 6)]
+    count = SWEEPS[unknowns.sweep]
+    pieces += [(parts[..., 2 : 2 + count], count)] + [(sides, unknowns.edges)] * unknowns.sides
+    out, at = np.zeros(head.shape[:-1] + (unknowns.shared + unknowns.own,)), 0
+    for piece, width in pieces:
+        if piece is not None:
+            out[..., at : at + width] = piece if piece.ndim == out.ndim else piece[..., None]
+        at += width
+    return out
+
+
+def face_block(state, data, unknowns):
+    """Predicted minus measured ranges to the board's plane, metres."""
+    group = data.face
+    ray = rays(state, data, group)
+    o, d = ray[:2]
+    normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
+    along = np.sum(normal * d, axis=-1, keepdims=True)
+    along = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    r = np.sum(normal * (origin - o), axis=-1, keepdims=True) / along
+    by_q = normal / along
+    head, parts = ray_columns(-by_q, -r * by_q, ray)
+    by_normal = (origin - o - r * d) / along
+    board = np.concatenate([cross(np.broadcast_to(normal, by_normal.shape), by_normal), by_q], axis=-1)
+    sensor = np.zeros(r.shape[:2] + (3,))
+    sensor[..., 0] = 1.0
+    J = assemble(unknowns, head, parts, board, sensor=sensor)
+    residuals = r[..., 0] + state.sensor[0] - group["range"]
+    sigma = np.where(group["used"], group["sigma"], 1.0) * data.face_scale
+    return Block(residuals * group["used"], J, group["used"] * np.sqrt(data.face_share) / sigma)
+
+
+def edge_distance(state, data, group, ray):
+    """Signed distance (p, n) of rays from their edges, positive outside, and its gradients by o, d and edge direction.
+
+    Returns
+    -------
+    u : ndarray, shape (p, n)
+    by_o, by_d, by_t : ndarray, shape (p, n, 3)
+        The gradient by the edge's point is ``-by_o``.
+    a, t, n : ndarray, shape (p, n, 3)
+        Point (relative to the board's origin), direction and outward normal of the edge, platform frame.
+    """
+    o, d = ray[:2]
+    rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
+    line = data.lines[group["edge"]]
+    shift = -(line[..., 2] - state.size[group["edge"]])[..., None]
+    zero = np.zeros(line.shape[:2] + (1,))
+    normal = np.concatenate([line[..., :2], zero], axis=-1)
+    along = np.stack([-line[..., 1], line[..., 0], zero[..., 0]], axis=-1)
+    a, t, n = ((shift * normal) @ rotation, along @ rotation, normal @ rotation)
+    away = o - a - state.boards[:, None, :, 3]
+    m = cross(d, t)
+    length = np.linalg.norm(m, axis=-1, keepdims=True)
+    c = m / length * np.where(np.sum(m * n, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    u = np.sum(c * away, axis=-1)
+    g = (away * np.sign(np.sum(c * m, axis=-1, keepdims=True)) - u[..., None] * m / length) / length
+    return u, c, cross(t, g), cross(g, d), a, t, n
+
+
+def beam_block(state, data, unknowns):
+    """Negative log likelihoods of beams near the edges."""
+    group = data.beam
+    ray = rays(state, data, group)
+    u, by_o, by_d, by_t, a, t, n = edge_distance(state, data, group, ray)
+    own = np.take_along_axis(state.sides, group["edge"], axis=1)
+    shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"] + own)
+    radius = np.where(group["used"], group["radius"], 1.0)
+    sigma, share_soft = flip_sigma(np.exp(state.sensor[2]), radius, group["step"])
+    margin = shift - u
+    cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
+    head, parts = ray_columns(-by_o, -by_d, ray)
+    board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
+    sensor = np.stack([0 * u, slope, -margin * share_soft], axis=-1)
+    size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
+    np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
+    np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
+    J = assemble(unknowns, head, parts, board, sensor=sensor, size=size, sides=sides)
+    share = data.beam_share * group["used"]
+    root = np.sqrt(information)
+    alive = root * sigma > 1e-7
+    residuals = np.divide(score, root, out=np.zeros_like(score), where=alive)
+    return Block(residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share)
+
+
+def view_chain(state, data):
+    """Rotations and translations that make up the predicted ``T_camera_board`` of every view."""
+    camera = state.cameras[data.view["camera"]]
+    on_head = data.on_head[data.view["camera"]]
+    pitch, by_parts = true_pitch(state, data, np.where(on_head, data.view["pitch"], 0.0))
+    pitch = np.where(on_head, pitch, 0.0)
+    head = np.where(on_head[..., None, None], state.head, np.eye(3, 4))
+    A = camera[..., :3] @ np.swapaxes(head[..., :3], -1, -2)
+    board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
+    y = tilted(board[..., 3], pitch, -1.0)
+    back = tilted(np.broadcast_to(np.eye(3), pitch.shape + (3, 3)), pitch[..., None], -1.0)  # rows Rx(-pitch) e_i
+    return camera, head, A, A @ np.swapaxes(back, -1, -2), board, y, on_head, by_parts
+
+
+def log_rotation(R):
+    """Rotation vectors of stacks of matrices."""
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+
+
+def _hat(v):
+    out = np.zeros(v.shape + (3,))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def inverse_left_jacobian(w):
+    """How a small turn of a rotation changes its rotation vector, shape (..., 3) -> (..., 3, 3)."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    safe = np.maximum(angle, 1e-4)
+    bend = np.where(angle > 1e-4, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)), 1 / 12)
+    W = _hat(w)
+    return np.eye(3) - 0.5 * W + bend * (W @ W)
+
+
+def view_block(state, data, unknowns):
+    """Predicted against measured poses of the board in the cameras: rotation vectors and translations."""
+    camera, head, A, B, board, y, on_head, by_parts = view_chain(state, data)
+    R, t = B @ board[..., :3], (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
+    pose = data.view["pose"]
+    w = log_rotation(R @ np.swapaxes(pose[..., :3, :3], -1, -2))
+    residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
+    left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
+
+    def rows(turn, shift):
+        return np.concatenate([left @ turn, shift], axis=-2)
+
+    moved = on_head[..., None, None]
+    by_head = np.concatenate([rows(-A, A @ _hat(y - head[..., 3])), rows(zero, -A)], axis=-1)
+    turn = rows(-A[..., :1], (A @ _hat(y))[..., :1]) * moved
+    by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
+    own = np.concatenate([rows(eye, -_hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
+    cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
+    np.put_along_axis(cameras, data.view["camera"][..., None, None, None], own[..., None, :], axis=-2)
+    cameras = cameras.reshape(cameras.shape[:3] + (-1,))
+    parts = turn * by_parts[..., None, :]
+    J = assemble(unknowns, by_head[..., AXIS_COLUMNS] * moved, parts, by_board, cameras=cameras)
+    p, v = residuals.shape[:2]
+    return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
+
+
+def view_whitener(data, by_pitch):
+    """Inverse Cholesky factors of the views' covariances, with what the error of the recorded pitch adds to them."""
+    if data.sigma_pitch == 0:
+        return data.view["whitener"] / data.view_scale[data.view["camera"]][..., None, None]
+    scale = data.view_scale[data.view["camera"]][..., None, None]
+    covariance = scale**2 * data.view["covariance"]
+    covariance = covariance + data.sigma_pitch**2 * by_pitch[..., :, None] * by_pitch[..., None, :]
+    return np.linalg.inv(np.linalg.cholesky(covariance)) * data.view["used"][..., None, None]
+
+
+def sweep_block(state, data, unknowns):
+    """What is expected of the sweeps' own errors of the pitch."""
+    count, first = SWEEPS[unknowns.sweep], unknowns.shared + 6
+    J = np.zeros((len(state.sweeps), count, unknowns.shared + unknowns.own))
+    J[:, range(count), range(first, first + count)] = 1.0
+    whitener = np.broadcast_to(1 / np.array(data.sweep_sigma[:count]), (len(J), count))
+    return Block(state.sweeps[:, :count], J, whitener)
+
+
+def side_block(state, data, unknowns):
+    """What is expected of the sides' deviations from the sensor's edge bias: Student's t, as a likelihood."""
+    x, spread = state.sides, SIDE_FREEDOM * data.side_sigma**2
+    J = np.zeros(x.shape + (unknowns.shared + unknowns.own,))
+    J[:, range(x.shape[1]), range(J.shape[-1] - x.shape[1], J.shape[-1])] = 1.0
+    root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
+    cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
+    return Block(root * x, root[..., None] * J, np.ones_like(x), cost=cost)
+
+
+def prior_block(state, data, unknowns):
+    """What is stated about the axis: Student's t, so that a wrong statement loses; every placement holds a part."""
+    r, J = prior_terms(state.head, data.prior)
+    sigma = np.repeat([data.prior.sigma_direction, data.prior.sigma_offset], 2)
+    square, p = np.sum((r / sigma) ** 2), len(state.boards)
+    root = np.sqrt((PRIOR_FREEDOM + 4) / (PRIOR_FREEDOM + square) / p) / sigma
+    jacobian = np.zeros((p, 4, unknowns.shared + unknowns.own))
+    jacobian[..., :4] = root[:, None] * J
+    cost = np.full((p, 4), 0.125 * (PRIOR_FREEDOM + 4) * np.log1p(square / PRIOR_FREEDOM) / p)
+    return Block(np.tile(root * r, (p, 1)), jacobian, np.ones((p, 4)), cost=cost)
+
+
+def usual_block(state, unknowns, name):
+    """A weak expectation of one of `USUAL`, for data that do not show it; every placement holds a part."""
+    p, c = len(state.boards), unknowns.cameras
+    (usual, spread), number = USUAL[name], SENSOR.index(name)
+    full = np.zeros(len(unknowns.mask))
+    full[4 + 6 * c + number] = 1.0
+    J = np.zeros((p, 1, unknowns.shared + unknowns.own))
+    J[:, 0, : unknowns.shared] = full[unknowns.mask]
+    away = (state.sensor[number] - usual) / (spread * np.sqrt(p))
+    # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with the softness squared:
+    # without this curvature steps overshoot twofold
+    bend = np.sqrt(1 + 2 * max(usual - state.sensor[number], 0.0)) if name == "edge_log_softness" else 1.0
+    cost = np.full((p, 1), 0.5 * away**2)
+    return Block(np.full((p, 1), away / bend), J * bend / (spread * np.sqrt(p)), np.ones((p, 1)), cost=cost)
+
+
+def joint_blocks(state, data, unknowns):
+    """All residuals of the joint estimate.
+
+    Parameters
+    ----------
+    state : JointState
+    data : JointData
+    unknowns : Unknowns
+
+    Returns
+    -------
+    list of Block
+        Of :func:`named_blocks`.
+    """
+    return list(named_blocks(state, data, unknowns).values())
+
+
+def named_blocks(state, data, unknowns):
+    """Residuals by name: face (metres), beam (likelihoods), view (radians and metres), sweep, side, `USUAL`, prior."""
+    makers = {"face": face_block, "beam": beam_block, "view": view_block}
+    blocks = {n: make(state, data, unknowns) for n, make in makers.items() if getattr(data, n)["used"].any()}
+    if SWEEPS[unknowns.sweep]:
+        blocks["sweep"] = sweep_block(state, data, unknowns)
+    if unknowns.sides:
+        blocks["side"] = side_block(state, data, unknowns)
+    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in unknowns.sensor}
+    if data.prior is not None and unknowns.axis:
+        blocks["prior"] = prior_block(state, data, unknowns)
+    return blocks
+
+
+def move_state(state, step, unknowns):
+    """Retraction of the joint estimate.
+
+    Parameters
+    ----------
+    state : JointState
+    step : tuple of ndarray
+        Shared increments (c,) and those of each placement (p, l).
+    unknowns : Unknowns
+
+    Returns
+    -------
+    JointState
+    """
+    full = np.zeros(len(unknowns.mask))
+    full[unknowns.mask] = step[0]
+    c = len(state.cameras)
+    head = np.zeros(6)
+    head[AXIS_COLUMNS] = full[:4]
+    sensor = state.sensor + full[4 + 6 * c : 9 + 6 * c]
+    sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
+    sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
+    count = SWEEPS[unknowns.sweep]
+    sweeps = state.sweeps.copy()
+    sweeps[:, :count] += step[1][:, 6 : 6 + count]
+    return replace(
+        state,
+        head=move_pose(state.head, head),
+        cameras=move_pose(state.cameras, full[4 : 4 + 6 * c].reshape(c, 6)) if c else state.cameras,
+        sensor=sensor,
+        size=state.size + full[9 + 6 * c :],
+        boards=move_pose(state.boards, step[1][:, :6]),
+        sweeps=sweeps,
+        sides=state.sides + step[1][:, 6 + count :] if unknowns.sides else state.sides,
+    )
+
+
+CHART = [1, 2, 4, 5]  # of [w, v]
+
+
+def chart_parameters(head):
+    """The axis as angles out of and within the scan plane, and minus y, z of its foot, shape (4,)."""
+    axis = axis_of(pose_transform(head))
+    return np.r_[
+        np.arctan2(axis.direction[2], axis.direction[0]),
+        np.arctan2(-axis.direction[1], axis.direction[0]),
+        -axis.foot[1:],
+    ]
+
+
+def prior_terms(head, prior):
+    """Differences from the prior in the chart (4,), and their Jacobian (4, 4) by the chart's increments.
+
+    The direction is compared by ``R0 R^T e_x``, the offset by the foot points, both in the prior's head frame.
+    """
+    reference = pose_array(head_from_axis(axis_of(prior.T_head_lrf)))
+    turn = reference[:, :3] @ head[:, :3].T
+    along, arm = turn[:, 0], np.array([0.0, head[1, 3], head[2, 3]])
+    r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]
+    J = np.zeros((4, 4))
+    for column, w in enumerate(np.eye(3)[1:]):
+        spun = -turn @ np.cross(w, [1.0, 0.0, 0.0])
+        J[:2, column] = spun[2], -spun[1]
+        J[2:, column] = -(turn @ np.cross(w, arm))[1:]
+    J[2:, 2:] = turn[1:, 1:]
+    return r, J
+
+
+def move_head(head, step):
+    """Move a head pose array in the 4-dof chart."""
+    delta = np.zeros(step.shape[:-1] + (6,))
+    delta[..., CHART] = step
+    return move_pose(head, delta)
+
+
+def sight_normals(lines, model):
+    """Unit normals of the planes through the camera centre and image lines, and lengths of ``K^T l``."""
+    raw = lines @ model.matrix
+    length = np.linalg.norm(raw, axis=-1)
+    return raw / length[..., None], length
+
+
+def sight_block(pose, points, normals, sigma):
+    """Distances of points from planes through the camera centre, metres.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+    points, normals : ndarray, shape (..., n, 3)
+    sigma : ndarray, shape (..., n)
+        Metres.
+
+    Returns
+    -------
+    Block
+    """
+    rotated = rotate_points(pose, points)
+    residuals = np.sum(normals * (rotated + pose[..., None, :, 3]), axis=-1)
+    normals = np.broadcast_to(normals, rotated.shape)
+    return Block(
+        residuals, gradient_by_pose(rotated, normals), np.broadcast_to(1.0 / np.asarray(sigma), residuals.shape)
+    )

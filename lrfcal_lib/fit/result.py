@@ -1,0 +1,165 @@
+"""What every solver hands back, names of unknowns, and the checks that every solver begins with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import DegenerateGeometry
+
+AXIS_NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "offset_in_scan_plane", "offset_across_scan_plane")
+AXIS_WORDS = (
+    "the tilt of the axis out of the scan plane",
+    "the turn of the axis within the scan plane",
+    "the offset of the axis within the scan plane",
+    "the offset of the axis across the scan plane",
+)
+
+
+@dataclass(frozen=True)
+class PlatformPrior:
+    """A rough measurement of the axis.
+
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+    sigma_direction : float
+        Radians, of each of the two angles.
+    sigma_offset : float
+        Metres, of each of the two offsets.
+    """
+
+    T_head_lrf: RigidTransform
+    sigma_direction: float
+    sigma_offset: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver hands back.
+
+    Attributes
+    ----------
+    transform : RigidTransform or None
+        The estimate (a stack of them for a batch of trials).
+    parameters : ndarray, shape (..., k)
+        For a transform its rotation vector and translation (radians, metres), then whatever else was unknown.
+    names : tuple of str, length k
+    converged : bool or ndarray of bool
+    iterations : int
+    cost_history : ndarray, shape (iterations + 1, ...)
+        Half the sum of squared whitened residuals (of the loss, where one is used).
+    residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
+        Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]`` for a transform).
+    weights : ndarray, shape (..., n)
+        Robust weights, 1 without a loss.
+    covariance : ndarray, shape (..., k, k)
+        Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the stated noise is too
+        small, and the covariance is multiplied by `inflation`, chi-square per degree of freedom; never shrunk below 1.
+    covariance_placements : ndarray, shape (..., k, k), or None
+        Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T`` where ``d_g`` is the
+        change of the estimate when placement g is left out. Model errors are common to one placement, which the first
+        covariance cannot know. None where one placement alone carries an unknown, or with fewer than three placements.
+    unobservable : tuple of str
+        Motions that the data do not determine, in words.
+    method : str
+    n_observations : int
+    chi2 : float or ndarray
+        Sum of squared whitened residuals (weighted).
+    inflation : float or ndarray
+        1 where chi-square agrees with the stated noise.
+    model : CameraModel or None
+        Refined intrinsics of a joint refinement.
+    board_poses : ndarray, shape (p, 4, 4), or None
+        Refined ``T_camera_board`` of a joint refinement, in the order of the observations' `placements`.
+    state : object
+        What the core moved about: everything that was unknown, shared or not.
+    """
+
+    transform: RigidTransform | None
+    parameters: np.ndarray
+    names: tuple[str, ...]
+    converged: bool | np.ndarray
+    iterations: int
+    cost_history: np.ndarray
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    weights: np.ndarray
+    covariance: np.ndarray
+    covariance_placements: np.ndarray | None
+    unobservable: tuple[str, ...]
+    method: str
+    n_observations: int
+    chi2: float | np.ndarray
+    inflation: float | np.ndarray
+    model: CameraModel | None = None
+    board_poses: np.ndarray | None = None
+    state: Any = None
+
+    @property
+    def sigma(self):
+        """Standard deviations of the increments from `covariance`, shape (..., k)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def sigma_placements(self):
+        """Standard deviations from `covariance_placements`, shape (..., k), or None."""
+        found = self.covariance_placements
+        return None if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+
+    @property
+    def trusted(self):
+        """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
+
+        Of every parameter the larger standard deviation of propagated noise and scatter over placements, with the
+        correlations of the noise: the scatter of a few placements says little about correlations.
+        """
+        if self.covariance_placements is None:
+            return self.covariance
+        ratio = np.ones_like(self.sigma)
+        known = (self.sigma > 0) & np.isfinite(self.sigma)
+        np.divide(self.sigma_placements, self.sigma, out=ratio, where=known)
+        grow = np.fmax(ratio, 1.0)
+        return grow[..., :, None] * self.covariance * grow[..., None, :]
+
+    @property
+    def trusted_sigma(self):
+        """Standard deviations from `trusted`, shape (..., k)."""
+        return np.sqrt(np.diagonal(self.trusted, axis1=-2, axis2=-1))
+
+    def __repr__(self):
+        state = "converged" if np.all(self.converged) else "NOT converged"
+        return (
+            f"Solution({self.method}: {state} after {self.iterations} iterations, {self.n_observations} observations)"
+        )
+
+
+FIELDS = {
+    "crossing": ("crossing_points", "crossing_covariance", "crossing_lines", "crossing_line_sigma"),
+    "plane": ("plane_points", "plane_covariance", "board_poses", "board_covariance"),
+    "scene": ("scene_points", "scene_covariance", "scene_pixels", "scene_sigma_px"),
+}
+
+
+def check_finite(obs, kind):
+    """Refuse observations of a kind ('crossing', 'plane' or 'scene') that hold a NaN or an infinity."""
+    for name in FIELDS[kind]:
+        values = np.asarray(getattr(obs, name), float)
+        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise ValueError(
+                f"{name} of camera '{obs.camera}' is not finite in row {row}: {values[row].ravel()[:3]}: leave them out"
+            )
+
+
+def check_count(found, least, what, camera):
+    """Refuse too few observations, with words for what they leave open."""
+    if found < least:
+        raise DegenerateGeometry(
+            f"camera '{camera}': {found} {what}, at least {least} needed: the rest of the pose stays unobservable"
+        )

@@ -1,0 +1,1 @@
+"""What all stages speak of: geometry, cameras, boards, observations."""

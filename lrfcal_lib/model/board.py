@@ -1,0 +1,136 @@
+"""The calibration board: outline, edges, printed pattern."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """A printed chessboard.
+
+    Attributes
+    ----------
+    columns, rows : int
+        Inner corners along x and y of the board frame.
+    square : float
+        Side of a square, metres.
+    origin : tuple of float
+        Board coordinates of the first inner corner, metres.
+    """
+
+    columns: int
+    rows: int
+    square: float
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def points(self):
+        """Inner corners row by row in the board frame, shape (rows * columns, 3), metres."""
+        y, x = np.mgrid[: self.rows, : self.columns] * self.square
+        return np.stack([x + self.origin[0], y + self.origin[1], 0.0 * x], axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board with straight edges.
+
+    Attributes
+    ----------
+    name : str
+    edges : tuple of str
+        Names of the straight edges in order around the outline (x to y in the board frame).
+    corners : ndarray, shape (n_edges, 2), or None
+        Outline in the board frame, metres: edge i runs from corner i to corner i + 1. None where the outline was
+        never measured; :mod:`lrfcal_lib.preprocess.survey` then measures it in the scale of the pattern.
+    pattern : Chessboard or None
+    features : tuple of str
+        The two edges that equations (7) to (14) call 1 and 2.
+    """
+
+    name: str
+    edges: tuple[str, ...]
+    corners: np.ndarray | None = None
+    pattern: Chessboard | None = None
+    features: tuple[str, str] = ("", "")
+
+    def lines(self):
+        """Edges as board-frame lines ``a x + b y + c = 0`` with (a, b) the unit normal that points out of the board.
+
+        Returns
+        -------
+        ndarray, shape (n_edges, 3)
+
+        Raises
+        ------
+        ValueError
+            If the outline is not known.
+        """
+        return outline_lines(self.known_corners())
+
+    def lengths(self):
+        """Edge lengths in metres, keyed by edge name."""
+        corners = self.known_corners()
+        return dict(zip(self.edges, np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), strict=True))
+
+    def known_corners(self):
+        if self.corners is None:
+            raise ValueError(f"the outline of board '{self.name}' is not known: measure it from images first")
+        return np.asarray(self.corners, float)
+
+
+def outline_lines(corners):
+    """Lines ``a x + b y + c = 0`` of a polygon's sides, unit normals outwards.
+
+    Parameters
+    ----------
+    corners : array_like, shape (n, 2)
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Row i belongs to the side from corner i to corner i + 1.
+    """
+    corners = np.asarray(corners, float)
+    along = np.roll(corners, -1, axis=0) - corners
+    turn = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
+    normal = np.sign(turn) * np.stack([along[:, 1], -along[:, 0]], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.column_stack([normal, -np.sum(normal * corners, axis=1)])
+
+
+def corners_of_lines(lines):
+    """Corners of a polygon from its sides: corner i is where side i - 1 meets side i.
+
+    Parameters
+    ----------
+    lines : array_like, shape (n, 3)
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+    """
+    lines = np.asarray(lines, float)
+    points = np.cross(np.roll(lines, 1, axis=0), lines)
+    return points[:, :2] / points[:, 2:]
+
+
+def triangle_board(ab=0.315, ac=0.380, name="triangle", pattern=None):
+    """The paper's board: a right-angled triangle with its right angle A in the origin, B on +x and C on +y.
+
+    Parameters
+    ----------
+    ab, ac : float
+        The two edges at the right angle, metres. The paper states 315, 380 and 491 mm; a right angle makes the third
+        edge 493.58 mm (the stated one closes at 89.4 deg), so the exact right angle is used here.
+    name : str
+    pattern : Chessboard, optional
+
+    Returns
+    -------
+    Board
+        Edges ``ab``, ``bc``, ``ca``.
+    """
+    corners = np.array([[0.0, 0.0], [ab, 0.0], [0.0, ac]])
+    return Board(name, ("ab", "bc", "ca"), corners, pattern, ("ab", "ca"))

@@ -1,0 +1,155 @@
+"""A session after preprocessing: the board in every sweep and image, and what could not be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.preprocess import board_in_scan, edges_in_scan, survey
+from lrfcal_lib.preprocess.survey import Outline
+from lrfcal_lib.session.cache import cached
+from lrfcal_lib.session.read import Session
+from lrfcal_lib.session.stated import SessionError
+
+VARIANTS = ("last_beam", "half_step")
+LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot
+
+
+@dataclass(frozen=True)
+class PitchNoise:
+    """How far the recorded pitch of a sweep is off.
+
+    Attributes
+    ----------
+    offset : float
+        Standard deviation of the whole sweep, radians.
+    stretch : float
+        Standard deviation of its scale, a fraction of the angle from the middle of the sweep.
+    """
+
+    offset: float = 0.0
+    stretch: float = 0.0
+
+    def sigma(self, pitch, middle):
+        """Standard deviation of recorded pitch angles, radians."""
+        return np.hypot(self.offset, self.stretch * (np.asarray(pitch) - middle))
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A session after preprocessing.
+
+    Attributes
+    ----------
+    session : Session
+    board : Board
+        With its outline, measured from the images where the session does not state it and they show it.
+    scans : dict of int to BoardScan
+        By placement.
+    edges : dict of str to dict of int to ScanEdges
+        Crossings of scan lines with the board's sides by edge-point variant and placement.
+    swept : dict of str to dict of int to ScanEdges
+        The same across the scan lines, where the sweep enters and leaves the board.
+    models : dict of str to CameraModel
+    views : dict of str to dict of int to BoardView
+        By camera and placement; where there are images at several pitch angles, the one with most edges.
+    outline : Outline or None
+    relief : ndarray or None
+        Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the images).
+    names : dict of int to dict of int to str
+        Board edge of each side of the scan, by placement and side number.
+    pitch_noise : PitchNoise
+        What the recordings themselves tell about it.
+    problems : dict of int or str to str
+        Why a placement (or a part of it) cannot be used.
+    """
+
+    session: Session
+    board: Board
+    scans: dict
+    edges: dict
+    swept: dict
+    models: dict = field(default_factory=dict)
+    views: dict = field(default_factory=dict)
+    outline: Outline | None = None
+    relief: np.ndarray | None = None
+    names: dict = field(default_factory=dict)
+    pitch_noise: PitchNoise = PitchNoise()
+    problems: dict = field(default_factory=dict)
+
+    def seen(self, camera, placement):
+        """The board in an image of a placement, and the very image that it was found in: there may be several.
+
+        Parameters
+        ----------
+        camera : str
+        placement : int
+
+        Returns
+        -------
+        view : BoardView
+        image : ndarray of uint8, shape (h, w, 3)
+        """
+        view = self.views[camera][placement]
+        records = self.session.images(camera, placement=placement)
+        return view, self.session.read_image(next(r for r in records if r.file.name == view.file))
+
+
+@cached
+def prepare_scans(session):
+    """The board in every sweep of a session, and its edge points in both variants.
+
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    Prepared
+        Without cameras.
+    """
+    scans, problems = {}, {}
+    edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
+    for placement in session.board_placements:
+        try:
+            scans[placement] = board_in_scan.find_board(session.sweep(placement), session.board, session.T_head_lrf)
+            for variant in VARIANTS:
+                edges[variant][placement] = edges_in_scan.edge_points(scans[placement], variant)
+                if np.ptp(scans[placement].sweep.pitch) > LEAST_SWEEP:
+                    swept[variant][placement] = edges_in_scan.sweep_edges(scans[placement], variant)
+        except (board_in_scan.BoardNotFound, SessionError) as error:
+            problems[placement] = str(error)
+    return Prepared(session, session.board, scans, edges, swept, problems=problems)
+
+
+def prepare_images(prepared):
+    """The board in every image of a session, the cameras' intrinsics, and the board's outline.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        With scans.
+
+    Returns
+    -------
+    Prepared
+    """
+    seen = survey.views_of(prepared.session, one_per_placement=True)
+    views = {camera: _main_views(found) for camera, found in seen.views.items()}
+    problems = prepared.problems | ({"outline": f"faces of the board only: {seen.unseen}"} if seen.unseen else {})
+    found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
+    return replace(prepared, models=seen.models, views=views, **found)
+
+
+def _main_views(views):
+    """The view of every placement with a pose and most edges; images that belong to no placement are left out."""
+    best = {}
+    for view in views:
+        if view.placement < 0:
+            continue
+        rank = (view.T_camera_board is not None, len(view.edges))
+        if view.placement not in best or rank > best[view.placement][0]:
+            best[view.placement] = (rank, view)
+    return {placement: view for placement, (_, view) in sorted(best.items())}

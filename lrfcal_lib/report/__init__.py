@@ -1,0 +1,1 @@
+"""Notebooks on a session, and the report made of them."""

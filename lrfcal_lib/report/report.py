@@ -1,0 +1,456 @@
+"""Execute the notebooks on a session and write what they found to ``reports/<session>/``."""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import ctypes
+import fcntl
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+
+from lrfcal_lib.report.notebook import ROOT, SCRATCH, SHIPPED
+from lrfcal_lib.session.cache import VARIABLE as CACHE
+from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.stated import SessionError
+
+NOTEBOOKS = ROOT / "notebooks"
+PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
+OWN_FILES = ("figures", "tables", "parts", "findings.json", "calibration.json", "cloud.ply", "index.html")
+PART = ".report-"  # begins the names of folders in which a report is being written
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+CELL_SECONDS = 600
+_CLIENTS = set()  # of the notebooks that are being executed
+THUMBNAIL_WIDTH = 900  # pixels
+SOURCE_OF_SESSIONS = (
+    "there is no session to report on. Either name one, `make report SESSION=path`, or get the public recording that "
+    "the README describes: GitHub repository suijingfeng/LaserSeteroCalibration @ f9a70a9, folder "
+    "ZED_STEREO_LASER_SWEEP, put its files in FOLDER/lms400_zed and run `LRFCAL_REAL_DATA=FOLDER make report`"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One executed notebook.
+
+    Attributes
+    ----------
+    name : str
+        File name without suffix.
+    title, thesis : str
+        First heading and first paragraph.
+    seconds : float
+    error : str
+        Traceback of the cell that failed, '' if none did.
+    """
+
+    name: str
+    title: str
+    thesis: str
+    seconds: float
+    error: str
+
+
+def make_report(session_path, out=None, jobs=2, notebooks=None):
+    """Execute the notebooks on a session and write the report.
+
+    Parameters
+    ----------
+    session_path : path
+        Folder of a session.
+    out : path, optional
+        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and
+        takes its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that
+        are no report's are kept.
+    jobs : int
+        Notebooks executed at the same time.
+    notebooks : sequence of path, optional
+        All of ``notebooks/`` unless given.
+
+    Returns
+    -------
+    list of Run
+        In the order of the notebooks. A notebook that fails is reported, the others still run.
+
+    Raises
+    ------
+    SessionError
+        If the session is not sound, or the folder of the report cannot be written.
+    """
+    begin = time.monotonic()
+    session_path = Path(session_path).resolve()
+    session = open_session(session_path)
+    out = Path(out or ROOT / "reports" / session_path.name).resolve()
+    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb") if notebooks is None else map(Path, notebooks))
+    with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
+        environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
+        runs = _execute_all(paths, environment, new, jobs)
+        found = _collect(new, [run.name for run in runs])
+        _write_index(new, session, runs, found, time.monotonic() - begin)
+    return runs
+
+
+def execute(path, environment, folder=None):
+    """Execute a notebook in a fresh kernel.
+
+    Parameters
+    ----------
+    path : Path
+    environment : dict of str to str
+        Variables for the kernel on top of this process's own.
+    folder : path, optional
+        Where the kernel runs, the notebook's own folder unless given.
+
+    Returns
+    -------
+    notebook : NotebookNode
+        With outputs, up to the cell that failed if one did.
+    error : str
+        Traceback of that cell, or ''.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
+
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": str(folder or Path(path).parent)}}
+    options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
+    client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
+    _CLIENTS.add(client)
+    try:
+        client.execute(env={**os.environ, **environment})
+    except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
+        return _without_widgets(notebook), _plain(str(problem)) or type(problem).__name__
+    finally:
+        _CLIENTS.discard(client)
+    return _without_widgets(notebook), ""
+
+
+def _without_widgets(notebook):
+    """Leave out live widgets: without their kernel they show an error, and pages would load them from elsewhere."""
+    notebook.metadata.pop("widgets", None)
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+    return notebook
+
+
+def store(path, session_path, cache=""):
+    """Execute a notebook and store it in place as run from top to bottom.
+
+    Parameters
+    ----------
+    path : Path
+    session_path : Path or None
+        What the notebook works on if it asks for a session.
+    cache : str
+        Folder of stages that other notebooks have worked out (see :mod:`lrfcal_lib.session.cache`).
+
+    Returns
+    -------
+    str
+        Traceback of the cell that failed (the file is then left alone), or ''.
+
+    Notes
+    -----
+    Outputs made from a recording that is not simulated are dropped (its pictures may carry no licence), execution
+    counts are kept. Once a simulated session ships with the repository the outputs stay.
+    """
+    import nbformat
+
+    environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
+    notebook, error = execute(path, environment | {CACHE: cache})
+    if error:
+        return error
+    if _asks_for_session(notebook) and not open_session(session_path).simulated:
+        for cell in notebook.cells:
+            if cell.cell_type == "code":
+                cell.outputs = []
+    kernel = {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"}
+    notebook.metadata = nbformat.from_dict({"kernelspec": kernel, "language_info": {"name": "python"}})
+    nbformat.write(notebook, path)
+    return ""
+
+
+def default_session():
+    """The session to report on when none is named.
+
+    Returns
+    -------
+    Path
+        The shipped session, else the public recording where a copy of it is at hand, freshly imported.
+
+    Raises
+    ------
+    SessionError
+        That says where to get one.
+    """
+    if (SHIPPED / "session.json").is_file():
+        return SHIPPED
+    recordings = Path(os.environ.get("LRFCAL_REAL_DATA") or ROOT.parent / "shared" / "real") / "lms400_zed"
+    if not recordings.is_dir():
+        raise SessionError(SOURCE_OF_SESSIONS)
+    from lrfcal_lib.session.importers import import_lasersetero
+
+    if SCRATCH.exists():
+        shutil.rmtree(SCRATCH)
+    SCRATCH.parent.mkdir(parents=True, exist_ok=True)
+    import_lasersetero(recordings, SCRATCH)
+    return SCRATCH
+
+
+def main(argv=None):
+    """Command line; returns 0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it."""
+    parser = argparse.ArgumentParser(prog="python -m lrfcal_lib report", description=__doc__)
+    parser.add_argument("session", nargs="*", help="folders of sessions (default: the one at hand)")
+    parser.add_argument("--out", help="folder of the report (default reports/<session>)")
+    parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
+    parser.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
+    options = parser.parse_args(argv)
+    # nohup ignores SIGHUP
+    before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
+    try:
+        sessions = [Path(path) for path in options.session] or [default_session()]
+        return max(_store_all(session) if options.store else _report(session, options) for session in sessions)
+    except SessionError as problem:
+        print(f"lrfcal: {problem}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as stopped:
+        number = signal.Signals((*stopped.args, signal.SIGINT)[0])
+        print(f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was", file=sys.stderr)
+        return 128 + number
+    finally:
+        for pair in before:
+            signal.signal(*pair)
+
+
+def _stop(number, frame):
+    """End in order; from here on there is only cleaning up, which nothing should interrupt."""
+    for other in ENDING:
+        signal.signal(other, signal.SIG_IGN)
+    raise KeyboardInterrupt(number)
+
+
+def _report(session, options):
+    begin = time.monotonic()
+    out = Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
+    runs = make_report(session, out, options.jobs)
+    failed = [run for run in runs if run.error]
+    for run in failed:
+        print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
+    seconds = time.monotonic() - begin
+    print(f"{len(runs) - len(failed)} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
+    return 1 if failed else 0
+
+
+def _store_all(session):
+    open_session(session)
+    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
+    with TemporaryDirectory(prefix="lrfcal-") as cache:
+        errors = {path.name: store(path, session.resolve(), cache) for path in paths}
+    for name, error in errors.items():
+        print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
+    return 1 if any(errors.values()) else 0
+
+
+def _asks_for_session(notebook):
+    return any("notebook.start(" in cell.source for cell in notebook.cells if cell.cell_type == "code")
+
+
+@contextmanager
+def _beside(out):
+    """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        for left in out.parent.glob(PART + "*"):
+            with suppress(OSError), open(left / "lock", "a") as lock:  # its owner lives, or it is somebody else's
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left)
+        box = Path(mkdtemp(prefix=".lrfcal-", dir=out.parent))
+        try:
+            with open(box / "lock", "w") as lock:  # it ends with this process, however that ends
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                box = box.rename(box.with_name(PART + box.name))  # named as others expect only once it is locked
+                (box / "report" / "parts").mkdir(parents=True)
+                yield box / "report"
+                _take_place(box / "report", out)
+        finally:
+            shutil.rmtree(box, ignore_errors=True)
+    except OSError as error:
+        raise SessionError(f"{out}: cannot write the report ({error}); --out names another folder") from error
+
+
+def _take_place(new, out):
+    """Exchange two folders in one step; files in the old one that are no report's come along."""
+
+    def ours(folder, names):
+        pages = (name for name in names if re.fullmatch("[0-9]{2}_.*[.]html", name))
+        return {*OWN_FILES, *pages} if folder == str(out) else ()
+
+    out.mkdir(exist_ok=True)
+    shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE: os.rename replaces nothing but empty folders
+    if ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange):
+        old = out.rename(out.with_name(out.name + ".old"))  # disks that cannot exchange, such as NFS
+        new.rename(out)
+        shutil.rmtree(old)
+
+
+def _execute_all(paths, environment, out, jobs):
+    """Execute and convert notebooks side by side; the bar shows on a terminal only."""
+    from tqdm import tqdm
+
+    with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
+        # later notebooks go through more stages and take longer, so they start first
+        futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
+        with ExitStack() as stack, tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+            stack.callback(_end, futures)
+            for future in as_completed(futures):
+                bar.set_postfix_str(futures[future].stem)
+                bar.update()
+    return sorted((future.result() for future in futures), key=lambda run: run.name)
+
+
+def _end(futures):
+    """End the notebooks that are being executed and leave out the others."""
+    for future in futures:
+        future.cancel()
+    while not all(future.done() for future in futures):
+        for client in list(_CLIENTS):
+            with suppress(AttributeError):  # its kernel is just starting
+                client.km.provisioner.process.kill()
+        time.sleep(0.05)
+
+
+def _run(path, environment, out):
+    """Execute one notebook and write its HTML."""
+    begin = time.monotonic()
+    notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
+    title, thesis = _headline(notebook, path.stem)
+    (out / f"{path.stem}.html").write_text(_to_html(notebook, title), encoding="utf-8")
+    return Run(path.stem, title, thesis, time.monotonic() - begin, error)
+
+
+def _to_html(notebook, title):
+    """A page of prose, figures and numbers, without the code."""
+    from nbconvert import HTMLExporter
+
+    exporter = HTMLExporter(
+        exclude_input=True, exclude_input_prompt=True, exclude_output_prompt=True, embed_images=True, theme="light"
+    )
+    page, _ = exporter.from_notebook_node(notebook, resources={"metadata": {"name": title}})
+    return re.sub(r"(<body[^>]*>)", r'\1<p style="margin:1em 2em"><a href="index.html">report</a></p>', page, count=1)
+
+
+def _headline(notebook, name):
+    """First heading and first paragraph of a notebook."""
+    text = "\n\n".join(cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown")
+    blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
+    title = next((block.lstrip("# ").splitlines()[0] for block in blocks if block.startswith("#")), name)
+    thesis = next((re.sub(r"[*`>]", "", block).strip() for block in blocks if not block.startswith("#")), "")
+    return title, " ".join(thesis.split())
+
+
+def _plain(text):
+    """Text without the colour codes of a terminal."""
+    return re.sub(r"\x1b\[[0-9;]*m", "", text)
+
+
+def _collect(out, names):
+    """What the notebooks found, by notebook; the findings of all go to ``findings.json``."""
+    found = {}
+    for name in names:
+        part = out / "parts" / f"{name}.json"
+        found[name] = json.loads(part.read_text()) if part.is_file() else {"figures": [], "tables": [], "findings": []}
+    shutil.rmtree(out / "parts")
+    findings = [{"notebook": name, **entry} for name in names for entry in found[name]["findings"]]
+    (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
+    return found
+
+
+def _write_index(out, session, runs, found, seconds):
+    from jinja2 import Environment
+
+    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
+        (Path(__file__).parent / "report.html.jinja").read_text(encoding="utf-8")
+    )
+    page = template.render(
+        session=session,
+        runs=runs,
+        found=found,
+        seconds=seconds,
+        failed=[run for run in runs if run.error],
+        findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
+        verdicts=[entry for run in runs for entry in found[run.name].get("verdicts", [])],
+        thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
+        rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
+        files=[name for name in ("calibration.json", "cloud.ply", "findings.json") if (out / name).is_file()],
+        provenance=_provenance(session),
+    )
+    (out / "index.html").write_text(page, encoding="utf-8")
+
+
+def _thumbnail(file):
+    """A picture as data URI, so that the page needs no other file; '' where there is none."""
+    import cv2
+
+    picture = cv2.imread(str(file))
+    if picture is None:
+        return ""
+    scale = THUMBNAIL_WIDTH / picture.shape[1]
+    if scale < 1:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def _rows(file, shapes):
+    """Header, alignment and formatted cells of a table; None where its notebook failed before writing it."""
+    import pandas as pd
+
+    if not file.is_file():
+        return None
+    table = pd.read_csv(file)
+    numeric = [table[c].dtype.kind in "if" for c in table.columns]
+    cells = [
+        ["–" if pd.isna(v) else shapes.get(c, "{}").format(v) for c, v in zip(table.columns, row, strict=True)]
+        for row in table.itertuples(index=False)
+    ]
+    return {"columns": list(table.columns), "numeric": numeric, "cells": cells}
+
+
+def _provenance(session):
+    """Pairs of name and value that tell what the report was made from."""
+    digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
+    pairs = [("session.json (SHA-256)", digest), ("date", date.today().isoformat()), ("commit", _commit())]
+    pairs += [("Python", platform.python_version())] + [(name, version(name)) for name in PACKAGES]
+    return [(name, value) for name, value in pairs if value]
+
+
+def _commit():
+    """Commit of the checkout, marked where files differ from it; '' outside a git repository."""
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return done.stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,255 @@
+"""Other people's recordings as sessions."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.session.read import image_size
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
+from lrfcal_lib.session.write import SessionWriter
+
+# LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder ZED_STEREO_LASER_SWEEP.
+# The authors' platform: pitch axis along x through (y = 0, z = 0.2 m) of their cloud frame; at the angle p = 90 deg
+# the LRF looks along +y. Ours is the same platform with the origin on the axis and pitch = p - 90 deg.
+LASERSETERO_HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])
+LASERSETERO_CLOUD = RigidTransform.from_translation([0.0, 0.0, 0.2])  # T_cloud_platform
+# The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of bolted plates.
+LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
+LASERSETERO_STEP_DEG = 0.1
+LASERSETERO_VIEW_DEG = (55.0, 125.0)  # the LMS400 sees 70 deg
+LASERSETERO_COUNT = 0.001  # metres, one count of the LMS400
+LASERSETERO_SQUARE = 0.0775
+LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
+
+
+def import_lasersetero(src, dst, *, intrinsics="own"):
+    """Make a session of the public LMS400 + ZED recording.
+
+    Parameters
+    ----------
+    src : path-like
+        Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and ``Calib_Results_{left,right}.m``.
+    dst : path-like
+        The new session.
+    intrinsics : {'own', 'published'}
+        'own' leaves the intrinsics open, so that they are estimated from the session's images; 'published' takes them
+        from the Bouguet results. Either way the published ones are kept in the session's reference.
+
+    Returns
+    -------
+    largest_miss : float
+        Metres between the published points and those rebuilt from range, bearing and pitch, at most.
+
+    Raises
+    ------
+    SessionError
+        For missing or truncated files, an existing target, or if rebuilding misses by more than 0.01 mm.
+    """
+    src = Path(src)
+    if intrinsics not in ("own", "published"):
+        raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
+    clouds = _numbered(src, "plane_*.pcd")
+    published = {name: read_bouguet(src / f"Calib_Results_{name}.m") for name in ("left", "right")}
+    images = {name: _numbered(src, f"{name}_*.png") for name in published}
+    models = {name: result["model"] if intrinsics == "published" else None for name, result in published.items()}
+    cameras = [CameraInfo(name, "platform", *_size(images[name]), models[name]) for name in published]
+    misses = []
+    about = _about(published) | {"platform_sigma": LASERSETERO_PLATFORM_SIGMA}
+    with SessionWriter(dst, _lasersetero_board(), _lms400(), cameras, LASERSETERO_HEAD, **about) as writer:
+        for placement, file in clouds.items():
+            ranges, bearings, pitch, miss = recover_polar(read_pcd(file), file)
+            writer.add_sweep(placement, ranges, bearings, pitch)
+            misses.append(miss)
+        for name, files in images.items():
+            for placement, file in files.items():
+                writer.add_image(name, file, placement, purpose="board")
+    return max(misses)
+
+
+def _numbered(folder, pattern):
+    numbered = ((re.search(r"_(\d+)\.", file.name), file) for file in sorted(folder.glob(pattern)))
+    found = {int(number[1]): file for number, file in numbered if number}
+    if not found:
+        raise SessionError(f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?")
+    return found
+
+
+def _size(files):
+    return image_size(next(iter(files.values())))
+
+
+def _lasersetero_board():
+    pattern = Chessboard(8, 6, LASERSETERO_SQUARE)
+    return Board("chessboard 9 x 7", ("top", "right", "bottom", "left"), None, pattern, ("left", "top"))
+
+
+def _lms400():
+    view = tuple(np.radians(LASERSETERO_VIEW_DEG))
+    return LrfInfo("SICK LMS400", view, np.radians(LASERSETERO_STEP_DEG), 0.005, 0.0, LASERSETERO_COUNT, 3.0)
+
+
+def _about(published):
+    reference = {
+        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b is "
+        "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes).",
+        "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
+        "T_left_platform": transform_to_json(_published_left()),
+        "cameras": {name: result["reference"] for name, result in published.items()},
+    }
+    source = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+    return {"licence": "none stated by the authors", "source": source, "reference": reference}
+
+
+def _published_left():
+    """The authors' result (printed with four digits, so made orthonormal again), for our platform frame."""
+    phi = [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
+    T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], Rotation.from_matrix(phi))
+    return T_left_cloud * LASERSETERO_CLOUD
+
+
+def recover_polar(points, name="points"):
+    """Range, bearing and pitch that the published points of a LaserSetero cloud were made of.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Authors' cloud frame, metres, in the order of acquisition.
+    name : str
+        For messages.
+
+    Returns
+    -------
+    ranges : ndarray, shape (L, B)
+        Metres on the sensor's grid of 1 mm, NaN outside the published part.
+    bearings : ndarray, shape (B,)
+        Ours, ascending, radians: the sensor's whole field of view in steps of 0.1 deg.
+    pitch : ndarray, shape (L,)
+        Ours, radians, one value a scan line.
+    miss : float
+        Largest distance between published and rebuilt points, metres.
+
+    Raises
+    ------
+    SessionError
+        If `miss` exceeds 0.01 mm: then the points are not what the authors' model makes.
+
+    Notes
+    -----
+    With n the offset of the scan plane from the axis, S the distance ahead inside it and p the authors' angle,
+    ``y + i z = (n - i S) exp(i p)``: the modulus gives S, the argument p. A new scan line starts where the
+    bearing restarts or the pitch jumps.
+    """
+    x, ahead, offset = LASERSETERO_HEAD.translation
+    p_platform = LASERSETERO_CLOUD.inv().apply(points)
+    S = np.sqrt(np.maximum(np.sum(p_platform[:, 1:] ** 2, axis=1) - offset**2, 0.0))
+    across, along = p_platform[:, 0] - x, S - ahead
+    ranges = np.round(np.hypot(across, along) / LASERSETERO_COUNT) * LASERSETERO_COUNT
+    steps = np.round(np.degrees(np.arctan2(along, across)) / LASERSETERO_STEP_DEG)  # 0.1 deg, so no .5 to round
+    bearing = np.radians(steps * LASERSETERO_STEP_DEG)
+    # Once more with the exact range and bearing: now the pitch carries the rounding of the published points only.
+    S = ranges * np.sin(bearing) + ahead
+    pitch = np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
+    line = np.cumsum(np.r_[True, (np.diff(steps) >= 0) | (np.abs(np.diff(pitch)) > 1e-4)]) - 1
+    pitch = np.bincount(line, pitch) / np.bincount(line)
+    rebuilt = lrf_to_platform(polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD)
+    miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
+    if not miss <= LARGEST_MISS:
+        raise SessionError(
+            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than {1000 * LARGEST_MISS:g} mm; "
+            "not points of this rig?"
+        )
+    return *_on_grid(ranges, steps, line), pitch, miss
+
+
+def _on_grid(ranges, steps, line):
+    first, last = (round(v / LASERSETERO_STEP_DEG) for v in LASERSETERO_VIEW_DEG)
+    if steps.min() < first or steps.max() > last:
+        reached = LASERSETERO_STEP_DEG * steps.min(), LASERSETERO_STEP_DEG * steps.max()
+        raise SessionError(f"bearings reach {reached[0]:.1f} .. {reached[1]:.1f} deg, the LMS400 sees 55 .. 125 deg")
+    grid = np.full((line[-1] + 1, last - first + 1), np.nan)
+    grid[line, steps.astype(int) - first] = ranges
+    return grid, np.radians(np.arange(first, last + 1) * LASERSETERO_STEP_DEG)
+
+
+def read_pcd(file):
+    """Points of an ASCII PCD file with the fields x y z.
+
+    Parameters
+    ----------
+    file : path-like
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+
+    Raises
+    ------
+    SessionError
+        For a missing file, other fields, binary data, or fewer points than the header states.
+    """
+    try:
+        head, _, body = Path(file).read_text(errors="replace").partition("DATA ascii")
+    except OSError as error:
+        raise SessionError(f"{file}: {error.strerror}") from error
+    fields, count = (re.search(rf"^{key} (.*)$", head, re.MULTILINE) for key in ("FIELDS", "POINTS"))
+    if not body or not fields or not count or fields[1].split() != ["x", "y", "z"]:
+        raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
+    try:
+        points = np.array(body.split(), dtype=float)
+    except ValueError as error:
+        raise SessionError(f"{file}: {error}; damaged?") from error
+    if points.size != 3 * int(count[1]) or points.size == 0:
+        raise SessionError(f"{file}: {points.size / 3:g} points, the header states {count[1]}; truncated?")
+    return points.reshape(-1, 3)
+
+
+def read_bouguet(file):
+    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox.
+
+    Parameters
+    ----------
+    file : path-like
+
+    Returns
+    -------
+    dict
+        ``model``: CameraModel (the toolbox prints three standard deviations; they become the covariance's diagonal);
+        ``reference``: the same as plain numbers, with ``T_camera_board`` by image number (millimetres became metres).
+
+    Raises
+    ------
+    SessionError
+        If the file or a value in it is missing.
+    """
+    try:
+        text = Path(file).read_text(errors="replace")
+    except OSError as error:
+        raise SessionError(f"{file}: {error.strerror}") from error
+    found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", text, re.MULTILINE)
+    values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
+    need = ("fc", "cc", "kc", "nx", "ny", "fc_error", "cc_error", "kc_error")
+    lacking = [key for key in need if key not in values]
+    if lacking:
+        raise SessionError(f"{file}: no value of {', '.join(lacking)}; is this a Calib_Results.m?")
+    intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
+    model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
+    model = model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2))
+    return {"model": model, "reference": _bouguet_reference(intrinsics, sigma / 3, values)}
+
+
+def _bouguet_reference(intrinsics, sigma, values):
+    poses = {}
+    for key in values:
+        if (number := re.fullmatch(r"omc_(\d+)", key)) and f"Tc_{number[1]}" in values:
+            rotation, shift = Rotation.from_rotvec(values[key]), values[f"Tc_{number[1]}"] / 1000
+            poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
+    both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma}
+    return {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}

@@ -1,0 +1,873 @@
+"""Telegrams of the SICK LMS2xx: bytes to values and back, without a port."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+STX = 0x02
+HOST, DEVICE = 0x00, 0x80  # address byte of telegrams to and from a device with the factory's address
+LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices
+OVERHEAD = 6  # start, address, length, CRC
+CHUNK = 512  # telegrams worked on at once: what fits into the cache of a processor
+
+
+class TelegramError(ValueError):
+    """Bytes that are no telegram, or not the telegram asked for."""
+
+
+@dataclass(frozen=True)
+class Telegram:
+    """A telegram without its frame.
+
+    Attributes
+    ----------
+    code : int
+        Command, or command + 0x80 in replies.
+    data : bytes
+        Without code and status.
+    status : int or None
+        Last byte of a reply; None in telegrams to the device.
+    address : int
+    """
+
+    code: int
+    data: bytes = b""
+    status: int | None = None
+    address: int = HOST
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Where the telegrams of a byte stream are.
+
+    Attributes
+    ----------
+    offset, length : ndarray of int, shape (n,)
+        Of whole telegrams with the right CRC.
+    code : ndarray of uint8, shape (n,)
+    rejected : ndarray of int, shape (m,)
+        Offsets outside of those where a telegram seems to begin whose CRC is wrong.
+    skipped : int
+        Bytes before `pending` that belong to no telegram.
+    pending : int
+        Where a telegram may begin whose end has not come yet, so that the bytes from there on must be kept; the number
+        of bytes if there is none.
+    """
+
+    offset: np.ndarray
+    length: np.ndarray
+    code: np.ndarray
+    rejected: np.ndarray
+    skipped: int
+    pending: int
+
+
+def crc16(data):
+    """The device's checksum of one byte string, or of each row of an array.
+
+    Parameters
+    ----------
+    data : bytes-like, or ndarray of uint8, shape (n, L)
+
+    Returns
+    -------
+    int, or ndarray of uint16, shape (n,)
+
+    Notes
+    -----
+    One shift for each byte, which enters together with the byte before it: ``crc <- x crc + (b[k-1] << 8 | b[k])``
+    modulo ``x^16 + x^15 + x^2 + 1`` over GF(2). That is linear, ``crc = sum_k x^(L-1-k) w_k``, so the words before the
+    last h (h a power of two) are multiplied by ``x^h`` and added to those, until one word is left.
+    It is weaker than other checksums of 16 bits: bit j of byte k enters as ``x^(L-1-k+j) (x^7 + 1)``, the same as bit
+    j + 1 of the next byte, so two flips on such a diagonal go unseen (one in L of all pairs or so).
+    """
+    if not isinstance(data, np.ndarray):
+        return int(crc16(np.frombuffer(data, np.uint8)[None])[0])
+    if data.shape[1] == 0:
+        return np.zeros(len(data), np.uint16)
+    words = data.astype(np.uint16)
+    words[:, 1:] |= words[:, :-1] << 8
+    while (n := words.shape[1]) > 1:
+        last = 1 << ((n - 1).bit_length() - 1)
+        rest = words[:, n - last :].copy()
+        rest[:, 2 * last - n :] ^= _times_power(last)[words[:, : n - last]]
+        words = rest
+    return words[:, 0]
+
+
+@lru_cache
+def _times_power(power):
+    """Table of every 16-bit polynomial times ``x^power``, shape (65536,); for powers of two."""
+    if power > 1:
+        root = _times_power(power // 2)
+        return root[root]
+    table = np.arange(1 << 16, dtype=np.uint16)
+    return (table << 1) ^ np.where(table & 0x8000, 0x8005, 0).astype(np.uint16)
+
+
+def encode_telegram(code, data=b"", *, status=None, address=None):
+    """Bytes of a telegram.
+
+    Parameters
+    ----------
+    code : int
+        Command, or reply code.
+    data : bytes-like
+    status : int, optional
+        Makes it a reply: appended to the data.
+    address : int, optional
+        By default 0x00 to the device, 0x80 for replies.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    ValueError
+        For numbers that are no bytes, or more than 65535 bytes of data.
+    """
+    address = address if address is not None else HOST if status is None else DEVICE
+    body = bytes([_byte(code, "code")]) + bytes(data) + (b"" if status is None else bytes([_byte(status, "status")]))
+    if len(body) > 0xFFFF:
+        raise ValueError(f"a telegram holds up to 65535 bytes, got {len(body)}: send several")
+    head = bytes([STX, _byte(address, "address")]) + len(body).to_bytes(2, "little")
+    return head + body + crc16(head + body).to_bytes(2, "little")
+
+
+def _byte(value, what):
+    if not 0 <= value <= 0xFF:
+        raise ValueError(f"{what} must be a byte, 0 to 255, got {value}")
+    return int(value)
+
+
+def parse_telegram(raw):
+    """Take the frame off one telegram.
+
+    Parameters
+    ----------
+    raw : bytes-like
+        From the start byte to the CRC, nothing else.
+
+    Returns
+    -------
+    Telegram
+
+    Raises
+    ------
+    TelegramError
+        If the start byte, the length or the CRC is wrong.
+    """
+    raw = bytes(raw)
+    if len(raw) < OVERHEAD + 1 or raw[0] != STX:
+        raise TelegramError(f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}")
+    stated = int.from_bytes(raw[2:4], "little") + OVERHEAD
+    if stated != len(raw):
+        raise TelegramError(f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream")
+    sent, computed = int.from_bytes(raw[-2:], "little"), crc16(raw[:-2])
+    if sent != computed:
+        raise TelegramError(f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again")
+    reply = raw[1] >= DEVICE and len(raw) > OVERHEAD + 1
+    return Telegram(raw[4], raw[5:-3] if reply else raw[5:-2], raw[-3] if reply else None, raw[1])
+
+
+def split_stream(data, *, replies=True):
+    """Find the telegrams in a byte stream, whatever lies between them.
+
+    Parameters
+    ----------
+    data : bytes-like
+    replies : bool
+        Only what devices send (address byte 0x80 and above); otherwise only what hosts send.
+
+    Returns
+    -------
+    Stream
+
+    Notes
+    -----
+    Every place that looks like a beginning is checked by its CRC; of overlapping ones the first counts. By chance one
+    in 65536 of the places inside other bytes passes.
+    """
+    data = np.frombuffer(data, np.uint8)
+    offset, length = _candidates(data, replies)
+    ends = offset + length
+    whole = ends <= len(data)
+    good = np.zeros(len(offset), bool)
+    good[whole] = check_crc(data, offset[whole], length[whole])
+    good[good] = _first_of_overlapping(offset[good], ends[good])
+    inside = _covered(offset, offset[good], ends[good])
+    rejected = offset[whole & ~good & ~inside]
+    begun = offset[~whole & (offset >= ends[good].max(initial=0))]
+    pending = int(begun[0]) if len(begun) else _begun_head(data, ends[good].max(initial=0))
+    skipped = pending - int(length[good].sum())
+    return Stream(offset[good], length[good], data[offset[good] + 4], rejected, skipped, pending)
+
+
+def _begun_head(data, used):
+    """Where the last bytes, too few to state a length, may begin a telegram; the number of bytes if nowhere."""
+    first = max(len(data) - 3, int(used))
+    starts = np.flatnonzero(data[first:] == STX)
+    return first + int(starts[0]) if len(starts) else len(data)
+
+
+def _candidates(data, replies):
+    """Offsets where a telegram may begin, and the lengths stated there."""
+    offset = np.flatnonzero(data == STX)
+    offset = offset[offset + 4 <= len(data)]
+    offset = offset[(data[offset + 1] >= DEVICE) == replies]
+    length = data[offset + 2] + (data[offset + 3].astype(int) << 8) + OVERHEAD
+    plausible = (length > OVERHEAD) & (length <= LONGEST)
+    return offset[plausible], length[plausible]
+
+
+def check_crc(data, offset, length):
+    """Which telegrams have the right CRC.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n,)
+    offset, length : ndarray of int, shape (m,)
+        Whole telegrams inside of `data`.
+
+    Returns
+    -------
+    ndarray of bool, shape (m,)
+    """
+    good = np.zeros(len(offset), bool)
+    for rows in alike(length):
+        for first in range(0, len(rows), CHUNK):
+            some = rows[first : first + CHUNK]
+            raw = cut(data, offset[some], length[some[0]])
+            good[some] = crc16(raw[:, :-2]) == _word(raw, -2)
+    return good
+
+
+def alike(*keys):
+    """Rows with the same keys, each group in order."""
+    if not len(keys[0]):
+        return []
+    _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
+
+
+def cut(data, offset, length):
+    """Pieces of the same length, shape (n, length)."""
+    return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
+
+
+def _word(raw, at):
+    return raw[:, at].astype(np.uint16) | (raw[:, at + 1].astype(np.uint16) << 8)
+
+
+def _first_of_overlapping(offset, ends):
+    """Mask of the intervals that do not begin inside of one kept before."""
+    if np.all(offset[1:] >= ends[:-1]):
+        return np.ones(len(offset), bool)
+    keep, free = np.zeros(len(offset), bool), 0
+    for row, (first, last) in enumerate(zip(offset.tolist(), ends.tolist(), strict=True)):
+        if first >= free:
+            keep[row], free = True, last
+    return keep
+
+
+def _covered(points, first, last):
+    """Which points lie in one of the ordered intervals [first, last)."""
+    if not len(first):
+        return np.zeros(len(points), bool)
+    before = np.searchsorted(first, points, side="right") - 1
+    return (before >= 0) & (points < last[before])
+
+
+SCAN = 0xB0
+METRES = {"cm": 0.01, "mm": 0.001}
+UNITS = ("cm", "mm")
+REASONS = (
+    "valid", "not valid", "dazzled", "overflow", "noise", "channel error", "larger than maximum", "reserved",
+)  # fmt: skip
+BEYOND = REASONS.index("larger than maximum")
+# index: how far a value is below the largest one its bits can hold
+_REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
+_BELOW_TOP = {1: 0, 2: 1, 3: 2, 4: 4, 5: 5, BEYOND: 8}
+
+
+@dataclass(frozen=True)
+class Mode:
+    """How a measuring mode shares the 16 bits of a value.
+
+    Attributes
+    ----------
+    bits : int
+        Lower bits, the range.
+    flags : tuple of str
+        Names of the upper bits, lowest first; 'reflector' where they hold a level instead.
+    """
+
+    bits: int
+    flags: tuple[str, ...]
+
+    @property
+    def top(self):
+        """Largest number the range bits hold: 'not valid'."""
+        return (1 << self.bits) - 1
+
+    @property
+    def largest(self):
+        """Largest number that is a range; the nine above are special."""
+        return self.top - 9
+
+
+MODES = {
+    0: Mode(13, ("field A", "field B", "dazzled")),
+    1: Mode(13, ("reflector",)),
+    2: Mode(13, ("field A", "field B", "field C")),
+    3: Mode(14, ("reflector",)),
+    4: Mode(14, ("field A", "field B")),
+    5: Mode(15, ("reflector",)),
+    6: Mode(15, ("field A",)),
+}
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Scans of the same number of values.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n,)
+        Which of the telegrams asked for these are.
+    words : ndarray of uint16, shape (n, B)
+        As sent, flags included.
+    ranges : ndarray, shape (n, B)
+        Metres; inf where the device says larger than its maximum, NaN for all other special values.
+    unit : {'cm', 'mm'}
+    mode : int
+    partial : ndarray of int, shape (n,)
+        Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
+    scan_index, telegram_index : ndarray of int, shape (n,)
+        Real-time indices, modulo 256; -1 where the device does not send them.
+    status : ndarray of uint8, shape (n,)
+    address : ndarray of uint8, shape (n,)
+    """
+
+    rows: np.ndarray
+    words: np.ndarray
+    ranges: np.ndarray
+    unit: str
+    mode: int
+    partial: np.ndarray
+    scan_index: np.ndarray
+    telegram_index: np.ndarray
+    status: np.ndarray
+    address: np.ndarray
+
+    @property
+    def reasons(self):
+        """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
+        return value_reasons(self.words, self.mode)
+
+    @property
+    def flags(self):
+        """Upper bits of every value, see `MODES`; ndarray of uint8, shape (n, B)."""
+        return (self.words >> MODES[self.mode].bits).astype(np.uint8)
+
+
+def mode_of(number):
+    """The measuring mode of a number.
+
+    Raises
+    ------
+    ValueError
+        For modes that send no range with special values.
+    """
+    if number not in MODES:
+        raise ValueError(f"measuring mode {number:#04x} is none of 0x00 to 0x06: set one of those (command 77)")
+    return MODES[number]
+
+
+def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
+    """Values of a scan as a device sends them.
+
+    Parameters
+    ----------
+    ranges : array_like
+        Metres, rounded to the unit. Whatever is larger than the mode can hold, inf included, becomes 'larger than
+        maximum'; NaN becomes 'not valid'.
+    unit : {'cm', 'mm'}
+    mode : int
+        Measuring mode, 0 to 6.
+    reasons : array_like of int, optional
+        Index into `REASONS` for each value; where it is not 0 the range does not count.
+    flags : array_like of int
+        The upper bits.
+
+    Returns
+    -------
+    ndarray of uint16
+        In the shape of `ranges`.
+
+    Raises
+    ------
+    ValueError
+        For negative ranges, flags that the mode has no bits for, an unknown unit, mode or reason.
+    """
+    ranges, mode, flags = np.asarray(ranges, float), mode_of(mode), np.asarray(flags)
+    if np.any(ranges < 0):
+        raise ValueError(f"a range is {np.nanmin(ranges):g} m: ranges are positive, use NaN for no return")
+    if np.any(flags < 0) or np.any(flags >> (16 - mode.bits)):
+        raise ValueError(f"flags must be 0 to {(1 << (16 - mode.bits)) - 1} in this mode, got up to {flags.max()}")
+    counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[_unit(unit)])
+    words = np.where(counts > mode.largest, mode.top - _BELOW_TOP[BEYOND], counts).astype(np.uint16)
+    words = np.where(np.isnan(ranges), np.uint16(mode.top), words)
+    reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons)
+    if unknown := set(np.unique(reasons).tolist()) - {0, *_BELOW_TOP}:
+        raise ValueError(f"reasons are 1 to {BEYOND}, 0 for a range, got {sorted(unknown)}")
+    for reason, below in _BELOW_TOP.items():
+        words = np.where(reasons == reason, np.uint16(mode.top - below), words)
+    return words | (flags.astype(np.uint16) << np.uint16(mode.bits))
+
+
+def _unit(unit):
+    if unit not in METRES:
+        raise ValueError(f"unit is one of {', '.join(METRES)}, got {unit!r}")
+    return unit
+
+
+def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE):
+    """Telegram 0xB0 of values that are encoded already.
+
+    Parameters
+    ----------
+    words : array_like of uint16, shape (B,)
+    unit : {'cm', 'mm'}
+    partial : int
+        0 to 3 for the quarters of a degree of an interlaced scan, -1 for a whole scan.
+    indices : tuple of int, optional
+        Real-time indices: scan and telegram, modulo 256.
+    status, address : int
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    ValueError
+        For more values or another partial scan than a telegram can state.
+    """
+    words = np.asarray(words)
+    if np.any(words < 0) or np.any(words > 0xFFFF):
+        raise ValueError(f"values are 16 bits, 0 to 65535, got {words.min()} to {words.max()}")
+    if words.ndim != 1 or len(words) > 401:
+        raise ValueError(f"a scan has up to 401 values in one row, got shape {words.shape}")
+    if partial not in (-1, 0, 1, 2, 3):
+        raise ValueError(f"partial is 0 to 3, or -1 for a whole scan, got {partial}")
+    count = len(words) | UNITS.index(_unit(unit)) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
+    tail = b"" if indices is None else bytes(i % 256 for i in indices)
+    data = count.to_bytes(2, "little") + words.astype("<u2").tobytes() + tail
+    return encode_telegram(SCAN, data, status=status, address=address)
+
+
+def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, flags=0, **options):
+    """Telegram 0xB0 of a scan: :func:`encode_values`, then :func:`encode_words` with the other options.
+
+    Examples
+    --------
+    >>> encode_scan([4.0, np.inf, np.nan], unit="cm").hex(" ")
+    '02 80 0a 00 b0 03 00 90 01 f7 1f ff 1f 10 a2 f5'
+    """
+    return encode_words(encode_values(ranges, unit=unit, mode=mode, reasons=reasons, flags=flags), unit=unit, **options)
+
+
+def decode_scan(raw, mode=0):
+    """One scan out of the telegram 0xB0.
+
+    Parameters
+    ----------
+    raw : bytes-like
+        The whole telegram.
+    mode : int
+        Measuring mode, which the telegram does not tell; 0 is the factory's.
+
+    Returns
+    -------
+    Scans
+        With one row.
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another telegram, or its number of values does not fit its length.
+    """
+    telegram = parse_telegram(raw)
+    if telegram.code != SCAN:
+        raise TelegramError(f"code {telegram.code:02X} is no scan (B0)")
+    found = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
+    if not found:
+        raise TelegramError(f"{len(raw)} bytes do not fit the number of values {telegram.data[:2].hex(' ') or 'none'}")
+    return found[0]
+
+
+def decode_scans(data, offset, length, mode=0):
+    """The scans among the telegrams of a stream, many at once. CRCs are not looked at again.
+
+    Parameters
+    ----------
+    data : bytes-like
+    offset, length : ndarray of int, shape (n,)
+        As of :func:`split_stream`.
+    mode : int
+        Measuring mode.
+
+    Returns
+    -------
+    list of Scans
+        One for each number of values, unit, and kind (whole or partial, with or without indices). Telegrams with
+        another code, or with a length that does not fit the number of values, are in none of them.
+    """
+    mode_of(mode)
+    data, length = np.frombuffer(data, np.uint8), np.asarray(length)
+    rows = np.flatnonzero(length >= 10)
+    rows = rows[data[offset[rows] + 4] == SCAN]
+    at = offset[rows]
+    word = data[at + 5] | (data[at + 6].astype(int) << 8)
+    extra = length[rows] - 10 - 2 * (word & 0x3FF)
+    sound = ((extra == 0) | (extra == 2)) & (word < 1 << 15)
+    rows, word, extra = rows[sound], word[sound], extra[sound]
+    groups = alike(word & 0xE3FF, extra)
+    return [_decode_alike(data, offset, rows[g], word[g], bool(extra[g[0]]), mode) for g in groups]
+
+
+def _decode_alike(data, offset, rows, word, indexed, mode):
+    values, unit = int(word[0] & 0x3FF), UNITS[word[0] >> 14]
+    words, ranges = np.empty((len(rows), values), np.uint16), np.empty((len(rows), values))
+    for first in range(0, len(rows), CHUNK):
+        some = slice(first, first + CHUNK)
+        words[some] = cut(data, offset[rows[some]] + 7, 2 * values).view("<u2")
+        ranges[some] = decode_values(words[some], unit=unit, mode=mode)
+    last = offset[rows] + 7 + 2 * values + 2 * indexed
+    scan, telegram = (data[last - k].astype(int) if indexed else np.full(len(rows), -1) for k in (2, 1))
+    partial = np.where(word >> 13 & 1, word >> 11 & 3, -1)
+    return Scans(rows, words, ranges, unit, mode, partial, scan, telegram, data[last], data[offset[rows] + 1])
+
+
+def decode_values(words, *, unit="mm", mode=0):
+    """Ranges of values as a device sends them.
+
+    Parameters
+    ----------
+    words : ndarray of uint16
+    unit : {'cm', 'mm'}
+    mode : int
+
+    Returns
+    -------
+    ndarray
+        Metres; inf where larger than maximum, NaN for all other special values.
+    """
+    mode = mode_of(mode)
+    counts = words & np.uint16(mode.top)
+    ranges = counts * METRES[_unit(unit)]
+    special = np.nonzero(counts > mode.largest)  # few, so they are looked up one by one
+    ranges[special] = np.where(_REASON_BELOW_TOP[mode.top - counts[special]] == BEYOND, np.inf, np.nan)
+    return ranges
+
+
+def value_reasons(words, mode=0):
+    """Why values are no ranges.
+
+    Parameters
+    ----------
+    words : ndarray of uint16
+    mode : int
+
+    Returns
+    -------
+    ndarray of uint8
+        Index into `REASONS`; 0 for a range.
+    """
+    mode = mode_of(mode)
+    counts = words & np.uint16(mode.top)
+    reasons = np.zeros(counts.shape, np.uint8)
+    special = np.nonzero(counts > mode.largest)
+    reasons[special] = _REASON_BELOW_TOP[mode.top - counts[special]]
+    return reasons
+
+
+# values of a whole scan -> first bearing and step in quarters of a degree
+_GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
+
+
+def scan_quarters(values, partial=-1):
+    """Bearings of the values of a scan, in quarters of a degree.
+
+    Parameters
+    ----------
+    values : int
+        How many there are; tells the variant (angle and resolution) of the device.
+    partial : int
+        -1 for a whole scan.
+
+    Returns
+    -------
+    ndarray of int, shape (values,)
+        0 at the right, 360 ahead; ascending. The 100 deg variants begin at 40 deg.
+
+    Raises
+    ------
+    TelegramError
+        If no variant sends that many values.
+    """
+    if partial >= 0:
+        if values != 181 - (partial > 0):
+            raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
+        return 4 * np.arange(values) + partial
+    if values not in _GRIDS:
+        known = ", ".join(map(str, sorted(_GRIDS)))
+        raise TelegramError(f"a whole scan has {known} values, got {values}: only a sub-range was asked for?")
+    first, step = _GRIDS[values]
+    return first + step * np.arange(values)
+
+
+STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xB2, 0xBA, 0xBB, 0xF4, 0xF7
+SEVERITIES = ("ok", "info", "warning", "error", "fatal")
+BAUD = {0x8067: 9600, 0x8033: 19200, 0x8019: 38400, 0x8001: 500000}
+CONFIGURATION_BYTES = 34
+
+
+@dataclass(frozen=True)
+class StatusByte:
+    """Last byte of every reply.
+
+    Attributes
+    ----------
+    severity : str
+        One of `SEVERITIES`, or 'unknown'.
+    restart_input, implausible, polluted : bool
+        Level of the RESTART input; measured values not plausible; window dirty.
+    """
+
+    severity: str
+    restart_input: bool
+    implausible: bool
+    polluted: bool
+
+
+@dataclass(frozen=True)
+class DeviceStatus:
+    """The parts of the status reply 0xB1 that a recording needs.
+
+    Attributes
+    ----------
+    firmware, serial : str
+    operating_mode : int
+        As of command 0x20; 0x24 streams, 0x25 waits for requests.
+    fault : int
+        0 for a sound device.
+    measuring_mode : int
+    scan_angle_deg, resolution_deg : float
+    baud : int or None
+        None for a rate that no manual lists.
+    address : int
+    unit : {'cm', 'mm'}
+    laser_on : bool
+    mirror_hz : float
+        Turns of the mirror per second; NaN where the motor does not turn.
+    """
+
+    firmware: str
+    serial: str
+    operating_mode: int
+    fault: int
+    measuring_mode: int
+    scan_angle_deg: float
+    resolution_deg: float
+    baud: int | None
+    address: int
+    unit: str
+    laser_on: bool
+    mirror_hz: float
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """The 34 bytes of configuration part 1 (0xF4, 0xF7, 0x77); older firmware sends fewer.
+
+    Attributes
+    ----------
+    block : bytes
+    """
+
+    block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
+
+    @property
+    def blanking_m(self):
+        """Ranges below are not measured, metres."""
+        return int.from_bytes(self.block[:2], "little") / 100
+
+    @property
+    def realtime_indices(self):
+        """Whether scans carry their indices."""
+        return bool(self.block[4] & 2)
+
+    @property
+    def measuring_mode(self):
+        """Key of `lms2xx.MODES`."""
+        return self.block[5]
+
+    @property
+    def unit(self):
+        """'cm' or 'mm'."""
+        return _unit_of(self.block[6])
+
+    def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
+        """The same with other values; what is None stays.
+
+        Returns
+        -------
+        Configuration
+        """
+        block = bytearray(self.block)
+        if realtime_indices is not None:
+            block[4] = block[4] & ~2 | 2 * bool(realtime_indices)
+        block[5] = block[5] if measuring_mode is None else measuring_mode
+        block[6] = block[6] if unit is None else UNITS.index(unit)
+        return Configuration(bytes(block))
+
+
+def encode_configuration(configuration, status=0x10):
+    """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring mode)."""
+    return encode_telegram(CONFIGURATION, configuration.block, status=status)
+
+
+def parse_status_byte(status):
+    """Meaning of the last byte of a reply.
+
+    Parameters
+    ----------
+    status : int
+
+    Returns
+    -------
+    StatusByte
+    """
+    level = status & 7
+    severity = SEVERITIES[level] if level < len(SEVERITIES) else "unknown"
+    return StatusByte(severity, bool(status & 0x20), bool(status & 0x40), bool(status & 0x80))
+
+
+def _data(raw, code, shortest):
+    """Data of a telegram that must have a code and a least number of bytes."""
+    telegram = parse_telegram(raw)
+    if telegram.code != code:
+        raise TelegramError(f"code {telegram.code:02X} is not the reply {code:02X} asked for")
+    if len(telegram.data) < shortest:
+        raise TelegramError(f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}")
+    return telegram.data
+
+
+def _unit_of(value):
+    if value >= len(UNITS):
+        raise TelegramError(f"unit {value} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)")
+    return UNITS[value]
+
+
+def parse_status(raw):
+    """Status reply 0xB1.
+
+    Parameters
+    ----------
+    raw : bytes-like
+        The whole telegram.
+
+    Returns
+    -------
+    DeviceStatus
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another reply, or too short.
+    """
+    data = b"\xb1" + _data(raw, STATUS, 123)  # offsets as in the manual, which counts the code as 0
+    number = {at: int.from_bytes(data[at : at + 2], "little") for at in (67, 107, 109, 116)}
+    return DeviceStatus(
+        firmware=_text(data[1:8]),
+        serial=_text(data[10:18]),
+        operating_mode=data[8],
+        fault=data[9],
+        measuring_mode=data[102],
+        scan_angle_deg=float(number[107]),
+        resolution_deg=number[109] / 100,
+        baud=BAUD.get(number[116]),
+        address=data[120],
+        unit=_unit_of(data[122]),
+        laser_on=bool(data[123]),
+        mirror_hz=1e6 / (90 * number[67]) if number[67] else float("nan"),
+    )
+
+
+def _text(data):
+    return data.decode("ascii", "replace").strip(" \0")
+
+
+def parse_type(raw):
+    """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063', 'V02.10')."""
+    return tuple(part.strip() for part in _text(_data(raw, TYPE, 1)).split(";"))
+
+
+def parse_errors(raw):
+    """Error reply 0xB2.
+
+    Returns
+    -------
+    list of tuple
+        Severity (one of `SEVERITIES`, 'unknown'), whether it is over, number of the error.
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged or another reply.
+    """
+    data = _data(raw, ERRORS, 0)
+    pairs = zip(data[::2], data[1::2], strict=False)
+    return [(parse_status_byte(kind).severity, kind >= 0x80, number) for kind, number in pairs]
+
+
+def parse_variant(raw):
+    """Variant reply 0xBB.
+
+    Returns
+    -------
+    accepted : bool
+    scan_angle_deg, resolution_deg : float
+        What holds now.
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another reply, or too short.
+    """
+    data = _data(raw, VARIANT, 5)
+    return bool(data[0]), float(int.from_bytes(data[1:3], "little")), int.from_bytes(data[3:5], "little") / 100
+
+
+def parse_configuration(raw):
+    """Configuration out of the replies 0xF4 (read) or 0xF7 (written).
+
+    Returns
+    -------
+    Configuration
+
+    Raises
+    ------
+    TelegramError
+        If it is damaged, another reply, or shorter than the measuring mode and the unit need.
+    """
+    if bytes(raw[4:5]) == bytes([CONFIGURED]):
+        return Configuration(_data(raw, CONFIGURED, 8)[1:])
+    return Configuration(_data(raw, CONFIGURATION, 7))

@@ -1,0 +1,516 @@
+"""Write a session so that a crash loses at most what was being written, placement by placement."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lrfcal_lib.session.read import (
+    DROPPED,
+    IMAGE_COLUMNS,
+    PART,
+    PLATFORM_COLUMNS,
+    PURPOSES,
+    check_image_size,
+    check_scans,
+    image_size,
+    read_npz,
+    unfinished_of,
+)
+from lrfcal_lib.session.stated import (
+    LOCK,
+    SCHEMA,
+    SessionError,
+    alone,
+    board_to_json,
+    camera_to_json,
+    folder,
+    listed,
+    lrf_to_json,
+    naming,
+    opened,
+    parse_session,
+    platform_to_json,
+    read_bytes,
+    read_json,
+    read_table,
+    short,
+)
+from lrfcal_lib.session.telegrams import INDEX_COLUMNS
+
+
+class SessionWriter:
+    """Write a session so that a crash loses at most what was being written.
+
+    Every sweep and every image is on the disk (fsync) before the table that names it is; :func:`finish` then makes
+    the one scans.npz, or leaves the telegrams as they are. An interrupted session is completed by ``finish(path)``.
+    A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
+
+    Parameters
+    ----------
+    path : path-like
+        Must not exist or be an empty folder.
+    board : Board
+    lrf : LrfInfo
+    cameras : iterable of CameraInfo
+    T_head_lrf : RigidTransform, optional
+    platform_sigma : tuple of float, optional
+        How well it is known: direction (radians) and offset (metres).
+    name : str, optional
+        The folder's name by default.
+    licence, source : str
+    simulated : bool
+    reference : dict, optional
+    placements : iterable of int
+        Placements known beforehand; those of added sweeps and images are added.
+
+    Raises
+    ------
+    SessionError
+        If the target exists, or something cannot stand in a session.
+
+    Examples
+    --------
+    ``with SessionWriter(path, board, lrf, cameras) as writer: writer.add_sweep(1, ranges, bearings, pitch)``
+    """
+
+    def __init__(
+        self, path, board, lrf, cameras=(), T_head_lrf=None, *, name=None, licence="", source="", simulated=False,
+        platform_sigma=None, reference=None, placements=(),
+    ):  # fmt: skip
+        self.path = Path(path)
+        self.cameras = {camera.name: camera for camera in cameras}
+        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
+        self.telegrams = self.path / "lrf" / "telegrams.bin"
+        data = {"schema": SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source}
+        rig = {"lrf": lrf_to_json(lrf), "platform": platform_to_json(T_head_lrf, platform_sigma)}
+        rig["cameras"] = {c.name: camera_to_json(c) for c in self.cameras.values()}
+        data |= {"simulated": simulated, "board": board_to_json(board), "rig": rig}
+        self.data = {**data, "placements": [int(p) for p in placements], "reference": reference or {}}
+        with naming(self.path):
+            parse_session(json.loads(json.dumps(self.data)))
+        if self.path.exists() and not self.path.is_dir():
+            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+        self.path.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(alone(self.path))
+            self._create()
+            self._held = stack.pop_all()
+
+    def _create(self):
+        if set(os.listdir(self.path)) - {LOCK}:
+            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+        self._make_folders()
+        self._write_index()
+
+    def _make_folders(self):
+        for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
+            with folder(self.path / name / "any", self.path, make=True):
+                pass
+        if self.cameras and not os.path.lexists(self.path / "images.csv"):
+            self._write("images.csv", ",".join(IMAGE_COLUMNS) + "\n")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        with contextlib.closing(self):
+            if kind is None:
+                complete(self.path)
+
+    def close(self):
+        """Write nothing any more: others may."""
+        self._held.close()
+
+    def _write(self, name, content):
+        write_file(self.path / name, content, self.path)
+
+    def _write_index(self):
+        self._write("session.json", json.dumps(self.data, indent=1) + "\n")
+
+    def _note_placement(self, placement):
+        if placement >= 0 and placement not in self.data["placements"]:
+            self.data["placements"] = sorted([*self.data["placements"], int(placement)])
+            self._write_index()
+
+    def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
+        """Append the scan lines of a placement.
+
+        Parameters
+        ----------
+        placement : int
+        ranges : array_like, shape (L, B)
+            Metres, NaN where nothing came back.
+        bearings : array_like, shape (B,)
+            Radians, ascending; the same in all sweeps of a session.
+        pitch : array_like, shape (L,)
+            Radians.
+        time_s : array_like, shape (L,), optional
+        intensities : array_like, shape (L, B), optional
+
+        Raises
+        ------
+        SessionError
+            For wrong shapes, wrong units, or other bearings than before.
+        """
+        if self.telegrams.exists():
+            raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
+        ranges, bearings = np.array(ranges, float, ndmin=2), np.asarray(bearings, float)
+        time_s = np.full(len(ranges), np.nan) if time_s is None else np.asarray(time_s, float)
+        scans = {"ranges": ranges, "bearings": bearings, "pitch": np.asarray(pitch, float), "time_s": time_s}
+        scans |= {"placement": np.full(len(ranges), placement)}
+        scans |= {} if intensities is None else {"intensities": np.asarray(intensities, float)}
+        with naming(f"{self.path}: placement {placement}"):
+            scans = check_scans(scans)
+            if self.bearings is not None and not np.array_equal(self.bearings, bearings):
+                raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
+        self.bearings, self.parts = bearings, self.parts + 1
+        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
+        self._note_placement(placement)
+
+    def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
+        """Append telegrams as the device sent them.
+
+        Parameters
+        ----------
+        placement : int
+            -1 for telegrams of no placement, such as the configuration (0xF4) or status (0xB1) reply with which a
+            recording should begin: it states the measuring mode, which a scan does not tell.
+        telegrams : sequence of bytes
+            One telegram each, from its start byte to its CRC, also damaged ones.
+        pitch : float or array_like, shape (len(telegrams),)
+            Radians.
+        time_s : float or array_like, shape (len(telegrams),)
+
+        Raises
+        ------
+        SessionError
+            For other numbers of pitches or times, pitches that are no radians, something that is no bytes, or a session
+            that has scan lines already.
+        """
+        with naming(f"{self.path}: placement {placement}"):
+            telegrams = _checked_telegrams(telegrams)
+            pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
+            if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
+                raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
+            if self.parts:
+                raise ValueError("the session has scan lines: add_sweep, or begin another one")
+        index = self.telegrams.with_name("index.csv")
+        if not os.path.lexists(index):
+            self._write("lrf/index.csv", ",".join(INDEX_COLUMNS) + "\n")
+        self._note_placement(placement)
+        offset = append_file(self.telegrams, b"".join(telegrams), self.path)
+        rows = []
+        for raw, angle, time in zip(telegrams, np.degrees(pitch), time_s, strict=True):
+            rows.append([cell(time), offset, len(raw), "" if placement < 0 else placement, cell(angle)])
+            offset += len(raw)
+        append_file(index, "".join(",".join(map(str, row)) + "\n" for row in rows), self.path)
+
+    def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
+        """Append an image.
+
+        Parameters
+        ----------
+        camera : str
+        image : path-like or ndarray of uint8, shape (h, w, 3)
+            A PNG or JPEG file, copied byte for byte, or blue-green-red pixels.
+        placement : int
+            -1 for none.
+        pitch : float
+            Radians.
+        time_s : float
+        purpose : {'board', 'intrinsics', 'scene'}
+
+        Raises
+        ------
+        SessionError
+            For an unknown camera or purpose, or an image of another size than the camera's.
+        """
+        if camera not in self.cameras or purpose not in PURPOSES:
+            known = f"cameras are {short(self.cameras)}, purposes {short(PURPOSES)}"
+            raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
+        pixels = isinstance(image, np.ndarray)
+        size = image.shape[1::-1] if pixels else image_size(image)
+        check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
+        self.shots[camera] += 1
+        suffix = ".png" if pixels else Path(image).suffix.lower()
+        name = f"images/{camera}/{self.shots[camera]:04d}{suffix}"
+        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else read_bytes(image))
+        self._note_placement(placement)
+        cells = [cell(time_s), camera, name, "" if placement < 0 else placement, cell(math.degrees(pitch)), purpose]
+        append_file(self.path / "images.csv", ",".join(map(str, cells)) + "\n", self.path)
+
+
+def finish(path):
+    """Complete a session: one scans.npz out of the sweeps. Also completes a session whose recording was interrupted.
+
+    A recording of telegrams is complete as it is; only what a crash cut off at the end of a table is removed.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    SessionError
+        If there is no sweep, or one of them is damaged, or somebody records this session.
+    """
+    try:
+        with alone(path):
+            complete(Path(path))
+    except FileNotFoundError as error:
+        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
+
+
+def complete(path):
+    """As :func:`finish`, for who writes the session already."""
+    mend_tables(path)
+    if os.path.lexists(path / "lrf" / "telegrams.bin"):
+        return
+    parts = [path / "lrf" / name for name in listed(path / "lrf", path) if PART.fullmatch(name)]
+    if not parts:
+        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
+    sweeps = [read_npz(part, path) for part in parts]
+    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
+    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, compress=True)
+    for part in parts:
+        part.unlink()
+
+
+def mend_tables(path):
+    """Remove rows that a crash cut off at the end of a session's tables."""
+    for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
+        if os.path.lexists(table) and not (data := read_bytes(table, path)).endswith(b"\n"):
+            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
+
+
+def _checked_telegrams(telegrams):
+    if isinstance(telegrams, bytes | bytearray):
+        raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
+    telegrams = [bytes(raw) for raw in telegrams]
+    if not telegrams or min(map(len, telegrams)) < 7:
+        lengths = short(sorted({len(raw) for raw in telegrams}))
+        raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {lengths}")
+    return telegrams
+
+
+def cell(value):
+    """A number as it stands in a table, empty for NaN."""
+    return "" if math.isnan(value) else repr(round(float(value), 9))
+
+
+def write_file(file, content, within, compress=False):
+    """Write a file of a session so that it is complete or not there: under another name, fsync, rename."""
+    draft = file.with_name(file.name + ".draft")
+    with folder(file, within) as inside:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(draft.name, dir_fd=inside)
+        with opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+            if isinstance(content, dict):
+                (np.savez_compressed if compress else np.savez)(stream, **content)
+            else:
+                stream.write(content.encode() if isinstance(content, str) else content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(draft.name, file.name, src_dir_fd=inside, dst_dir_fd=inside)
+        os.fsync(inside)
+
+
+def append_file(file, content, within):
+    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
+    left = memoryview(content.encode() if isinstance(content, str) else content)
+    with opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+        handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
+        try:
+            while left:
+                left = left[os.write(handle, left) :]
+            os.fsync(handle)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(handle, begin)  # half a row would spoil the next one
+            raise
+    return begin
+
+
+class SessionRecorder(SessionWriter):
+    """A :class:`SessionWriter` for recordings that may be interrupted and go on later.
+
+    While a session is recorded, session.json has the key ``unfinished``: the placement that was begun. The placement
+    joins ``placements`` when it is finished, in one renaming of session.json; until then every reader leaves it out.
+    Going on, or dropping a placement, marks what was recorded of it: its rows of index.csv lose their placement, its
+    images get the purpose 'dropped'. No telegram and no image is deleted.
+
+    Parameters
+    ----------
+    path : path-like
+        Must not exist or be an empty folder, unless the recording goes on.
+    resume : bool
+        Go on with the recording in `path`, if there is one.
+    board, lrf, cameras, T_head_lrf, name, licence, source, simulated, reference
+        As of :class:`SessionWriter`.
+
+    Raises
+    ------
+    SessionError
+        If there is a session already (or one that states another board or rig, where it goes on).
+    """
+
+    def __init__(self, path, board, lrf, cameras=(), T_head_lrf=None, *, resume=False, **about):
+        self._resume = resume
+        super().__init__(path, board, lrf, cameras, T_head_lrf, **about)
+
+    @property
+    def finished(self):
+        """Numbers of the finished placements."""
+        return tuple(self.data["placements"])
+
+    def _create(self):
+        stated = self.path / "session.json"
+        if self._resume and os.path.lexists(stated):
+            self._go_on(read_json(stated, self.path))
+        else:
+            self._begin(stated)
+        self._make_folders()
+        if not os.path.lexists(self.path / "platform.csv"):
+            self._write("platform.csv", ",".join(PLATFORM_COLUMNS) + "\n")
+
+    def _begin(self, stated):
+        """session.json comes first, so that a recording killed at once can go on."""
+        if set(os.listdir(self.path)) - {_draft(stated), LOCK}:
+            hint = "choose another name" if self._resume else "record with --resume to go on with it, or choose another"
+            raise SessionError(f"{self.path}: exists already; {hint}")
+        self.data["unfinished"] = []
+        self._write_index()
+
+    def _go_on(self, data):
+        """Take over what an earlier recording wrote, without the placement that it did not finish."""
+        mine = json.loads(json.dumps(self.data))
+        with naming(self.path / "session.json"):
+            placements = list(parse_session(data)["placements"])
+            left = unfinished_of(data)
+            for key in ("board", "rig"):
+                if data[key] != mine[key]:
+                    where = _first_difference(data[key], mine[key], key)
+                    raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
+        self.data = {**data, "placements": placements, "unfinished": list(left or ())}
+        self._make_folders()
+        mend_tables(self.path)
+        for placement in left or ():
+            self._mark_dropped(placement)
+        self.data["unfinished"] = []
+        self._write_index()
+        for camera in self.cameras:
+            there = listed(self.path / "images" / camera, self.path)
+            names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
+            self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
+
+    def begin_placement(self, placement):
+        """State that a placement is being recorded from now on.
+
+        Raises
+        ------
+        SessionError
+            If another one is, or the number was recorded already.
+        """
+        for other in self.data["unfinished"]:
+            raise SessionError(f"{self.path}: placement {other} is being recorded: finish it first")
+        if placement in self.finished or placement < 0:
+            raise SessionError(f"{self.path}: placement {placement} cannot be begun; recorded: {short(self.finished)}")
+        self.data["unfinished"] = [int(placement)]
+        self._write_index()
+
+    def finish_placement(self):
+        """State that the placement begun last is complete; from now on it is part of the session."""
+        if not self.data["unfinished"]:
+            raise SessionError(f"{self.path}: no placement is being recorded: begin one first")
+        before = dict(self.data)
+        self.data |= {"placements": sorted([*self.finished, *self.data["unfinished"]]), "unfinished": []}
+        try:
+            self._write_index()
+        except OSError:
+            self.data = before
+            raise
+
+    def drop_placement(self, placement):
+        """Take a placement, finished or not, out of the session; its number can be recorded again.
+
+        Raises
+        ------
+        SessionError
+            If there is no such placement.
+        """
+        if placement not in {*self.finished, *self.data["unfinished"]}:
+            raise SessionError(f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}")
+        self.data["placements"] = [p for p in self.finished if p != placement]
+        self.data["unfinished"] = [placement]
+        self._write_index()
+        self._mark_dropped(placement)
+        self.data["unfinished"] = []
+        self._write_index()
+
+    def add_platform(self, rows):
+        """Append to the log of the platform.
+
+        Parameters
+        ----------
+        rows : sequence of (float, float, float)
+            Host time (s), commanded and measured pitch (rad); NaN where a head was not told, or does not tell.
+        """
+        lines = [[cell(t), *(cell(math.degrees(a)) for a in angles)] for t, *angles in rows]
+        append_file(self.path / "platform.csv", "".join(",".join(line) + "\n" for line in lines), self.path)
+
+    def finish(self):
+        """Close the recording: nothing can be half done in it any more."""
+        for placement in self.data["unfinished"]:
+            self.drop_placement(placement)
+        del self.data["unfinished"]
+        self._write_index()
+        complete(self.path)
+        self.close()
+
+    def __exit__(self, kind, error, trace):
+        """A recording ends by :meth:`finish`; after anything else it may go on."""
+        self.close()
+
+    def shots_of(self, purpose):
+        """Numbers of images of a purpose, a dict by camera."""
+        rows = read_table(self.path / "images.csv", IMAGE_COLUMNS, self.path)[0] if self.cameras else []
+        return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
+
+    def _note_placement(self, placement):
+        if placement >= 0 and placement not in self.data["unfinished"]:
+            raise SessionError(f"{self.path}: placement {placement} was not begun")
+
+    def _mark_dropped(self, placement):
+        number = str(placement)
+        for file, columns, key, to in (
+            ("lrf/index.csv", INDEX_COLUMNS, "placement", ""),
+            ("images.csv", IMAGE_COLUMNS, "purpose", DROPPED),
+        ):
+            there = os.path.lexists(self.path / file)
+            rows = read_table(self.path / file, columns, self.path)[0] if there else []
+            mine = [row for row in rows if row["placement"] == number]
+            for row in mine:
+                row[key] = to
+            if mine:
+                lines = [",".join(columns), *(",".join(row.values()) for row in rows)]
+                self._write(file, "\n".join(lines) + "\n")
+
+
+def _draft(file):
+    return file.name + ".draft"
+
+
+def _first_difference(old, new, where):
+    """Which value of session.json differs, as text."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        key = next(k for k in [*old, *new] if old.get(k, ...) != new.get(k, ...))
+        return _first_difference(old.get(key), new.get(key), f"{where}.{key}")
+    return f"{where} is {old!r}, not {new!r}"
