@@ -176,7 +176,7 @@ def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
         raise RuntimeError("power cut")
     with (path / "images.csv").open("a") as table:
         table.write(",left,images/left/00")
-    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.finish"):
+    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"):
         open_session(path)
     finish(path)
     session = open_session(path)
