@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
-from lrfcal_lib.preprocess import edges_in_image, intrinsics, survey
+from lrfcal_lib.preprocess import board_in_image, edges_in_image, intrinsics, pattern_in_image, survey
 from lrfcal_lib.preprocess.board_in_image import (
     find_polygon,
     mirrored_pose,
@@ -151,7 +151,7 @@ def small_turn(a, b):
 @pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (0.6, 0.05), (-1.2, 0.05)])
 def test_corners_are_found_at_subpixel_level(roll, limit):
     pose = pose_of(roll)
-    found = survey.find_pattern(render(pose), PATTERN)
+    found = pattern_in_image.find_pattern(render(pose), PATTERN)
     exact = project(pose.apply(PATTERN.points()), MODEL)
     error = min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found)))
     assert error < limit
@@ -164,7 +164,7 @@ def test_white_squares_on_a_dark_board_are_found():
         exact = project(pose.apply(PATTERN.points()), MODEL)
         assert min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found))) < 0.1
     # a finder that has seen the negative still finds the positive
-    np.testing.assert_array_equal(finder(render(pose)), survey.find_pattern(render(pose), PATTERN))
+    np.testing.assert_array_equal(finder(render(pose)), pattern_in_image.find_pattern(render(pose), PATTERN))
 
 
 def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
@@ -193,7 +193,7 @@ def test_views_that_differ_most_come_first():
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
-    found = survey.find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
+    found = pattern_in_image.find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
     x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
 
@@ -201,7 +201,9 @@ def test_corners_run_clockwise_also_in_a_mirrored_image():
 def test_grey_images_give_the_same_corners():
     picture = render(pose_of())
     np.testing.assert_allclose(
-        survey.find_pattern(picture[..., 0], PATTERN), survey.find_pattern(picture, PATTERN), atol=0.01
+        pattern_in_image.find_pattern(picture[..., 0], PATTERN),
+        pattern_in_image.find_pattern(picture, PATTERN),
+        atol=0.01,
     )
 
 
@@ -209,19 +211,19 @@ def test_the_second_detector_helps_where_the_first_fails(monkeypatch):
     from lrfcal_lib.preprocess import pattern_in_image as pattern
 
     picture = render(pose_of())
-    exact = survey.find_pattern(picture, PATTERN)
+    exact = pattern_in_image.find_pattern(picture, PATTERN)
     monkeypatch.setattr(pattern, "_sectors", lambda *a: None)
-    classic = survey.find_pattern(picture, PATTERN)
+    classic = pattern_in_image.find_pattern(picture, PATTERN)
     monkeypatch.undo()
     monkeypatch.setattr(pattern, "_classic", lambda *a: None)
-    sectors = survey.find_pattern(picture, PATTERN)
+    sectors = pattern_in_image.find_pattern(picture, PATTERN)
     for other in (classic, sectors):
         assert min(np.abs(p - exact).max() for p in (other, turn_pattern(other))) < 0.3
 
 
 def test_no_pattern():
     with pytest.raises(survey.PatternNotFound, match="6 x 4 inner corners"):
-        survey.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
+        pattern_in_image.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
 
 
 def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
@@ -239,10 +241,10 @@ def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
 @pytest.mark.parametrize("beyond", [-5, 3, 20])
 def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
     pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
-    whole = survey.find_pattern(picture, pattern)
+    whole = pattern_in_image.find_pattern(picture, pattern)
     part = np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond])
     try:
-        found = survey.find_pattern(part, pattern)
+        found = pattern_in_image.find_pattern(part, pattern)
     except survey.PatternNotFound:
         assert beyond < 18  # where all squares are seen it is found
     else:
@@ -252,7 +254,7 @@ def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
 @pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3, 1), np.uint8), np.zeros((0, 0), np.uint8)])
 def test_what_is_no_image(bad):
     with pytest.raises(ValueError, match="must be uint8"):
-        survey.find_pattern(bad, PATTERN)
+        pattern_in_image.find_pattern(bad, PATTERN)
 
 
 # --- adjustment ----------------------------------------------------------------------------------------------------
@@ -579,7 +581,7 @@ def test_a_picked_edge_needs_two_points():
 
 
 def test_edge_of_a_hopeless_prediction():
-    with pytest.raises(survey.EdgeNotSeen, match="predicted length is 3 px"):
+    with pytest.raises(edges_in_image.EdgeNotSeen, match="predicted length is 3 px"):
         refine_edge(render(pose_of()), MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0)
 
 
@@ -865,7 +867,7 @@ def test_triangles_that_cannot_be_used():
     cut = render(triangle_pose(at=(0.42, 0.0, 0.9)), TRIANGLE)
     assert "cut by the image border" in survey.view_board(cut, TRIANGLE, MODEL).reason
     disc = cv2.circle(blank.copy(), (300, 200), 80, (20, 20, 20), -1)
-    with pytest.raises(survey.OutlineNotFound, match="no dark region"):
+    with pytest.raises(board_in_image.OutlineNotFound, match="no dark region"):
         find_polygon(disc, 3)
     square = Board("square", ("a", "b", "c", "d"), np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
     flat = cv2.fillPoly(blank.copy(), [np.array([[100, 100], [500, 140], [400, 200], [120, 300]])], (20, 20, 20))
@@ -973,7 +975,9 @@ def test_opencv_stereo_pairs(real_data):
     numbers = [i for i in range(1, 15) if i != 10]
     corners, models = [], []
     for camera, rms in (("left", 0.4087), ("right", 0.4586)):
-        pixels = [survey.find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers]
+        pixels = [
+            pattern_in_image.find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers
+        ]
         result = survey.estimate_intrinsics(pixels, pattern, (640, 480))
         assert result.rms_px < rms
         corners.append(dict(zip(numbers, pixels, strict=True)))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import edges_in_scan
+from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
 from lrfcal_lib.preprocess.board_in_scan import fit_lines
 from lrfcal_lib.preprocess.edges_in_scan import straight_runs
 from lrfcal_lib.session.read import Sweep, open_session
@@ -78,7 +78,7 @@ def spoiled(s, ranges):
 
 
 def found(s, **options):
-    return edges_in_scan.find_board(s.sweep, s.board, HEAD, **options)
+    return board_in_scan.find_board(s.sweep, s.board, HEAD, **options)
 
 
 # ---------------------------------------------------------------------------------------------- finding the board
@@ -96,7 +96,7 @@ def test_the_board_and_nothing_else_is_found(wall):
 
 def test_nothing_need_be_known_about_board_or_platform():
     s = scene(sigma=0.004)
-    assert np.mean(edges_in_scan.find_board(s.sweep).mask != s.on) < 1e-3
+    assert np.mean(board_in_scan.find_board(s.sweep).mask != s.on) < 1e-3
 
 
 def test_the_nearest_of_two_boards_is_taken():
@@ -138,13 +138,13 @@ MISSING = {
 def test_no_board_is_said_with_what_was_seen(message):
     s = scene(wall=3.5)
     ranges = MISSING[message](s)
-    with pytest.raises(edges_in_scan.BoardNotFound, match="placement 1: " + message):
+    with pytest.raises(board_in_scan.BoardNotFound, match="placement 1: " + message):
         found(spoiled(s, ranges))
 
 
 def test_a_board_of_another_size_is_not_taken():
-    with pytest.raises(edges_in_scan.BoardNotFound, match=r"seen: 0\.5\d m2"):
-        edges_in_scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
+    with pytest.raises(board_in_scan.BoardNotFound, match=r"seen: 0\.5\d m2"):
+        board_in_scan.find_board(scene(wall=None).sweep, triangle_board(), HEAD)
 
 
 def behind(s, centre, width, length, depth):
@@ -194,14 +194,14 @@ def test_points_of_one_scan_line_are_no_board():
     ranges = shelf(s, 12)
     assert np.mean(found(spoiled(s, ranges)).mask != s.on) < 2e-3
     alone = np.where(s.on, np.nan, ranges)
-    with pytest.raises(edges_in_scan.BoardNotFound, match="on 1 of 161 scan lines"):
+    with pytest.raises(board_in_scan.BoardNotFound, match="on 1 of 161 scan lines"):
         found(spoiled(s, alone))
 
 
 @pytest.mark.parametrize("roll", [25.0, 70.0, 160.0, 250.0])
 def test_a_board_that_makes_one_plane_with_its_post_is_refused(roll):
     s = noisy_triangle(roll=roll)
-    with pytest.raises(edges_in_scan.BoardNotFound, match=r"no flat surface of the board's size; seen: 0\.\d+ m2"):
+    with pytest.raises(board_in_scan.BoardNotFound, match=r"no flat surface of the board's size; seen: 0\.\d+ m2"):
         found(spoiled(s, behind(s, (0.08, 0.05), 0.06, 1.0, 0.01)[0]))
 
 
@@ -211,14 +211,14 @@ def test_a_plane_seen_along_itself_is_no_board():
     ranges = np.full(s.on.shape, np.nan)
     depth = 1.0 + 0.25 * np.random.default_rng(0).random(s.on.shape) ** 0.5
     ranges[40:80] = np.where(flat, depth, np.nan)[40:80]
-    with pytest.raises(edges_in_scan.BoardNotFound, match="seen along itself"):
+    with pytest.raises(board_in_scan.BoardNotFound, match="seen along itself"):
         found(spoiled(s, np.sort(ranges, axis=0)))
 
 
 def test_what_clutter_leaves_on_a_plane_is_no_board():
     s = noisy_triangle(wall=None)
     hidden = np.random.default_rng(1).random(s.on.shape) < 0.75
-    with pytest.raises(edges_in_scan.BoardNotFound, match="filled to 2[0-9] %"):
+    with pytest.raises(board_in_scan.BoardNotFound, match="filled to 2[0-9] %"):
         found(spoiled(s, np.where(hidden, np.nan, s.sweep.ranges)))
 
 
@@ -241,9 +241,9 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
 
 def test_pieces_end_at_jumps_gaps_and_lines():
     ranges = np.array([[1.0, 1.01, 2.0, 2.0, np.nan, 2.0], [2.0, np.nan, np.nan, 2.0, 2.5, 2.5]])
-    assert edges_in_scan.segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
-    assert edges_in_scan.segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
-    assert (edges_in_scan.segments(np.full((2, 3), np.nan)) == -1).all()
+    assert board_in_scan.segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
+    assert board_in_scan.segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
+    assert (board_in_scan.segments(np.full((2, 3), np.nan)) == -1).all()
 
 
 def test_median_filter_is_the_median_of_what_exists():
@@ -251,21 +251,21 @@ def test_median_filter_is_the_median_of_what_exists():
     ranges = rng.random((7, 30))
     ranges[rng.random(ranges.shape) < 0.2] = np.nan
     mask = rng.random(ranges.shape) < 0.8
-    out = edges_in_scan.median_filter(ranges, mask, 5)
+    out = board_in_scan.median_filter(ranges, mask, 5)
     taken = np.where(mask, ranges, np.nan)
     for line, beam in np.ndindex(ranges.shape):
         if np.isfinite(taken[line, beam]):
             assert out[line, beam] == np.nanmedian(taken[line, max(beam - 2, 0) : beam + 3])
         else:
             assert np.isnan(out[line, beam])
-    np.testing.assert_array_equal(edges_in_scan.median_filter(ranges, width=1), ranges)
-    assert np.isnan(edges_in_scan.median_filter(np.full((2, 3), np.nan))).all()
+    np.testing.assert_array_equal(board_in_scan.median_filter(ranges, width=1), ranges)
+    assert np.isnan(board_in_scan.median_filter(np.full((2, 3), np.nan))).all()
 
 
 @pytest.mark.parametrize("width", [0, 4, -1])
 def test_median_filter_needs_an_odd_width(width):
     with pytest.raises(ValueError, match=f"odd and positive, got {width}"):
-        edges_in_scan.median_filter(np.ones((1, 5)), width=width)
+        board_in_scan.median_filter(np.ones((1, 5)), width=width)
 
 
 def test_lines_are_fitted_exactly_and_outliers_do_not_count():
@@ -296,15 +296,15 @@ def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
     ranges[rows, last + 1] = 0.5 * (ranges[rows, last] + ranges[rows, last + 2])
     b = found(spoiled(s, ranges))
     assert len(rows) * 0.95 <= b.n_jump_points <= len(rows) * 1.1
-    before, after = edges_in_scan.count_jump_points(b)
+    before, after = board_in_scan.count_jump_points(b)
     assert before == b.n_jump_points and after < 0.05 * before
-    profile = edges_in_scan.edge_profile(b, rows[30], +1, 10)
+    profile = board_in_scan.edge_profile(b, rows[30], +1, 10)
     assert len(profile.bearings) == 21
     assert np.isfinite(profile.fitted[:11]).all() and np.isnan(profile.fitted[11:]).all()
     assert abs(profile.original[11] - profile.original[10]) > 0.3
     assert np.abs(profile.filtered[:11] - profile.fitted[:11]).max() < 0.02
     with pytest.raises(ValueError, match="scan line 0 of placement 1 does not hit the board"):
-        edges_in_scan.edge_profile(b, 0)
+        board_in_scan.edge_profile(b, 0)
 
 
 # ---------------------------------------------------------------------------------------------- edges
@@ -518,11 +518,11 @@ def test_the_direction_of_the_sweep_does_not_matter():
     turned = replace(s.sweep, ranges=s.sweep.ranges[::-1], pitch=s.sweep.pitch[::-1])
     a, b = (
         key(edges_in_scan.edge_points(found(s))),
-        key(edges_in_scan.edge_points(edges_in_scan.find_board(turned, s.board, HEAD))),
+        key(edges_in_scan.edge_points(board_in_scan.find_board(turned, s.board, HEAD))),
     )
     np.testing.assert_allclose(a[0], b[0], atol=1e-4)
     assert np.mean(a[1] == b[1]) > 0.99
-    first, second = (edges_in_scan.sweep_edges(edges_in_scan.find_board(x, s.board, HEAD)) for x in (s.sweep, turned))
+    first, second = (edges_in_scan.sweep_edges(board_in_scan.find_board(x, s.board, HEAD)) for x in (s.sweep, turned))
     assert sorted(first.end) == sorted(second.end)
 
 
@@ -532,7 +532,7 @@ def test_a_wider_view_without_returns_changes_nothing():
     ranges = np.full((len(s.sweep.pitch), len(more)), np.nan)
     ranges[:, 60 : 60 + len(s.sweep.bearings)] = s.sweep.ranges
     wide = replace(s.sweep, ranges=ranges, bearings=more)
-    a, b = edges_in_scan.edge_points(found(s)), edges_in_scan.edge_points(edges_in_scan.find_board(wide, s.board, HEAD))
+    a, b = edges_in_scan.edge_points(found(s)), edges_in_scan.edge_points(board_in_scan.find_board(wide, s.board, HEAD))
     np.testing.assert_allclose(a.points, b.points, atol=1e-9)
     np.testing.assert_array_equal(a.side, b.side)
 
@@ -569,7 +569,7 @@ def test_too_short_or_too_few_is_no_side():
 
 def test_face_points_lie_on_the_face_and_away_from_the_edges():
     s = scene(sigma=0.005)
-    p_lrf, pitch, covariance = edges_in_scan.face_points(found(s), 300)
+    p_lrf, pitch, covariance = board_in_scan.face_points(found(s), 300)
     assert p_lrf.shape == (300, 3) and pitch.shape == (300,) and covariance.shape == (300, 3, 3)
     p = s.pose.inv().apply(lrf_to_platform(p_lrf, pitch, HEAD))
     lines = s.board.lines()
@@ -593,7 +593,7 @@ def test_another_variant_is_refused(function):
 def real(lms400_session):
     session = open_session(lms400_session)
     scans = {
-        p: edges_in_scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements
+        p: board_in_scan.find_board(session.sweep(p), session.board, session.T_head_lrf) for p in session.placements
     }
     edges = {p: edges_in_scan.edge_points(b) for p, b in scans.items()}
     return scans, edges

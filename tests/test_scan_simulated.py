@@ -7,7 +7,7 @@ import pytest
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import edges_in_scan
+from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 
@@ -35,7 +35,7 @@ def seen(name, placement):
     at = pose.inv().apply((origin + ranges[..., None] * rays).reshape(-1, 3))[:, :2]
     beyond = (at @ truth.board.lines()[:, :2].T + truth.board.lines()[:, 2]).max(axis=1).reshape(pitch.shape)
     return (
-        edges_in_scan.find_board(sweep, session.board, session.T_head_lrf),
+        board_in_scan.find_board(sweep, session.board, session.T_head_lrf),
         np.where(ranges > 0, beyond, np.inf),
         ranges,
     )
@@ -84,7 +84,7 @@ def test_each_edge_gives_one_side_with_its_direction(name, placement):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
     session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
-    board = edges_in_scan.find_board(
+    board = board_in_scan.find_board(
         session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed)
     )
     assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()
