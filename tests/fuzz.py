@@ -271,7 +271,7 @@ def pixels(rng, file):
             data = data[:at] + rng.choice([b"\xff", b"\xff\xff", b"\xff\x01", b"\xff\xd0", b"\x00"]) + data[at:]
     file.write_bytes(data)
     stated = file.parents[2] / "session.json"
-    if rng.random() < 0.5:
+    if rng.random() < 0.5 and stated.is_file() and not stated.is_symlink():  # no pipe by an earlier damage
         session = json.loads(stated.read_text())
         session["rig"]["cameras"][file.parent.name] |= {"width": size[0], "height": size[1]}
         stated.write_text(json.dumps(session))

@@ -221,9 +221,10 @@ def test_the_second_detector_helps_where_the_first_fails(monkeypatch):
         assert min(np.abs(p - exact).max() for p in (other, turn_pattern(other))) < 0.3
 
 
-def test_no_pattern():
+@pytest.mark.parametrize("shape", [(480, 640, 3), (1, 1), (1, 5000), (8, 8)])  # OpenCV refuses narrow ones
+def test_no_pattern(shape):
     with pytest.raises(survey.PatternNotFound, match="6 x 4 inner corners"):
-        pattern_in_image.find_pattern(np.full((480, 640, 3), 90, np.uint8), PATTERN)
+        pattern_in_image.find_pattern(np.full(shape, 90, np.uint8), PATTERN)
 
 
 def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):

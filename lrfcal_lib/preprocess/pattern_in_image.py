@@ -97,10 +97,11 @@ class PatternFinder:
 def _classic(picture, size, negative=False):
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     # the quick check for a chessboard overlooks white squares on a dark board, and saves little time there
-    if negative:
-        found, corners = cv2.findChessboardCorners(255 - picture, size, flags=flags)
-    else:
-        found, corners = cv2.findChessboardCorners(picture, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+    picture, flags = (255 - picture, flags) if negative else (picture, flags | cv2.CALIB_CB_FAST_CHECK)
+    try:
+        found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+    except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
+        return None
     return corners.reshape(-1, 2) if found else None
 
 
