@@ -31,7 +31,7 @@ TEXTS = {
 SHOW = """
 import matplotlib.pyplot as plt
 import pandas as pd
-from lrfcal_lib import notebook
+from lrfcal_lib.report import notebook
 session = notebook.start()
 texts = [session.licence, session.source, session.board.name, *session.board.edges, session.lrf.model]
 texts += [session.reference["recording"], session.images()[0].file.name]

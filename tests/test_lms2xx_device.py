@@ -2,6 +2,7 @@
 
 import errno
 import os
+import termios
 import time
 import tty
 
@@ -86,8 +87,8 @@ def test_a_rate_that_the_line_does_not_take_is_refused_and_the_old_one_stays(wir
             set_rate(port, 12345)
         with pytest.raises(PortError, match="cannot do -1 Bd"):
             set_rate(port, -1)
-        real = port.termios.tcgetattr
-        monkeypatch.setattr(port.termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
+        real = termios.tcgetattr
+        monkeypatch.setattr(termios, "tcgetattr", lambda fd: [*real(fd)[:4], 13, 13, real(fd)[6]])
         with pytest.raises(PortError, match="does not take 500000 Bd.*RS-422 interface"):
             set_rate(port, 500000)
         assert port.baudrate == 19200

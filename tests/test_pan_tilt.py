@@ -486,7 +486,7 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
     """In real time, on a pseudo-terminal."""
     code = """
     import sys, time
-    from lrfcal_lib.drivers.pan_tilt import HeadSettings, PanTilt
+    from lrfcal_lib.drivers.head import HeadSettings, PanTilt
     head = PanTilt.open(sys.argv[1], HeadSettings(baudrate=38400, gap_s=0.005))
     head.start_sweep(1.0, speed=1)
     try:

@@ -25,7 +25,7 @@ KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "languag
 GOOD = """
 import matplotlib.pyplot as plt
 import pandas as pd
-from lrfcal_lib import notebook
+from lrfcal_lib.report import notebook
 session = notebook.start()
 """
 RESULTS = """
@@ -167,7 +167,7 @@ def test_two_reports_at_once_lose_nothing(session, tmp_path, line):
     assert parts(tmp_path) == []
 
 
-RUN = "import sys; from pathlib import Path; from lrfcal_lib import report; report.NOTEBOOKS = Path(sys.argv[1])\n"
+RUN = "import sys, pathlib; from lrfcal_lib.report import report; report.NOTEBOOKS = pathlib.Path(sys.argv[1])\n"
 ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129, signal.SIGKILL: -9}
 
 

@@ -10,15 +10,17 @@ CALIBRATE = """
 import sys
 if sys.argv[2] == "before":  # libraries that are there already have counted the threads that they are to use
     import cv2, numpy, scipy.linalg
-from lrfcal_lib import evaluate, export, notebook, pipeline
+from lrfcal_lib.calibrate import pipeline, reconstruct
+from lrfcal_lib.evaluate import export, tables
+from lrfcal_lib.report import notebook
 found = pipeline.calibrate(export.open_session(sys.argv[1]))
-method = evaluate.handed_over(found)
+method = tables.handed_over(found)
 export.write_calibration("calibration.json", export.calibration_record(found, method))
-export.write_ply("cloud.ply", pipeline.color_cloud(found, method))
-notebook.table(evaluate.intrinsics_table(found.prepared.models), "intrinsics")
-notebook.table(evaluate.platform_calibration_table(found.platform), "platform")
-notebook.table(evaluate.camera_calibration_table(found.solutions), "cameras")
-notebook.table(evaluate.edge_lengths(found.prepared), "edges")
+reconstruct.write_ply("cloud.ply", pipeline.color_cloud(found, method))
+notebook.table(tables.intrinsics_table(found.prepared.models), "intrinsics")
+notebook.table(tables.platform_calibration_table(found.platform), "platform")
+notebook.table(tables.camera_calibration_table(found.solutions), "cameras")
+notebook.table(tables.edge_lengths(found.prepared), "edges")
 """
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
