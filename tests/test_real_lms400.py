@@ -155,9 +155,12 @@ def test_the_joint_cameras_agree_with_the_chessboard(found):
 
 
 def test_random_halves_agree_as_their_sigma_says(joint):
-    """The prior of the platform is common to both halves, so they differ a little less than predicted."""
+    """The prior of the platform is common to both halves, so they differ a little less than predicted.
+
+    The scale of the pitch is free: it turns by 4 % more than recorded (known to 0.7 %), which costs the halves 0.07 deg.
+    """
     middle = jointly.random_halves(joint).median(numeric_only=True)
-    assert middle.rotation_deg < 0.4 and middle.translation_mm < 12
+    assert middle.rotation_deg < 0.5 and middle.translation_mm < 12
     usual = 0.89  # median of the length of a normal 3-vector, relative to its root mean square
     for unit in ("rotation_deg", "translation_mm"):
         assert 1 / 1.6 < middle[unit] / (usual * middle[f"predicted_{unit}"]) < 1.6
@@ -166,7 +169,9 @@ def test_random_halves_agree_as_their_sigma_says(joint):
 def test_edge_lengths_of_left_out_placements(joint):
     table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint=joint)
     summary = tables.edge_summary(table).set_index(["variant", "ends"]).mean_abs_error_mm
-    assert summary["likelihood", "scan"] < 4.7 and summary["half_step", "scan"] < 4.7
+    assert summary["half_step", "scan"] < 3.5 and summary["fused", "image"] < 6.0
+    # by the likelihood, the scale of the pitch makes lengths across the scan lines right and those along them worse
+    assert summary["likelihood", "scan"] < 7.0 and summary["likelihood", "pitch"] < 16.0  # held at zero: 4.0 and 26.1
 
 
 def test_the_cloud_is_coloured(found):

@@ -213,7 +213,7 @@ def test_make_takes_a_session_with_a_space():
     shown = subprocess.run(
         ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'", 'SESSION=a "b c'],
         cwd=report.ROOT, capture_output=True, text=True, check=True)  # fmt: skip
-    assert shown.stdout == '<-m><lrfcal_lib.report.report><a "b c>'
+    assert shown.stdout == '<-m><lrfcal_lib><report><a "b c>'
 
 
 def test_pages_of_notebooks_hide_code_and_hold_their_pictures(finished):

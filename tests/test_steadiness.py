@@ -277,7 +277,7 @@ def test_the_figure_marks_the_step():
     background_motion(ax, {"left": Steadiness("left", np.arange(1, n + 1), 1, steps=(a_step([1e-3, 0, 0]),), **more)})
     marks = [line.get_xdata()[0] for line in ax.lines if len(set(line.get_xdata())) == 1 and len(line.get_xdata()) == 2]
     assert marks == [9.5], "between the tenth and the eleventh tick"
-    assert "10 and 11" in ax.get_title() and ax.get_ylabel().endswith("[px]")
+    assert "10 and 11" in ax.get_title("left") + ax.get_title("center") and ax.get_ylabel().endswith("[px]")
     plt.close(fig)
 
 
