@@ -157,7 +157,7 @@ def test_the_joint_cameras_agree_with_the_chessboard(found):
 def test_random_halves_agree_as_their_sigma_says(joint):
     """The prior of the platform is common to both halves, so they differ a little less than predicted.
 
-    The scale of the pitch is free: it turns by 4 % more than recorded (known to 0.7 %), which costs the halves 0.07 deg.
+    The scale of the pitch is free: it is 4 % +- 0.7 %, which costs the halves 0.07 deg.
     """
     middle = jointly.random_halves(joint).median(numeric_only=True)
     assert middle.rotation_deg < 0.5 and middle.translation_mm < 12
