@@ -26,9 +26,8 @@ from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.edges_in_scan import edge_cells
 from lrfcal_lib.preprocess.prepared import VARIANTS, Prepared
+from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
-from lrfcal_lib.solvers.lines import find_outlying_placements
-from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
 NAME_DISTANCE = 0.08  # metres between a side in the cloud and the board edge it is named after, at most
@@ -292,7 +291,7 @@ def rough_poses(prepared, variant="half_step"):
         obs = observe(prepared, camera, variant)
         try:
             judged = find_outlying_placements(obs, "planes")
-            rough[camera] = solve_zhang_pless(obs.select(judged.inliers)).transform
+            rough[camera] = solve_camera(obs.select(judged.inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
             prepared.problems[f"camera {camera}"] = str(error)
             continue

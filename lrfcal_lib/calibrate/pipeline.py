@@ -38,7 +38,7 @@ from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.prepared import PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import stereo_check
 from lrfcal_lib.session.cache import cached
-from lrfcal_lib.solvers import METHODS
+from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
 from lrfcal_lib.solvers.platform import PlatformObservations, solve_platform, solve_projected
@@ -648,16 +648,15 @@ def _platform_and_corrections(calibration, method):
     return calibration.platform.transform(axis), correct
 
 
-def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):
+def calibrate_cameras(observations, methods=METHODS):
     """Calibrate every camera by every method.
 
     Parameters
     ----------
     observations : dict of (str, str) to CameraObservations
         Of :func:`observe_all`.
-    methods : sequence of str
-    T0 : dict of str to RigidTransform, optional
-        Rough measurements by camera; closed forms where there is none.
+    methods : iterable of str
+        Of :data:`lrfcal_lib.solvers.METHODS`.
 
     Returns
     -------
@@ -669,10 +668,8 @@ def calibrate_cameras(observations, methods=tuple(METHODS), T0=None):
     solutions, problems = {}, {}
     for camera in dict.fromkeys(camera for camera, _ in observations):
         for name in methods:
-            method = METHODS[name]
             try:
-                start = (T0 or {}).get(camera)
-                solutions[camera, name] = method.solve(observations[camera, method.variant], start)
+                solutions[camera, name] = solve_camera(observations[camera, METHODS[name].variant], name)
             except DegenerateGeometry as error:
                 problems[camera, name] = str(error)
     return solutions, problems

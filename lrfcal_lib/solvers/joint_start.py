@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -18,6 +16,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     tilt,
 )
+from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
@@ -70,11 +69,10 @@ def start_states(obs, T0=None):
 
 
 def _planes(obs, camera, points, key, poses, covariance):
-    """What :func:`start_from_planes` needs of observations, as it names them."""
-    numbers = np.arange(len(poses))
-    return SimpleNamespace(
-        camera=obs.cameras[camera], plane_points=points, plane_placement=key, placements=numbers, board_poses=poses,
-        plane_covariance=np.broadcast_to(1e-4 * np.eye(3), (len(points), 3, 3)), board_covariance=covariance,
+    """What :func:`start_from_planes` needs of observations."""
+    return CameraObservations(
+        None, obs.cameras[camera], plane_points=points, plane_placement=key, board_poses=poses,
+        board_covariance=covariance,
     )  # fmt: skip
 
 
