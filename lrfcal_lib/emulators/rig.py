@@ -65,7 +65,7 @@ class EmulatedRig:
     time_scale : float
         Seconds of the devices in a second of the host; 1 is safe. Up to 8 does for stop-and-go. A stream of scans
         leaves some out, with a warning, where this machine is too slow for it, as with a head that moves. The instants
-        of scans need a host clock that runs as fast (`clock` of `LMS2xx.open` and `Rig.open`): by another one they
+        of scans need a host clock that runs as fast (`clock` of `LMS2xx` and `Rig.open`): by another one they
         are off by tenths of a second.
     lrf_options : dict, optional
         Of :class:`EmulatedLms`.
