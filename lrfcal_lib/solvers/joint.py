@@ -5,63 +5,41 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import minimise, solve, whiten
-from lrfcal_lib.fit.residuals import (
-    SENSOR,
-    JointData,
-    JointState,
-    Unknowns,
-    chart_parameters,
-    disc_edge,
-    gather,
-    joint_blocks,
-    move_state,
-    named_blocks,
-)
+from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    TiltAxis,
-    axis_of,
-    head_from_axis,
-    motion_words,
-    pose_array,
-    pose_parameters,
-    pose_transform,
-)
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_parameters, pose_transform
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.solvers.joint_noise import (
-    CONTRADICTION,
-    LARGEST_SHARE,
-    LEAST_MISFIT,
-    ROUGH_MISS,
-    estimate_noise,
-    image_misses,
-    joint_warnings,
-    lens_covariance,
-    misfits,
-    rough_misses,
-    same_levels,
-    view_misses,
-)
+from lrfcal_lib.solvers import joint_noise
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
-START_STEPS = 8
-NOISE_ROUNDS, ROUND_STEPS = 10, 10
+SWEEP_SIGMA = (np.radians(0.5), 0.05)
+START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 60
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 LEVELS = (
     "face_scale", "view_scale", "sigma_pitch", "face_share", "beam_share", "lapse", "sweep_sigma", "side_sigma",
     "prior",
 )  # fmt: skip
-SWEEP_SIGMA = (np.radians(0.5), 0.05)
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
+CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
+LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
+LARGEST_SHARE = 0.3  # of the placements that may contradict the others
+ROUGH_MISS = 0.08  # metres, of a board's face from where the first image of it puts it
+WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
+    "range_offset": "the range offset",
+    "edge_log_odds": "the edge bias",
+    "edge_log_softness": "the softness of the edges",
+    "pitch_scale": "the scale of the pitch",
+    "pitch_by_direction": "the pitch offset by sweep direction",
+}
 
 
 @dataclass(frozen=True)
@@ -70,6 +48,12 @@ class JointSolution:
 
     Attributes
     ----------
+    solution : Solution
+        Of the shared unknowns (covariances, names, convergence).
+    observations : JointObservations
+        Without what is excluded.
+    data, unknowns : JointData, Unknowns
+        Padded observations with the noise levels used, and what was unknown; for `solvers` only.
     T_head_lrf : RigidTransform
         In the gauge of the stated platform (rotation about the axis and shift along it cannot be observed).
     transforms : dict of str to RigidTransform
@@ -88,22 +72,17 @@ class JointSolution:
         Normalised squared residuals of each placement (1 is what the noise explains).
     excluded : dict of int or str to str
         Placements (and, under names of their own, cameras and single images) left out, with the reason.
-    unobservable : tuple of str
-        Motions that the data do not determine, in words.
     lens : ndarray, shape (c, c)
         The part of the covariances that comes from the intrinsics, which all placements share.
     warnings : tuple of str
         What is suspicious: no convergence, noise that contradicts what is stated, a weak axis, errors of the pitch that
         the data ask for.
-    solution : Solution
-        Of the shared unknowns (covariances, names, convergence).
-    state : JointState
-    unknowns : Unknowns
-    data : JointData
-    observations : JointObservations
-        Without what is excluded.
     """
 
+    solution: Solution
+    observations: JointObservations
+    data: residuals.JointData
+    unknowns: Unknowns
     T_head_lrf: RigidTransform
     transforms: dict
     boards: dict
@@ -113,27 +92,31 @@ class JointSolution:
     noise: dict
     misfit: dict
     excluded: dict
-    unobservable: tuple
     lens: np.ndarray
     warnings: tuple
-    solution: Solution
-    state: JointState
-    unknowns: Unknowns
-    data: JointData
-    observations: JointObservations
+
+    @property
+    def state(self):
+        """Everything that moved."""
+        return self.solution.state
 
     @property
     def converged(self):
         return bool(self.solution.converged)
 
     @property
-    def axis(self) -> TiltAxis:
-        return axis_of(self.T_head_lrf)
+    def unobservable(self):
+        """Motions that the data do not determine, in words."""
+        return self.solution.unobservable
+
+    @property
+    def axis(self):
+        return geometry.axis_of(self.T_head_lrf)
 
     @property
     def edge_bias(self):
         """Where readings flip with a background as far and bright as the board, spot radii outside the edge."""
-        return float(disc_edge(self.sensor["edge_log_odds"])[0])
+        return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
 
     def columns(self, prefix):
         """Indices of the shared unknowns whose names begin so."""
@@ -169,9 +152,17 @@ class JointSolution:
         if placement in self.sweeps:
             index = list(self.sweeps).index(placement)
             offset, stretch = self.sweeps[placement]
-            turn = self.sensor["pitch_by_direction"] * self.data.direction[index]
-            corrected = corrected + turn + offset + stretch * (pitch - self.data.middle[index])
+            turn = self.sensor["pitch_by_direction"] * self.observations.direction[index]
+            corrected = corrected + turn + offset + stretch * (pitch - self.observations.middle[index])
         return points, corrected
+
+    def camera_at(self, name, pitch):
+        """``T_camera_platform`` of a camera while the head stands at a pitch (radians)."""
+        pose = self.transforms[name]
+        if self.observations.mounts[self.observations.cameras.index(name)] == "platform":
+            return pose
+        turn = RigidTransform.from_rotation(Rotation.from_rotvec([-float(pitch), 0.0, 0.0]))
+        return pose * self.T_head_lrf.inv() * turn
 
     def camera(self, name):
         """The pose of one camera as a `Solution` like those of the other methods."""
@@ -180,8 +171,8 @@ class JointSolution:
         both = {key: getattr(whole, key) for key in ("covariance", "covariance_placements")}
         spread = {key: None if value is None else value[np.ix_(index, index)] for key, value in both.items()}
         return replace(
-            whole, transform=self.transforms[name], parameters=pose_parameters(pose), names=POSE_NAMES,
-            jacobian=whole.jacobian[..., index], unobservable=self.unobservable, state=pose, **spread,
+            whole, transform=self.transforms[name], parameters=pose_parameters(pose), names=geometry.POSE_NAMES,
+            jacobian=whole.jacobian[..., index], state=pose, **spread,
         )  # fmt: skip
 
     def __repr__(self):
@@ -197,14 +188,12 @@ def solve_joint(
     sensor=("range_offset", "edge_log_odds", "edge_log_softness"),
     size=False,
     sides=False,
-    side_sigma=0.35,
     sweep="none",
     sweep_sigma=SWEEP_SIGMA,
     lapse=0.0,
     noise="stated",
     start=None,
     required=True,
-    max_iterations=60,
 ):
     """Estimate axis, cameras, range offset, edge bias and the pose of every board at once.
 
@@ -223,8 +212,6 @@ def solve_joint(
         Estimate the board's size: one offset an edge.
     sides : bool
         Every side of every placement deviates from the sensor's edge bias, because backgrounds are not alike.
-    side_sigma : float
-        Scale of these deviations, log odds.
     sweep : {'none', 'offset', 'offset_stretch'}
         Errors of the recorded pitch that every sweep has of its own.
     sweep_sigma : tuple of float
@@ -238,7 +225,6 @@ def solve_joint(
         Skips the search for a start value.
     required : bool
         False: report unobservable motions instead of raising.
-    max_iterations : int
 
     Returns
     -------
@@ -252,27 +238,66 @@ def solve_joint(
         For unknown names, contradictory noise settings, or observations that are not finite.
     """
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
-    obs, blind = without_blind_cameras(obs, required)
+    obs, excluded = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
-    excluded = blind
     if start is None:
         obs, lost = without_lost_placements(obs)
         obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
-    data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), side_sigma=side_sigma, prior=prior)
-    state = _converge(start, data, coarse(unknowns), max_iterations)
-    state = _converge(state, data, unknowns, max_iterations, LAST_STEP)
+    data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), prior=prior)
+    state = converged(start, data, coarse(unknowns))
+    state = converged(state, data, unknowns, LAST_STEP)
     data = replace(data, lapse=lapse)
     if noise == "estimate":
-        state, data = settle(state, data, unknowns, max_iterations)
+        state, data = settle(state, data, unknowns)
         obs, state, data, bad = drop_contradictions(obs, state, data, unknowns)
-        excluded = excluded | bad
         if bad:
-            state, data = settle(state, data, unknowns, max_iterations)
+            excluded = excluded | bad
+            state, data = settle(state, data, unknowns)
     if noise == "estimate" or lapse:
-        state = _converge(state, data, unknowns, max_iterations, LAST_STEP)
-    found = _solve(obs, data, in_stated_gauge(state, obs), unknowns, required, max_iterations)
-    return _wrap(obs, data, unknowns, found, excluded)
+        state = converged(state, data, unknowns, LAST_STEP)
+    return finished(obs, state, data, unknowns, excluded, required)
+
+
+def solve_again(obs, like):
+    """Solve for other placements with the settings, noise levels and start value of a solution.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Some of the placements that `like` was made from (for leave-one-out and random halves).
+    like : JointSolution
+
+    Returns
+    -------
+    JointSolution
+
+    Raises
+    ------
+    DegenerateGeometry
+        When these placements leave a motion open.
+    """
+    known = list(like.boards)
+    rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
+    obs = obs.select([known[row] for row in rows])
+    data = gathered(obs, like.data)
+    state = converged(of_placements(like.state, rows), data, like.unknowns, LAST_STEP)
+    return finished(obs, state, data, like.unknowns, like.excluded, True)
+
+
+def check_settings(obs, sensor, sweep_sigma, noise, lapse):
+    """Refuse settings that contradict themselves."""
+    unknown = next((name for name in sensor if name not in SENSOR), None)
+    for wrong, words in (
+        (unknown is not None, f"sensor unknowns are {', '.join(SENSOR)}; got {unknown!r}"),
+        (noise not in ("stated", "estimate"), f"noise is 'stated' or 'estimate', got {noise!r}"),
+        (not 0 <= lapse < 0.5, f"lapse is the share of beams that say nothing, 0 to 0.5, got {lapse}"),
+        (min(sweep_sigma) <= 0, f"sweep_sigma must be positive (radians, fraction), got {sweep_sigma}"),
+    ):
+        if wrong:
+            raise ValueError(words)
+    if len(obs.placements) == 0:
+        raise DegenerateGeometry("no placement to calibrate with")
 
 
 def without_blind_cameras(obs, required):
@@ -299,45 +324,33 @@ def without_lost_placements(obs):
     return obs.select(obs.placements[~lost]), words
 
 
-def settle(state, data, unknowns, iterations):
-    """Estimate unknowns and noise levels in turn until they agree."""
-    for _ in range(NOISE_ROUNDS):
-        before, data = data, estimate_noise(state, data, unknowns)
-        state = _converge(state, data, unknowns, min(iterations, ROUND_STEPS))
-        if same_levels(before, data):
-            break
-    return state, data
+def converged(state, data, unknowns, tolerance=ROUGH_STEP, steps=MOST_STEPS):
+    """The state that explains the data best, from one nearby."""
+    return minimise(
+        lambda s: joint_blocks(s, data, unknowns), state, lambda s, step: move_state(s, step, unknowns),
+        shared=unknowns.shared, max_iterations=steps, tolerance=tolerance,
+    )[0]  # fmt: skip
 
 
-def drop_contradictions(obs, state, data, unknowns):
-    """Leave out placements whose residuals are far larger than the others', or the one image that makes them so."""
-    found, usual = contradictions(state, data, unknowns)
-    limits, rows, out, words = CONTRADICTION * usual, [], [], {}
-    for i in np.flatnonzero((found > limits).any(axis=1)):
-        row, board = wrong_image(obs, state, data, unknowns, i, limits)
-        why = f"residuals are {np.sqrt(np.max(found[i] / usual)):.0f} times those of the others"
-        if row is not None:
-            rows, state.boards[i] = [*rows, row], board
-            words[image_name(obs, row)] = f"{image_name(obs, row)}: with it {why}; the image is left out"
-        elif found[i, 0] > limits[0]:
-            out.append(i)
-            words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
-    if not words:
-        return obs, state, data, {}
-    obs = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), rows)).select(np.delete(obs.placements, out))
-    own = {key: np.delete(getattr(state, key), out, axis=0) for key in OWN}
-    return obs, replace(state, **own), with_levels(gather(obs), data), words
+def coarse(unknowns):
+    """The unknowns without those of the edges: from far away, beams on the wrong side would blow up the softness."""
+    return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
 
 
-def contradictions(state, data, unknowns):
-    """Misfits of placements, and of their images alone, shape (p, 2), and what is usual of both, shape (2,).
+def gathered(obs, like):
+    """Padded observations with the noise levels of others."""
+    return replace(gather(obs), **{key: getattr(like, key) for key in LEVELS})
 
-    A wrong image raises the noise level of all images until ranges outvote it: images are compared with images.
-    """
-    blocks, several = named_blocks(state, data, unknowns), data.view["used"].sum(axis=1) > 1
-    found = np.stack([misfits(blocks, data), misfits(blocks, data, ("view",))], axis=1)
-    images = np.median(found[several, 1]) if several.any() else np.inf
-    return found, np.array([max(np.median(found[:, 0]), 1.0), max(images, LEAST_MISFIT)])
+
+def of_placements(state, rows):
+    """The state of some placements (by index)."""
+    return replace(state, **{key: getattr(state, key)[rows] for key in OWN})
+
+
+def without(obs, state, views, placements):
+    """Observations and state without some views and placements (by index)."""
+    kept = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), views)).select(np.delete(obs.placements, placements))
+    return kept, of_placements(state, np.delete(np.arange(len(obs.placements)), placements))
 
 
 def image_name(obs, row):
@@ -346,106 +359,27 @@ def image_name(obs, row):
     return f"placement {obs.placements[obs.view_placement[row]]}, image of '{camera}' at {pitch:.1f} deg"
 
 
-def wrong_image(obs, state, data, unknowns, i, limits):
-    """The view without which placement i agrees with the others (None where there is none), and its board then.
-
-    Every view is left out once, in copies of the placement, with all that the placements share held.
-    """
-    rows = np.flatnonzero(obs.view_placement == i)
-    if len(rows) < 2:
-        return None, None
-    copies = np.full(len(rows), i)
-    own = {key: getattr(state, key)[copies] for key in OWN}
-    own["boards"] = boards_in_images(obs, state.head, state.cameras, np.roll(rows, -1))
-    groups = {name: {key: v[copies] for key, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
-    groups["view"]["used"][range(len(rows)), range(len(rows))] = False
-    groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
-    data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
-    lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
-    state = _converge(replace(state, **own), data, lone, START_STEPS)
-    found = np.max(contradictions(state, data, lone)[0] / limits, axis=1)
-    best = int(np.argmin(found))
-    return (rows[best], state.boards[best]) if found[best] <= 1 else (None, None)
-
-
-def with_levels(data, like):
-    """Padded observations with the noise levels of others."""
-    return replace(data, **{key: getattr(like, key) for key in LEVELS})
-
-
-def solve_again(obs, like, max_iterations=60):
-    """Solve for other placements with the settings, noise levels and start value of a solution.
-
-    Parameters
-    ----------
-    obs : JointObservations
-        Some of the placements that `like` was made from (for leave-one-out and random halves).
-    like : JointSolution
-    max_iterations : int
-
-    Returns
-    -------
-    JointSolution
-
-    Raises
-    ------
-    DegenerateGeometry
-        When these placements leave a motion open.
-    """
-    known = list(like.boards)
-    rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
-    obs = obs.select([known[row] for row in rows])
-    state = replace(like.state, **{key: getattr(like.state, key)[rows] for key in OWN})
-    data = with_levels(gather(obs), like.data)
-    state = _converge(state, data, like.unknowns, max_iterations, LAST_STEP)
-    found = _solve(obs, data, in_stated_gauge(state, obs), like.unknowns, True, max_iterations)
-    return _wrap(obs, data, like.unknowns, found, like.excluded)
-
-
-def check_settings(obs, sensor, sweep_sigma, noise, lapse):
-    """Refuse settings that contradict themselves."""
-    unknown = [name for name in sensor if name not in SENSOR]
-    if unknown:
-        raise ValueError(f"sensor unknowns are {', '.join(SENSOR)}; got {unknown[0]!r}")
-    if noise not in ("stated", "estimate"):
-        raise ValueError(f"noise is 'stated' or 'estimate', got {noise!r}")
-    if not 0 <= lapse < 0.5:
-        raise ValueError(f"lapse is the share of beams that say nothing, 0 to 0.5, got {lapse}")
-    if min(sweep_sigma) <= 0:
-        raise ValueError(f"sweep_sigma must be positive (radians, fraction), got {sweep_sigma}")
-    if len(obs.placements) == 0:
-        raise DegenerateGeometry("no placement to calibrate with")
-
-
 def best_start(obs, unknowns, sweep_sigma, T0=None):
-    """The most promising start value, and the placements that no start value can bring together.
-
-    Returns
-    -------
-    obs : JointObservations
-        Without those placements.
-    state : JointState
-    excluded : dict of int to str
+    """The most promising start value, what is left of the observations with it, and in words what is not.
 
     Raises
     ------
     DegenerateGeometry
         When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
     """
-    data, best, least = gather(obs), None, np.inf
+    data, least = replace(gather(obs), sweep_sigma=tuple(sweep_sigma)), np.inf
     for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
             state = replace(state, head=pose_array(known))
-        rough = np.median(rough_misses(state, data))
-        kept, state, bad, cost = agreeing_start(obs, state, data, unknowns, tuple(sweep_sigma))
-        badness = cost + LEFT_OUT * max(left_out_shares(obs, bad))
-        if best is None or badness < least:
-            best, least = (kept, state, bad, rough), badness
+        misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
+        found = agreeing_start(obs, state, data, unknowns)
+        badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2]))
+        if number == 0 or badness < least:
+            (kept, start, bad, _), rough, least = found, np.median(misses), badness
         if least < GOOD_START and (T0 is None or number):
             break
-    kept, state, bad, rough = best
-    miss = np.median(view_misses(state, gather(kept)))
+    miss = np.median(joint_noise.view_misses(start, gather(kept)))
     if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm "
@@ -457,7 +391,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, state, bad
+    return kept, start, bad
 
 
 def left_out_shares(obs, bad):
@@ -466,75 +400,113 @@ def left_out_shares(obs, bad):
     return placements / len(obs.placements), (len(bad) - placements) / max(len(obs.view_camera), 1)
 
 
-def agreeing_start(obs, state, data, unknowns, sweep_sigma):
+def agreeing_start(obs, state, data, unknowns):
     """A few steps without what contradicts a start value; what a rough one leaves out is judged again by the rest.
 
     Returns the observations kept, the state, what is left out in words, and the mean cost.
     """
+    few = coarse(unknowns)
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
-        cut = replace(gather(kept) if bad else data, sweep_sigma=sweep_sigma)
-        found, cost = a_few_steps(fitting, cut, unknowns)
+        cut = gathered(kept, data) if bad else data
+        found = converged(fitting, cut, few, steps=START_STEPS)
         if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
         state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
-    return kept, found, bad, cost / count_rows(cut)
+    return kept, found, bad, total_cost(found, cut, few) / count_rows(kept)
 
 
 def without_contradictions(obs, state, data):
     """Leave out images that put the board far off where it was scanned, and placements of which none is left."""
-    place, count = obs.view_placement, len(obs.placements)
-    boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place))) if len(place) else state.boards[:0]
-    misses, alone = image_misses(state, data, boards, place), ~np.isin(np.arange(count), place)
-    wrong = misses > max(ROUGH_MISS, 5 * np.median(misses)) if len(place) else np.zeros(0, bool)
-    good = alone | np.isin(np.arange(count), place[~wrong])
+    place = obs.view_placement
+    if len(place) == 0:
+        return obs, state, {}
+    boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
+    misses = joint_noise.face_misses(state, data, boards, place)
+    wrong = misses > max(ROUGH_MISS, 5 * np.median(misses))
     if not wrong.any():
         return obs, state, {}
-    rows, first = np.unique(place[~wrong], return_index=True)
-    own = {key: getattr(state, key).copy() for key in OWN}
-    own["boards"][rows] = boards[~wrong][first]
+    good, first = np.unique(place[~wrong], return_index=True)
+    out, single = np.setdiff1d(place, good), np.flatnonzero(wrong & np.isin(place, good))
+    own = state.boards.copy()
+    own[good] = boards[~wrong][first]
     words = {
         int(obs.placements[i]): f"placement {obs.placements[i]}: the scan is {1000 * misses[place == i].min():.0f} mm "
         "off where its image puts the board; left out"
-        for i in np.flatnonzero(~good)
+        for i in out
     }
-    single = np.flatnonzero(wrong & good[place])
     for row in single:
         name = image_name(obs, row)
         words[name] = f"{name}: it puts the board {1000 * misses[row]:.0f} mm off the scan; the image is left out"
-    kept = obs.keep(view=~np.isin(np.arange(len(place)), single)).select(obs.placements[good])
-    return kept, replace(state, **{key: value[good] for key, value in own.items()}), words
+    return *without(obs, replace(state, boards=own), single, out), words
 
 
-def a_few_steps(state, data, unknowns):
-    """A state after a few steps with soft edges, and its cost."""
-    few = coarse(unknowns)
-    state = _converge(state, data, few, START_STEPS)
-    return state, total_cost(state, data, few)
+def settle(state, data, unknowns):
+    """Estimate unknowns and noise levels in turn until they agree."""
+    for _ in range(NOISE_ROUNDS):
+        before, data = data, joint_noise.estimate_noise(state, data, unknowns)
+        state = converged(state, data, unknowns, steps=ROUND_STEPS)
+        if joint_noise.same_levels(before, data):
+            break
+    return state, data
 
 
-def coarse(unknowns):
-    """The unknowns without those of the edges: from far away, beams on the wrong side would blow up the softness."""
-    return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
+def drop_contradictions(obs, state, data, unknowns):
+    """Leave out placements whose residuals are far larger than the others', or the one image that makes them so."""
+    found, usual = contradictions(state, data, unknowns)
+    limits, views, out, words = CONTRADICTION * usual, [], [], {}
+    for i in np.flatnonzero((found > limits).any(axis=1)):
+        view, board = wrong_image(obs, state, data, unknowns, i, limits)
+        why = f"residuals are {np.sqrt(np.max(found[i] / usual)):.0f} times those of the others"
+        if view is not None:
+            views, state.boards[i] = [*views, view], board
+            words[image_name(obs, view)] = f"{image_name(obs, view)}: with it {why}; the image is left out"
+        elif found[i, 0] > limits[0]:
+            out.append(i)
+            words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
+    if words:
+        obs, state = without(obs, state, views, out)
+        data = gathered(obs, data)
+    return obs, state, data, words
 
 
-def count_rows(data):
+def contradictions(state, data, unknowns):
+    """Misfits of placements, and of their images alone, shape (p, 2), and what is usual of both, shape (2,).
+
+    A wrong image raises the noise level of all images until ranges outvote it: images are compared with images.
+    """
+    blocks, several = residuals.named_blocks(state, data, unknowns), data.view["used"].sum(axis=1) > 1
+    found = np.stack([joint_noise.misfits(blocks, data, groups) for groups in (("face", "view"), ("view",))], axis=1)
+    images = np.median(found[several, 1]) if several.any() else np.inf
+    return found, np.array([max(np.median(found[:, 0]), 1.0), max(images, LEAST_MISFIT)])
+
+
+def wrong_image(obs, state, data, unknowns, i, limits):
+    """The view without which placement i agrees with the others (None where there is none), and its board then.
+
+    Every view is left out once, in copies of the placement, with all that the placements share held.
+    """
+    rows = np.flatnonzero(obs.view_placement == i)
+    if len(rows) < 2:
+        return None, None
+    copies, each = np.full(len(rows), i), np.arange(len(rows))
+    state = replace(
+        of_placements(state, copies), boards=boards_in_images(obs, state.head, state.cameras, np.roll(rows, -1))
+    )
+    groups = {name: {key: v[copies] for key, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
+    groups["view"]["used"][each, each] = False
+    groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
+    data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
+    lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
+    state = converged(state, data, lone, steps=START_STEPS)
+    found = np.max(contradictions(state, data, lone)[0] / limits, axis=1)
+    best = int(np.argmin(found))
+    return (rows[best], state.boards[best]) if found[best] <= 1 else (None, None)
+
+
+def count_rows(obs):
     """Number of observations."""
-    return sum(int(group["used"].sum()) for group in (data.face, data.beam, data.view))
-
-
-def in_stated_gauge(state, obs):
-    """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
-    axis = head_from_axis(axis_of(pose_transform(state.head)))
-    stated = obs.T_head_lrf
-    head = axis if stated is None else stated * head_from_axis(axis_of(stated)).inv() * axis
-    change = head * pose_transform(state.head).inv()
-    boards = pose_array(change * pose_transform(state.boards))
-    cameras = state.cameras.copy()
-    fixed = [i for i, mount in enumerate(obs.mounts) if mount == "platform"]
-    if fixed:
-        cameras[fixed] = pose_array(pose_transform(cameras[fixed]) * change.inv())
-    return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
+    return len(obs.face_range) + len(obs.beam_hit) + len(obs.view_pitch)
 
 
 def total_cost(state, data, unknowns):
@@ -545,31 +517,18 @@ def total_cost(state, data, unknowns):
     return float(total) if np.isfinite(total) else np.inf
 
 
-def _converge(state, data, unknowns, iterations, tolerance=None):
-    evaluate, move = _problem(data, unknowns)
-    options = {"shared": unknowns.shared, "max_iterations": iterations, "tolerance": tolerance or ROUGH_STEP}
-    return minimise(evaluate, state, move, **options)[0]
-
-
-def _problem(data, unknowns):
-    return (lambda s: joint_blocks(s, data, unknowns)), (lambda s, step: move_state(s, step, unknowns))
-
-
-def _solve(obs, data, state, unknowns, required, max_iterations):
-    evaluate, move = _problem(data, unknowns)
-    names = unknowns.names(obs.cameras, obs.edges)
-    return solve(
-        evaluate, state, move, names=names, method="joint", read=lambda s: (None, _parameters(s, unknowns)),
-        scales=[SCALES.get(name, 1.0) for name in names], words=lambda d: joint_words(d, names, obs.cameras),
-        shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=max_iterations,
-        tolerance=LAST_STEP,
-        n_observations=count_rows(data),
-    )  # fmt: skip
-
-
-def _parameters(state, unknowns):
-    poses = pose_parameters(state.cameras).ravel() if len(state.cameras) else np.zeros(0)
-    return np.concatenate([chart_parameters(state.head), poses, state.sensor, state.size])[unknowns.mask]
+def in_stated_gauge(state, obs):
+    """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
+    axis, stated = (None if T is None else geometry.head_from_axis(geometry.axis_of(T)) for T in
+                    (pose_transform(state.head), obs.T_head_lrf))  # fmt: skip
+    head = axis if stated is None else obs.T_head_lrf * stated.inv() * axis
+    change = head * pose_transform(state.head).inv()
+    cameras = state.cameras.copy()
+    for i, mount in enumerate(obs.mounts):
+        if mount == "platform":
+            cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
+    boards = pose_array(change * pose_transform(state.boards))
+    return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 
 
 def joint_words(direction, names, cameras):
@@ -579,44 +538,43 @@ def joint_words(direction, names, cameras):
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if index and np.max(np.abs(direction[index])) > 0.3:
-            words.append(motion_words(direction[index], camera))
+            words.append(geometry.motion_words(direction[index], camera))
     for name, value in zip(names, direction, strict=True):
         if abs(value) > 0.3 and not any(name.startswith(f"{c}_") for c in cameras):
-            words.append(_WORDS.get(name, name.replace("_", " ")))
+            words.append(WORDS.get(name, name.replace("_", " ")))
     return " with ".join(words)
 
 
-_WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
-    "range_offset": "the range offset",
-    "edge_log_odds": "the edge bias",
-    "edge_log_softness": "the softness of the edges",
-    "pitch_scale": "the scale of the pitch",
-    "pitch_by_direction": "the pitch offset by sweep direction",
-}
+def finished(obs, state, data, unknowns, excluded, required):
+    """The last steps, in the gauge of the stated platform, and all that a solution says."""
+    names = unknowns.names(obs.cameras, obs.edges)
 
+    def read(s):
+        poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
+        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor, s.size])[unknowns.mask]
 
-def _wrap(obs, data, unknowns, found, excluded):
-    state, blocks = found.state, named_blocks(found.state, data, unknowns)
-    lens = lens_covariance(obs, found, data, unknowns)
+    found = solve(
+        lambda s: joint_blocks(s, data, unknowns), in_stated_gauge(state, obs),
+        lambda s, step: move_state(s, step, unknowns), names=names, method="joint", read=read,
+        scales=[SCALES.get(name, 1.0) for name in names], words=lambda d: joint_words(d, names, obs.cameras),
+        shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=MOST_STEPS,
+        tolerance=LAST_STEP, n_observations=count_rows(obs),
+    )  # fmt: skip
+    lens = joint_noise.lens_covariance(obs, found, data, unknowns)
     spread = None if found.covariance_placements is None else found.covariance_placements + lens
     found = replace(found, covariance=found.covariance + lens, covariance_placements=spread)
-    T_head_lrf = pose_transform(state.head)
+    state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, unknowns), obs.placements.tolist()
+    levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return JointSolution(
-        T_head_lrf,
-        {name: pose_transform(pose) for name, pose in zip(obs.cameras, state.cameras, strict=True)},
-        dict(zip(obs.placements.tolist(), pose_transform(state.boards), strict=True)),
-        dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
-        {int(p): s for p, s in zip(obs.placements, state.sweeps, strict=True)},
-        dict(zip(obs.edges, state.size.tolist(), strict=True)),
-        noise_levels(data),
-        dict(zip(obs.placements.tolist(), misfits(blocks, data).tolist(), strict=True)),
-        excluded, found.unobservable, lens, joint_warnings(blocks, data, unknowns, found, obs.cameras), found, state,
-        unknowns, data, obs,
+        found, obs, data, unknowns,
+        T_head_lrf=pose_transform(state.head),
+        transforms={name: pose_transform(pose) for name, pose in zip(obs.cameras, state.cameras, strict=True)},
+        boards=dict(zip(numbers, pose_transform(state.boards), strict=True)),
+        sensor=dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
+        sweeps=dict(zip(numbers, state.sweeps, strict=True)),
+        size=dict(zip(obs.edges, state.size.tolist(), strict=True)),
+        noise={name: float(getattr(data, name)) for name in levels}
+        | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
+        misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),
+        excluded=excluded, lens=lens, warnings=joint_noise.joint_warnings(blocks, data, unknowns, found, obs.cameras),
     )  # fmt: skip
-
-
-def noise_levels(data):
-    """Noise levels in use by name."""
-    views = {"view_scale": float(data.view_scale[0])} if len(data.view_scale) else {}
-    names = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
-    return {name: float(getattr(data, name)) for name in names} | views

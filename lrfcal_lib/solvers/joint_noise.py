@@ -1,4 +1,4 @@
-"""Noise levels of the joint estimate, contradictions, the share of the intrinsics, and what is suspicious, in words."""
+"""Noise levels of the joint estimate, the share of the intrinsics, misfits, and what is suspicious, in words."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import whiten
-from lrfcal_lib.fit.residuals import (
-    SIDE_FREEDOM,
-    SWEEPS,
-    Unknowns,
-    edge_distance,
-    named_blocks,
-    pad,
-    rays,
-    view_block,
-    view_whitener,
-)
+from lrfcal_lib.fit.residuals import SIDE_FREEDOM, SWEEPS, Unknowns, rays, view_block
 from lrfcal_lib.model.camera import project_jacobians
 
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 LEAST_CORNERS = 6
+PARTS = 3  # of a board in x and y, and of an edge
+PLANE = 3  # numbers of a plane, that a placement's own pose takes up
+PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
+LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
+SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
+SETTLED = 0.02  # change of the logarithm of a noise level
+NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
+ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
+WEAK_DIRECTION, WEAK_OFFSET = np.radians(1.0), 0.020  # standard deviations of an axis nobody should rely on
+TERMS = {
+    "pitch_scale": (0.001, "the scale of the pitch", 100.0, "%"),
+    "pitch_by_direction": (np.radians(0.01), "a pitch offset by sweep direction", np.degrees(1.0), "deg"),
+}
 
 
 def pose_by_intrinsics(T_camera_board, corners, model):
@@ -48,92 +52,47 @@ def pose_by_intrinsics(T_camera_board, corners, model):
 
 
 def lens_covariance(obs, found, data, unknowns):
-    """Covariance of the shared unknowns from the covariances of the intrinsics.
-
-    Parameters
-    ----------
-    obs : JointObservations
-        With `view_lens` and `lens_covariance`.
-    found : Solution
-        Of the joint estimate, with ``jacobian`` and ``covariance`` of all blocks.
-    data : JointData
-    unknowns : Unknowns
-
-    Returns
-    -------
-    ndarray, shape (c, c)
-        Zeros where the intrinsics are taken to be exact.
-    """
+    """Covariance (c, c) of the shared unknowns from those of the intrinsics; zeros where they are taken to be exact."""
     c = unknowns.shared
     total = np.zeros((c, c))
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
         return total
-    J = whiten(view_block(found.state, data, unknowns))[1]
-    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(obs.placements))["lens"]
-    whitener = view_block(found.state, data, unknowns).whitener
+    block = view_block(found.state, data, unknowns)
+    J, used = whiten(block)[1], data.view["used"]
+    lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
     weighted = np.sqrt(found.weights[..., None]) * found.jacobian
     hessian = np.swapaxes(weighted, -1, -2) @ weighted
     inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
     reduced = J[..., :c] - J[..., c:] @ inverse @ hessian[:, c:, :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
     for camera, spread in enumerate(obs.lens_covariance):
-        mine = (data.view["used"] & (data.view["camera"] == camera))[..., None, None]
-        shift = (whitener @ (lens * mine)).reshape(J.shape[:2] + (LENS,))
+        mine = (used & (data.view["camera"] == camera))[..., None, None]
+        shift = (block.whitener @ (lens * mine)).reshape(J.shape[:2] + (LENS,))
         gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
         total = total + gain @ spread @ gain.T
     return total
 
 
-PARTS = 3  # of a board in x and y, and of an edge
-PLANE = 3  # numbers of a plane, that a placement's own pose takes up
-PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
-LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
-SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
-CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
-LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
-LARGEST_SHARE = 0.3  # of the placements that may contradict the others
-SETTLED = 0.02  # change of the logarithm of a noise level
-ROUGH_MISS = 0.08  # metres, of a board's face from where the first image of it puts it
-
-
 def estimate_noise(state, data, unknowns):
-    """Update the noise levels from the residuals at a solution.
-
-    Parameters
-    ----------
-    state : JointState
-    data : JointData
-    unknowns : Unknowns
-
-    Returns
-    -------
-    JointData
-    """
-    blocks = named_blocks(state, data, unknowns)
-    own = own_variance(blocks, unknowns)
+    """Padded observations with noise levels from the residuals at a solution."""
+    blocks, hessian = residuals.named_blocks(state, data, unknowns), 0.0
+    for block in blocks.values():
+        J = whiten(block)[1][..., unknowns.shared :]
+        hessian = hessian + np.swapaxes(J, -1, -2) @ J
+    variance = np.diagonal(np.linalg.pinv(hessian, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
     if "face" in blocks:
         data = replace(data, **face_levels(state, data, blocks["face"]))
     if "beam" in blocks:
         data = replace(data, beam_share=beam_share(state, data, blocks["beam"], unknowns))
     if "view" in blocks:
         data = view_levels(data, blocks["view"], state)
-    first = 6 + SWEEPS[unknowns.sweep]
+    count = SWEEPS[unknowns.sweep]
     if unknowns.sides:
-        data = replace(data, side_sigma=side_level(state.sides, own[:, first:], data.side_sigma))
-    if SWEEPS[unknowns.sweep]:
-        found = np.sqrt(np.mean(state.sweeps[:, : first - 6] ** 2 + own[:, 6:first], axis=0))
-        data = replace(data, sweep_sigma=(*np.maximum(found, 1e-6), *data.sweep_sigma[len(found) :]))
+        data = replace(data, side_sigma=side_level(state.sides**2 + variance[:, 6 + count :], data.side_sigma))
+    if count:
+        found = np.sqrt(np.mean(state.sweeps[:, :count] ** 2 + variance[:, 6 : 6 + count], axis=0))
+        data = replace(data, sweep_sigma=(*np.maximum(found, 1e-6), *data.sweep_sigma[count:]))
     return data
-
-
-def own_variance(blocks, unknowns):
-    """Variances of every placement's own unknowns with the shared ones held, shape (p, l)."""
-    c = unknowns.shared
-    hessian = 0.0
-    for block in blocks.values():
-        J = whiten(block)[1][..., c:]
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
-    return np.diagonal(np.linalg.pinv(hessian, rcond=1e-13, hermitian=True), axis1=1, axis2=2)
 
 
 def face_levels(state, data, block):
@@ -145,8 +104,7 @@ def face_levels(state, data, block):
     x = on_board(state, data)
     part = _part(x[..., 0], used) * PARTS + _part(x[..., 1], used)
     rows = np.arange(len(used))[:, None] * PARTS**2 + part
-    size = len(used) * PARTS**2
-    total, count = np.bincount(rows[used], z[used], size), np.bincount(rows[used], minlength=size)
+    total, count = np.bincount(rows[used], z[used]), np.bincount(rows[used])
     full = count > 1
     free = full.sum() - PLANE * np.sum(number > 0)
     ratio = np.sum(total[full] ** 2 / count[full]) / scale**2 / max(free, 1)
@@ -155,9 +113,13 @@ def face_levels(state, data, block):
 
 def on_board(state, data):
     """Measured face points in the boards' frames, shape (p, n, 3)."""
+    return (_face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
+
+
+def _face_points(state, data):
+    """Measured face points in the platform frame, shape (p, n, 3)."""
     o, d = rays(state, data, data.face)[:2]
-    x = o + (data.face["range"] - state.sensor[0])[..., None] * d - state.boards[:, None, :, 3]
-    return x @ state.boards[:, :, :3]
+    return o + (data.face["range"] - state.sensor[0])[..., None] * d
 
 
 def _part(values, used):
@@ -169,24 +131,19 @@ def _part(values, used):
 
 def beam_share(state, data, block, unknowns):
     """Share of independent errors among neighbouring beams, from the scores of parts of every edge."""
-    used = data.beam["used"]
     ray = rays(state, data, data.beam)
-    a, t = edge_distance(state, data, data.beam, ray)[4:6]
+    a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
     o, d = ray[:2]
     normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
     r = np.sum(normal * (origin - o), axis=-1) / np.sum(normal * d, axis=-1)
     along = np.sum((o + r[..., None] * d - origin - a) * t, axis=-1)
     root = np.linalg.norm(block.jacobian[..., unknowns.shared + 3 : unknowns.shared + 6], axis=-1)  # root information
-    score = block.residuals * root
     ratios = []
     for edge in range(len(data.lines)):
-        mine = used & (data.beam["edge"] == edge)
-        part = _part(along, mine)
-        for k in range(PARTS):
-            here = mine & (part == k)
-            information = np.sum(np.where(here, root**2, 0.0), axis=1)
-            total = np.sum(np.where(here, score, 0.0), axis=1)
-            ratios.append(np.divide(total**2, information, out=np.full(len(total), np.nan), where=information > 0))
+        mine = data.beam["used"] & (data.beam["edge"] == edge)
+        here = mine & (_part(along, mine) == np.arange(PARTS)[:, None, None])
+        information, score = (np.sum(np.where(here, v, 0.0), axis=-1) for v in (root**2, block.residuals * root))
+        ratios.append(np.divide(score**2, information, out=np.full(score.shape, np.nan), where=information > 0))
     ratio = np.nanmean(ratios) * PARTS / (PARTS - 1) if np.isfinite(ratios).any() else 1.0
     return float(1 / max(ratio, 1.0))
 
@@ -196,41 +153,41 @@ def view_levels(data, block, state):
 
     One scale serves all cameras: with one view each, a camera could buy itself perfection at the other's cost.
     """
-    p, v = data.view["used"].shape
-    r, used, by_pitch = block.residuals.reshape(p, v, 6), data.view["used"], pitch_columns(state, data)
+    used = data.view["used"]
+    r = block.residuals.reshape(used.shape + (6, 1))
+    # derivatives of the residuals by the pitch of the image; zero for cameras on the base
+    lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
+    turned = replace(data, direction=np.ones(len(data.direction)))
+    by_pitch = view_block(state, turned, lone).jacobian[..., 0].reshape(used.shape + (6,))
     free = 1 - 6 * used.any(axis=1).sum() / max(6 * used.sum(), 1)  # the boards' own poses take up the rest
     free = max(free, LEAST_FREEDOM)
 
     def level(sigma):
         trial = replace(data, sigma_pitch=float(sigma))
         for _ in range(SCALE_ROUNDS):
-            z = (view_whitener(trial, by_pitch) @ r[..., None])[..., 0][used]
+            z = (residuals.view_whitener(trial, by_pitch) @ r)[..., 0][used]
             factor = np.sqrt(np.mean(z**2) / free)
             trial = replace(trial, view_scale=np.clip(trial.view_scale * factor**0.7, *SCALE_LIMITS))
-        whitener = view_whitener(trial, by_pitch)
-        z = (whitener @ r[..., None])[..., 0][used]
+        whitener = residuals.view_whitener(trial, by_pitch)
+        z = (whitener @ r)[..., 0][used]
         return 0.5 * np.sum(z**2) / free - np.log(np.diagonal(whitener[used], axis1=-2, axis2=-1)).sum(), trial
 
     found = [level(sigma) for sigma in (PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1])]
     return min(found, key=lambda pair: pair[0])[1]
 
 
-def pitch_columns(state, data):
-    """Derivative of the views' residuals by the pitch of the image, shape (p, v, 6); zero for cameras on the base."""
-    c = len(state.cameras)
-    lone = Unknowns(c, len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
-    turned = replace(data, direction=np.ones(len(data.direction)))
-    J = view_block(state, turned, lone).jacobian
-    return J[..., 0].reshape(J.shape[0], -1, 6)
-
-
-def side_level(sides, variance, sigma):
-    """Scale of the sides' deviations, Student's t by expectation and maximisation."""
-    square = sides**2 + variance
+def side_level(square, sigma):
+    """Scale of the sides' (squared) deviations, Student's t by expectation and maximisation."""
     for _ in range(20):
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma**2)
         sigma = np.sqrt(np.mean(weight * square))
     return float(np.clip(sigma, 0.01, 2.0))
+
+
+def same_levels(before, after):
+    """Whether noise levels have settled within a few per cent."""
+    ratios = [getattr(after, name) / getattr(before, name) for name in ("face_scale", "face_share", "beam_share")]
+    return bool(np.all(np.abs(np.log([*ratios, *(after.view_scale / before.view_scale)])) < SETTLED))
 
 
 def misfits(blocks, data, groups=("face", "view")):
@@ -243,21 +200,10 @@ def misfits(blocks, data, groups=("face", "view")):
     return total / np.maximum(count - 6, 1)
 
 
-def rough_misses(state, data):
-    """Median distance of every board's face points from where the start value puts the board, metres, (p,)."""
-    return _medians(np.abs(on_board(state, data)[..., 2]), data.face["used"])
-
-
-def image_misses(state, data, boards, placement):
+def face_misses(state, data, boards, placement):
     """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
-    o, d = rays(state, data, data.face)[:2]
-    x = (o + (data.face["range"] - state.sensor[0])[..., None] * d)[placement] - boards[:, None, :, 3]
+    x = _face_points(state, data)[placement] - boards[:, None, :, 3]
     return _medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
-
-
-def _medians(values, used):
-    """Medians of the used values of every row; 0 where there are none."""
-    return np.array([np.median(row[mine]) if mine.any() else 0.0 for row, mine in zip(values, used, strict=True)])
 
 
 def view_misses(state, data):
@@ -270,44 +216,33 @@ def view_misses(state, data):
     return _medians(np.linalg.norm(shift, axis=-1), used)
 
 
-def same_levels(before, after):
-    """Whether noise levels have settled within a few per cent."""
-    ratios = [getattr(after, name) / getattr(before, name) for name in ("face_scale", "face_share", "beam_share")]
-    ratios += (after.view_scale / before.view_scale).tolist()
-    return bool(np.all(np.abs(np.log(ratios)) < SETTLED))
-
-
-NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
-ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
-WEAK_DIRECTION, WEAK_OFFSET = np.radians(1.0), 0.020  # standard deviations of an axis nobody should rely on
-TERMS = {
-    "pitch_scale": (0.001, "the scale of the pitch", 100.0, "%"),
-    "pitch_by_direction": (np.radians(0.01), "a pitch offset by sweep direction", np.degrees(1.0), "deg"),
-}
+def _medians(values, used):
+    """Medians of the used values of every row; 0 where there are none."""
+    return np.array([np.median(row[mine]) if mine.any() else 0.0 for row, mine in zip(values, used, strict=True)])
 
 
 def joint_warnings(blocks, data, unknowns, found, names):
-    """Warnings about a joint estimate.
-
-    Parameters
-    ----------
-    blocks : dict of str to Block
-        Of :func:`lrfcal_lib.fit.residuals.named_blocks` at the solution.
-    data : JointData
-    unknowns : Unknowns
-    found : Solution
-    names : tuple of str
-        Of the cameras.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """What is suspicious about a joint estimate with cameras of these names, in words."""
     words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
-    words += weak_words(found)
-    return tuple(words + asked_words(found.state, data, unknowns))
+    axis, offset = (
+        [sigma for name, sigma in zip(found.names, found.sigma, strict=True) if name.startswith(prefix)]
+        for prefix in ("axis_", "offset_")
+    )
+    turn, shift = np.linalg.norm(axis), np.linalg.norm(offset)
+    if axis and (turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET):
+        words.append(
+            f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger "
+            "pitch range, take images at more pitch angles, or state the platform with its accuracy"
+        )
+    held = [name for name in TERMS if name not in unknowns.sensor]
+    wider = replace(unknowns, sensor=(*unknowns.sensor, *held))
+    for name, (square, value) in score_tests(found.state, data, wider, held).items() if held else ():
+        least, what, factor, unit = TERMS[name]
+        if square > ASKED and abs(value) > least:
+            words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
+    return tuple(words)
 
 
 def noise_words(blocks, data, names):
@@ -331,47 +266,17 @@ def noise_words(blocks, data, names):
     ]
 
 
-def weak_words(found):
-    """A tilt axis that is hardly known."""
-    sigma = dict(zip(found.names, found.sigma, strict=True))
-    axis = [value for name, value in sigma.items() if name.startswith("axis_")]
-    offset = [value for name, value in sigma.items() if name.startswith("offset_")]
-    if not axis:
-        return []
-    turn, shift = np.linalg.norm(axis), np.linalg.norm(offset)
-    if turn < WEAK_DIRECTION and shift < WEAK_OFFSET:
-        return []
-    return [
-        f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger pitch "
-        "range, take images at more pitch angles, or state the platform with its accuracy"
-    ]
-
-
-def asked_words(state, data, unknowns):
-    """Errors of the pitch that were held at zero although the residuals ask for them (a score test)."""
-    held = [name for name in TERMS if name not in unknowns.sensor]
-    if not held:
-        return []
-    words, wider = [], replace(unknowns, sensor=(*unknowns.sensor, *held))
-    for name, (square, value) in score_tests(state, data, wider, held).items():
-        least, what, factor, unit = TERMS[name]
-        if square > ASKED and abs(value) > least:
-            words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
-    return words
-
-
 def score_tests(state, data, unknowns, held):
     """Squared scores of shared unknowns held at zero, in standard deviations, and the values they would take.
 
     Each one is tested by itself, with all that was estimated free.
     """
     c, hessian, gradient = unknowns.shared, 0.0, 0.0
-    for block in named_blocks(state, data, unknowns).values():
+    for block in residuals.named_blocks(state, data, unknowns).values():
         r, J = whiten(block)
         transposed = np.swapaxes(J, -1, -2)
         hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
-    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-12, hermitian=True)
-    back = hessian[:, :c, c:] @ inverse
+    back = hessian[:, :c, c:] @ np.linalg.pinv(hessian[:, c:, c:], rcond=1e-12, hermitian=True)
     whole = np.sum(hessian[:, :c, :c] - back @ hessian[:, c:, :c], axis=0)
     score = np.sum(gradient[:, :c] - (back @ gradient[:, c:, None])[..., 0], axis=0)
     names = unknowns.names(range(unknowns.cameras), range(unknowns.edges))
