@@ -13,7 +13,7 @@ import pytest
 from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
-from lrfcal_lib.drivers.head import HEAD, HeadSettings
+from lrfcal_lib.drivers.head import HeadSettings
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
@@ -113,7 +113,7 @@ def paths(data, way=()):
 def every_key():
     """A rig file that states all that can be stated about devices and plan."""
     data = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
-    head = {name: getattr(HeadSettings(), name) for name in HEAD}
+    head = {name: getattr(HeadSettings(), name) for name in vars(HeadSettings())}
     data["devices"]["head"] |= head | {"degrees_per_second": 4.0, "repeat_s": 0.5, "pitch_limits_deg": [-60, 60]}
     data["devices"]["lrf"] |= {"baudrate": 9600, "address": 1, "password": "SICK_LMS", "measuring_mode": 0,
                                "realtime_indices": True, "interlaced": False}  # fmt: skip

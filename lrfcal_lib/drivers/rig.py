@@ -442,7 +442,7 @@ def _named(device, opener, *arguments, **options):
 def _open_head(stated, **options):
     from lrfcal_lib.drivers.head import PanTilt
 
-    return PanTilt.open(stated.head_device, stated.head_settings, **options)
+    return PanTilt(stated.head_device, stated.head_settings, **options)
 
 
 def _open_lrf(stated, **given):
