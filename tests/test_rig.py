@@ -541,7 +541,7 @@ def test_a_camera_of_another_size_is_refused(monkeypatch):
         def close(self):
             closed.append(self)
 
-    monkeypatch.setattr("lrfcal_lib.drivers.video.Camera.open", lambda *args, **options: Small())
+    monkeypatch.setattr("lrfcal_lib.drivers.video.Camera", lambda *args, **options: Small())
     monkeypatch.setattr(rig_module, "_open_head", lambda *args, **_: Head(Clock()))
     monkeypatch.setattr(rig_module, "_open_lrf", lambda *args, **_: Lrf(None, None))
     with pytest.raises(RigFileError, match=r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"):

@@ -468,7 +468,7 @@ def _open_camera(stated, name, **given):
     asked, info = stated.camera_devices[name], stated.cameras[name]
     options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
     size = (info.width, info.height)
-    camera = Camera.open(asked["source"], name=name, size=size, **options, **given)
+    camera = Camera(asked["source"], name=name, size=size, **options, **given)
     got = camera.settings["size"]["got"]
     if got is not None and tuple(got) != (info.width, info.height):
         camera.close()
