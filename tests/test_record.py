@@ -127,7 +127,7 @@ def test_interlaced_telegrams_share_their_pitch(tmp_path):
     reading = rig.lrf.request()
     event = Scanned(1, (replace(reading, telegrams=reading.telegrams * 4),), np.array([0.1]))
     recording.writer.begin_placement(1)
-    recording._write(event)
+    recording.write(event)
     rows = (tmp_path / "s" / "lrf" / "index.csv").read_text().splitlines()[2:]
     assert len(rows) == 4 and len({row.split(",")[4] for row in rows}) == 1
 
@@ -457,13 +457,10 @@ def test_an_emulated_board_moves_by_itself(tmp_path, monkeypatch):
     assert moved == [1, 2]
 
 
-def test_lights_and_advice_are_shown(tmp_path):
+def test_lights_are_shown(tmp_path):
     screen = Screen()
-    record_session(
-        make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(screen, answers("")), advice=lambda s: "go left"
-    )
-    text = screen.getvalue()
-    assert "BAD   scan: no board" in text and "BAD   camera left" in text and "WARN  information: go left" in text
+    record_session(make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(screen, answers("")))
+    assert "BAD   scan: no board" in screen.getvalue() and "BAD   camera left: 0 of 1" in screen.getvalue()
 
 
 def board_picture(noise=0):
