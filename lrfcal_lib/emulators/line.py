@@ -176,7 +176,7 @@ class Faults:
         with self._lock:
             hit = self._times[name] > 0 or self._now() < self._until.get(name, 0)
             self._times[name] -= self._times[name] > 0
-            self.counts.update([name] * hit)
+            self.counts.update([name] * bool(hit))
             return hit
 
     def mangle(self, data, names=REPLY):
