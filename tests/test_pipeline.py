@@ -1,6 +1,7 @@
 """Combining axes, naming sides, pitch noise: the parts of the chain that need no recording."""
 
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,10 +22,10 @@ def head(rng, angle=0.05):
     return RigidTransform.from_components(rng.normal(size=3) * 0.1, Rotation.from_rotvec(rng.normal(size=3) * angle))
 
 
-def trusted(covariance, scatter):
-    """The covariance to rely on, of propagated noise and of the scatter over placements."""
+def estimate(T_head_lrf, covariance, scatter=None):
     inner = dict.fromkeys(field.name for field in fields(Solution))
-    return Solution(**inner | {"covariance": covariance, "covariance_placements": scatter}).trusted
+    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance}
+    return SimpleNamespace(T_head_lrf=T_head_lrf, solution=Solution(**inner | {"covariance_placements": scatter}))
 
 
 def test_the_chart_of_the_axis_is_undone():
@@ -37,7 +38,7 @@ def test_the_chart_of_the_axis_is_undone():
 def test_the_better_known_axis_wins(scale, wins):
     rng = np.random.default_rng(1)
     stated, data = head(rng), head(rng)
-    found, covariance = pipeline.combine((data, scale * STATED), (stated, STATED))
+    found, covariance = pipeline.combine(estimate(data, scale * STATED), (stated, STATED))
     winner = {"data": data, "stated": stated}[wins]
     assert max(axis_difference(axis_of(found), axis_of(winner))) < 1e-6
     assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
@@ -46,20 +47,20 @@ def test_the_better_known_axis_wins(scale, wins):
 def test_placements_that_agree_by_chance_do_not_outweigh_the_stated_axis():
     rng = np.random.default_rng(4)
     stated, data = head(rng), head(rng)
-    found, _ = pipeline.combine((data, trusted(1e8 * STATED, 1e-8 * STATED)), (stated, STATED))
+    found, _ = pipeline.combine(estimate(data, 1e8 * STATED, 1e-8 * STATED), (stated, STATED))
     assert max(axis_difference(axis_of(found), axis_of(stated))) < 1e-6
 
 
 def test_combining_keeps_what_no_data_can_show():
     rng = np.random.default_rng(2)
     stated = head(rng)
-    found, _ = pipeline.combine((stated, STATED), (stated, STATED))
+    found, _ = pipeline.combine(estimate(stated, STATED), (stated, STATED))
     np.testing.assert_allclose(found.as_matrix(), stated.as_matrix(), atol=1e-12)
 
 
 def test_without_a_stated_platform_the_data_stand_alone():
     data = head(np.random.default_rng(3))
-    found, covariance = pipeline.combine((data, np.eye(4)), None)
+    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None)
     assert found is data and (covariance == np.eye(4)).all()
 
 

@@ -287,7 +287,7 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
         except DegenerateGeometry as error:
             problems[name] = str(error)
     axes = {name: (found.T_head_lrf, found.solution.trusted) for name, found in solutions.items()}
-    best = combine(axes["line_3d"], stated) if "line_3d" in axes else stated
+    best = combine(solutions["line_3d"], stated) if "line_3d" in solutions else stated
     if best is None:
         raise DegenerateGeometry(f"the platform is neither stated nor determined by the sweeps: {problems}")
     axes |= ({} if stated is None else {"stated": stated}) | {"combined": best}
@@ -300,25 +300,16 @@ def stated_covariance(sigma):
 
 
 def combine(found, stated):
-    """Weigh an estimated axis and the stated one by their covariances.
+    """Weigh an estimated axis (PlatformSolution) and the stated one by their covariances.
 
-    Parameters
-    ----------
-    found : (RigidTransform, ndarray of shape (4, 4))
-        ``T_head_lrf``, and the covariance of its axis.
-    stated : (RigidTransform, ndarray of shape (4, 4)), or None
-
-    Returns
-    -------
-    T_head_lrf : RigidTransform
-    covariance : ndarray, shape (4, 4)
+    `stated` and what is returned are ``T_head_lrf`` and the covariance of its axis; None where nothing is stated.
     """
+    covariance = found.solution.trusted
     if stated is None:
-        return found
-    (T_found, covariance), (T_stated, prior) = found, stated
-    values, known = (chart_parameters(pose_array(T)) for T in (T_found, T_stated))
-    gain = prior @ np.linalg.inv(prior + covariance)
-    axis = axis_from_chart(known + gain @ (values - known))
+        return found.T_head_lrf, covariance
+    T_stated, prior = stated
+    known, gain = chart_parameters(pose_array(T_stated)), prior @ np.linalg.inv(prior + covariance)
+    axis = axis_from_chart(known + gain @ (found.solution.parameters - known))
     unseen = T_stated * geometry.head_from_axis(geometry.axis_of(T_stated)).inv()  # turn about the axis, shift along it
     return unseen * geometry.head_from_axis(axis), prior - gain @ prior
 
