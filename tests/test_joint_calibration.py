@@ -9,6 +9,7 @@ from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
 from lrfcal_lib.evaluate import jointly, tables
 from lrfcal_lib.evaluate.export import calibration_record
@@ -45,8 +46,8 @@ def test_the_session_asks_for_its_unknowns(joint):
 
 def test_the_scale_of_the_pitch_is_free_with_the_axis_whatever_the_images(joint):
     """Held at zero, a wrong scale would go into the axis: also with cameras on the base, and one image a placement."""
-    views = {name: found[:1] for name, found in pipeline.all_views(joint.prepared).items()}
-    seen = pipeline.observe_joint(joint.prepared, views)
+    views = {name: found[:1] for name, found in all_views(joint.prepared).items()}
+    seen = observe_joint(joint.prepared, views)
     assert "pitch_scale" in pipeline.joint_settings(joint.prepared, seen)["sensor"]
 
 

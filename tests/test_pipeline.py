@@ -38,7 +38,7 @@ def test_the_chart_of_the_axis_is_undone():
 def test_the_better_known_axis_wins(scale, wins):
     rng = np.random.default_rng(1)
     stated, data = head(rng), head(rng)
-    found, covariance = pipeline.combine(estimate(data, scale * STATED), stated, SIGMA)
+    found, covariance = pipeline.combine(estimate(data, scale * STATED), (stated, STATED))
     winner = {"data": data, "stated": stated}[wins]
     assert max(axis_difference(axis_of(found), axis_of(winner))) < 1e-6
     assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
@@ -47,20 +47,20 @@ def test_the_better_known_axis_wins(scale, wins):
 def test_placements_that_agree_by_chance_do_not_outweigh_the_stated_axis():
     rng = np.random.default_rng(4)
     stated, data = head(rng), head(rng)
-    found, _ = pipeline.combine(estimate(data, 1e8 * STATED, 1e-8 * STATED), stated, SIGMA)
+    found, _ = pipeline.combine(estimate(data, 1e8 * STATED, 1e-8 * STATED), (stated, STATED))
     assert max(axis_difference(axis_of(found), axis_of(stated))) < 1e-6
 
 
 def test_combining_keeps_what_no_data_can_show():
     rng = np.random.default_rng(2)
     stated = head(rng)
-    found, _ = pipeline.combine(estimate(stated, STATED), stated, SIGMA)
+    found, _ = pipeline.combine(estimate(stated, STATED), (stated, STATED))
     np.testing.assert_allclose(found.as_matrix(), stated.as_matrix(), atol=1e-12)
 
 
 def test_without_a_stated_platform_the_data_stand_alone():
     data = head(np.random.default_rng(3))
-    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None, SIGMA)
+    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None)
     assert found is data and (covariance == np.eye(4)).all()
 
 
@@ -85,19 +85,19 @@ def side(board, edge, n=20, shift=0.0, turn_deg=0.0):
 def test_sides_are_named_after_the_nearest_edge():
     board = triangle_board()
     sides = {4: side(board, "bc", shift=0.01), 7: side(board, "ab", shift=-0.01), 9: side(board, "ca")}
-    assert observe._nearest_edges(board, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
+    assert observe.nearest_edges(board, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
 
 
 def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
     board = triangle_board()
-    names, problems = observe._nearest_edges(board, {0: side(board, "ab", turn_deg=5), 1: side(board, "bc", shift=0.2)})
+    names, problems = observe.nearest_edges(board, {0: side(board, "ab", turn_deg=5), 1: side(board, "bc", shift=0.2)})
     assert names == {}
     assert "turned by 5.0 deg" in problems[0] and "200 mm from the edge 'bc'" in problems[1]
 
 
 def test_two_sides_do_not_share_an_edge():
     board = triangle_board()
-    names, _ = observe._nearest_edges(board, {0: side(board, "ab"), 1: side(board, "ab", shift=0.02)})
+    names, _ = observe.nearest_edges(board, {0: side(board, "ab"), 1: side(board, "ab", shift=0.02)})
     assert list(names.values()).count("ab") == 1
 
 

@@ -105,7 +105,7 @@ def test_the_pitch_depends_on_the_direction_of_the_sweep(found):
 
 
 def test_the_axis_agrees_with_the_authors_within_its_uncertainty(found):
-    angle, offset = axis_difference(axis_of(found.platform.T_head_lrf), axis_of(found.platform.stated))
+    angle, offset = axis_difference(axis_of(found.platform.T_head_lrf), axis_of(found.platform.transform("stated")))
     assert angle < np.deg2rad(1.5) and offset < 0.03
     values = found.platform.parameters()
     sigma = np.sqrt(np.diag(values["line_3d"][1]))

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct as rec
+from lrfcal_lib.calibrate.outline import measure_board
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
 
@@ -59,8 +60,8 @@ def test_exact_edge_points_give_exact_lengths():
     s = np.linspace(0.1, 0.9, 12)[:, None]
     sides = {e: pose.apply(corners[i] * (1 - s) + corners[(i + 1) % 3] * s) for i, e in enumerate(board.edges)}
     face = pose.apply(np.random.default_rng(0).dirichlet([1, 1, 1], 50) @ corners)
-    lengths = rec.measure_board(face, sides, board.edges).lengths
+    lengths = measure_board(face, sides, board.edges).lengths
     for name, value in board.lengths().items():
         assert lengths[name] == pytest.approx(value, abs=1e-9)
     del sides["bc"]
-    assert rec.measure_board(face, sides, board.edges).lengths == {}
+    assert measure_board(face, sides, board.edges).lengths == {}

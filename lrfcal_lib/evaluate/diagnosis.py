@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.observe import platform_of, rough_poses
+from lrfcal_lib.calibrate.observe import rough_poses
+from lrfcal_lib.calibrate.outline import platform_of
 from lrfcal_lib.model.geometry import lrf_to_source
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.steadiness import camera_steadiness
@@ -71,7 +72,7 @@ def board_maps(prepared):
         By placement; from LRF points (n, 3) and their pitch (n,) to the board frame (n, 3). Cameras posed from the
         planes alone, so good to about a centimetre.
     """
-    rough = rough_poses(replace(prepared, problems={}))  # its findings are in the problems already
+    rough, _ = rough_poses(prepared)  # its findings are in the problems already
     maps = {}
     for camera, T_camera_source in rough.items():
         for placement, view in prepared.views[camera].items():

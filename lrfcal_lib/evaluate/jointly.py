@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.observe import likely_outline_of
+from lrfcal_lib.calibrate.outline import likely_outline_of
 from lrfcal_lib.evaluate.next_placement import outline
 from lrfcal_lib.evaluate.tables import ends_of, rms, unit_of
 from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift, named_blocks
@@ -288,7 +288,7 @@ def joint_errors(joint, truth):
     """
     solution, rows = joint.solution, []
     if joint.settings["axis"]:
-        sigma = np.sqrt(np.diag(joint.axis_parameters()[1]))
+        sigma = np.sqrt(np.diag(solution.covariance("axis_", "offset_")))
         turn, shift = axis_difference(solution.axis, axis_of(truth.T_head_lrf))
         rows = [("tilt axis", turn, np.linalg.norm(sigma[:2]), shift, np.linalg.norm(sigma[2:]))]
     for camera, found in solution.transforms.items():

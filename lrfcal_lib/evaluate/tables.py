@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate.observe import likely_outline_of, outline_of
-from lrfcal_lib.calibrate.outline import fused_outline_of
+from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
 from lrfcal_lib.calibrate.pipeline import left_out_residuals as jointly_left_out
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.model.board import Board
@@ -638,7 +637,7 @@ def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
         ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines), 'image'
         where images show them ('fused').
     """
-    ways = {v: lambda placement, v=v: _by_least_squares(prepared, placement, v, T_head_lrf) for v in VARIANTS}
+    ways = {v: lambda placement, v=v: outline_of(prepared, placement, v, T_head_lrf) for v in VARIANTS}
     if joint is not None:
         edge_model_of = joint.edge_model
         ways["fused"] = lambda placement: fused_outline_of(joint, placement)
@@ -652,11 +651,6 @@ def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
-
-
-def _by_least_squares(prepared, placement, variant, T_head_lrf):
-    outline = outline_of(prepared, placement, variant, T_head_lrf)
-    return outline.measured, outline.across
 
 
 def _placement_lengths(prepared, placement, variant, measure):
