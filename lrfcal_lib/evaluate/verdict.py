@@ -248,10 +248,11 @@ def _without_joint(calibration, method):
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
     head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
-    chains = {None: Chain(head, None, "head", (sigma,), *rest)}
+    chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
         sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
-        chains[camera] = Chain(head, pose_array(found.transform), session.cameras[camera].mount, (sigma,), *rest)
+        on_head = session.cameras[camera].mount == "head"
+        chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
     noise = np.median([board.sigma_range for board in prepared.scans.values()])
     return replace(_expected(chains, prepared.models, pitch, noise, reasons), sweep_mm=0.0)
