@@ -21,11 +21,10 @@ ALL = 10**9  # crossings
 NOISE_WORDS = {
     "face_scale": "scatter of ranges, in stated standard deviations",
     "view_scale": "scatter of board poses in images, in stated standard deviations",
-    "face_share": "independent errors per range",
-    "beam_share": "independent errors per beam at an edge",
+    "face_share": "independent errors per range", "beam_share": "independent errors per beam at an edge",
     "sigma_pitch": "error of the pitch of single images [deg]",
     "side_sigma": "spread of the edge bias from side to side [log odds]",
-}
+}  # fmt: skip
 
 
 def range_residuals(solution):
@@ -87,11 +86,8 @@ def joint_table(joint):
     units, factors = zip(*map(unit_of, solution.names), strict=True)
     spread = np.full(len(factors), np.nan) if solution.sigma_placements is None else solution.sigma_placements
     return pd.DataFrame({
-        "parameter": solution.names,
-        "unit": units,
-        "value": factors * solution.parameters,
-        "sigma_noise": factors * solution.sigma,
-        "sigma_placements": factors * spread,
+        "parameter": solution.names, "unit": units, "value": factors * solution.parameters,
+        "sigma_noise": factors * solution.sigma, "sigma_placements": factors * spread,
         "sigma": factors * solution.trusted_sigma,
     })  # fmt: skip
 

@@ -24,17 +24,12 @@ HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
 LIMITS = (0.005, 0.995)  # of what chance alone does
 FEWEST_TRIALS = 10
 GROUPS = {  # unknowns by name: what they are together, the unit of that and the factor to it
-    r"axis_.*": ("axis direction", "deg", np.degrees(1.0)),
-    r"offset_.*": ("axis offset", "mm", 1000.0),
-    r"size_.*": ("board size", "mm", 1000.0),
-    r"range_offset": ("range offset", "mm", 1000.0),
-    r"edge_log_odds": ("edge bias", "log odds", 1.0),
-    r"edge_log_softness": ("edge softness", "log", 1.0),
-    r"pitch_scale": ("pitch scale", "%", 100.0),
-    r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
-    r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)),
-    r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
-}
+    r"axis_.*": ("axis direction", "deg", np.degrees(1.0)), r"offset_.*": ("axis offset", "mm", 1000.0),
+    r"size_.*": ("board size", "mm", 1000.0), r"range_offset": ("range offset", "mm", 1000.0),
+    r"edge_log_odds": ("edge bias", "log odds", 1.0), r"edge_log_softness": ("edge softness", "log", 1.0),
+    r"pitch_scale": ("pitch scale", "%", 100.0), r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
+    r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)), r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
+}  # fmt: skip
 UNIFORM = 1 / np.sqrt(12.0)
 FACE = 24  # face points a placement
 
@@ -280,13 +275,10 @@ def _judge(trials, index, factor):
     correlation = mean / np.sqrt(np.multiply.outer(np.diagonal(mean), np.diagonal(mean)))
     free, seen = count * _freedom(np.mean(B * scale, axis=0)), max(round(count * _freedom(correlation)), 1)
     row = {
-        "rmse": rmse,
-        "crb": crb,
-        "rmse_over_crb": rmse / crb,
-        "stated_over_crb": stated / crb,
+        "rmse": rmse, "crb": crb, "rmse_over_crb": rmse / crb, "stated_over_crb": stated / crb,
         "coverage": np.mean(np.abs(e / stated_sigma) < HALF_WIDTH),
         "nees": np.mean(np.sum(e * np.linalg.solve(C, e[..., None])[..., 0], axis=-1)) / len(index),
-    }
+    }  # fmt: skip
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
     row["nees_low"], row["nees_high"] = chi2.ppf(LIMITS, e.size) / e.size
@@ -332,14 +324,10 @@ def crossings(shots, setup, last_beam=False):
     noise = variance[..., None, None] * _outer(points / np.linalg.norm(points, axis=-1, keepdims=True))
     radius = setup.radius(np.linalg.norm(points, axis=-1))
     found = {
-        "points": points,
-        "half_step": turned * half[:, None],
-        "noise": noise,
-        "covariance": noise + _outer(turned * setup.step * UNIFORM),
-        "radius": radius,
-        "background": 0 * radius,
+        "points": points, "half_step": turned * half[:, None], "noise": noise,
+        "covariance": noise + _outer(turned * setup.step * UNIFORM), "radius": radius, "background": 0 * radius,
         "line_sigma": np.full(radius.shape, setup.sigma_px),
-    }
+    }  # fmt: skip
     found = {k: v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
     return found | {"lines": shots["lines"].reshape(t, 2 * p, 3), "groups": np.repeat(np.arange(p), 2)}
 
@@ -412,11 +400,8 @@ def shots_table(shots, setup, solutions):
         squares = np.sum(error * np.linalg.solve(found.covariance[..., :6, :6], error[..., None])[..., 0], axis=-1)
         angle, distance = np.degrees(np.linalg.norm(error[:, :3], axis=-1)), 1e3 * np.linalg.norm(error[:, 3:], axis=-1)
         rows.append({
-            "method": method,
-            "rotation_median_deg": np.median(angle),
-            "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
-            "translation_median_mm": np.median(distance),
-            "translation_rms_mm": np.sqrt(np.mean(distance**2)),
+            "method": method, "rotation_median_deg": np.median(angle), "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
+            "translation_median_mm": np.median(distance), "translation_rms_mm": np.sqrt(np.mean(distance**2)),
             "nees": np.mean(squares) / 6,
             "bias_error": np.median(np.abs(edge_bias(found)[0] - setup.bias)) if method == "line_ml" else np.nan,
             "converged": np.mean(found.converged),

@@ -17,15 +17,8 @@ from lrfcal_lib.calibrate.outline import fused_outline_of
 from lrfcal_lib.calibrate.pipeline import left_out_residuals as jointly_left_out
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    axis_difference,
-    axis_of,
-    lrf_to_platform,
-    paper_parameters,
-    transform_difference,
-)
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
 from lrfcal_lib.solvers import METHODS
@@ -36,10 +29,9 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
-    r"offset_.*|size_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0),
-    r"pitch_scale": ("%", 100.0),
+    r"offset_.*|size_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
-}
+}  # fmt: skip
 
 
 def unit_of(parameter):
@@ -99,13 +91,13 @@ def camera_errors(solution, truth, camera):
     """Rotation (degrees) and translation error (millimetres) of a camera, by column; none without truth."""
     if truth is None:
         return {}
-    angle, distance = transform_difference(solution.transform, truth.cameras[camera])
+    angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
     return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
 
 
 def axis_errors(T_head_lrf, truth):
     """Direction (degrees) and offset error (millimetres) of a tilt axis."""
-    angle, offset = axis_difference(axis_of(T_head_lrf), axis_of(truth.T_head_lrf))
+    angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), geometry.axis_of(truth.T_head_lrf))
     return np.rad2deg(angle), 1000 * offset
 
 
@@ -127,7 +119,7 @@ def edge_point_table(prepared, truth):
         misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
             found = prepared.edges[variant][placement]
-            p_platform = lrf_to_platform(found.points, truth.pitch[placement][found.line], truth.T_head_lrf)
+            p_platform = geometry.lrf_to_platform(found.points, truth.pitch[placement][found.line], truth.T_head_lrf)
             p_board = truth.boards[placement].inv().apply(p_platform)
             for side, edge in names.items():
                 misses[edge].append(p_board[found.side == side, :2] @ lines[edge][:2] + lines[edge][2])
@@ -163,12 +155,10 @@ def placements_table(prepared, observations):
             else:
                 notes += [f"{camera} {edge}: {why}" for edge, why in view.rejected]
         row = {
-            "placement": placement,
-            "used": any(placement in obs.all_placements for obs in own.values()),
-            "reason": prepared.problems.get(placement) or "; ".join(notes),
-            "n_scan_lines": int(mask.any(axis=1).sum()),
+            "placement": placement, "used": any(placement in obs.all_placements for obs in own.values()),
+            "reason": prepared.problems.get(placement) or "; ".join(notes), "n_scan_lines": int(mask.any(axis=1).sum()),
             "n_points": int(mask.sum()),
-        }
+        }  # fmt: skip
         crossed = {c: np.unique(obs.crossing_edge[obs.crossing_placement == placement]) for c, obs in own.items()}
         rows.append(row | {f"edges_{camera}": len(edges) for camera, edges in crossed.items()})
     return pd.DataFrame(rows)
@@ -220,7 +210,7 @@ def left_out_residuals(obs, judge, solve, full):
     for placement in judge.all_placements:
         try:
             solution = solve(obs.select(obs.all_placements[obs.all_placements != placement]), full.transform)
-        except DegenerateGeometry:
+        except geometry.DegenerateGeometry:
             continue
         held = judge.select([placement])
         edge_px[judge.crossing_placement == placement] = edge_residuals_px(held, solution.transform, solution.model)
@@ -262,15 +252,11 @@ def method_comparison(observations, solutions, truth=None, joint=None):
             held_edge, held_plane = left_out_residuals(own, judge, METHODS[name].solve, solution)
         edge = edge_residuals_px(judge, solution.transform, solution.model)
         row = {
-            "camera": camera,
-            "method": name,
-            "n_placements": len(np.unique(used)),
-            "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan,
-            "edge_rms_px": rms(edge),
-            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)),
-            "left_out_edge_rms_px": rms(held_edge),
+            "camera": camera, "method": name, "n_placements": len(np.unique(used)),
+            "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan, "edge_rms_px": rms(edge),
+            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)), "left_out_edge_rms_px": rms(held_edge),
             "left_out_plane_rms_mm": 1000 * rms(held_plane),
-        }
+        }  # fmt: skip
         rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
 
@@ -365,7 +351,7 @@ def platform_calibration_table(platform, truth=None):
     """
     names, found = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y"), {}
     for method, (values, covariance) in platform.parameters().items():
-        phi, ty = paper_parameters(platform.transform(method))
+        phi, ty = geometry.paper_parameters(platform.transform(method))
         sigma = np.append(np.sqrt(np.diag(covariance)), np.full(4, np.nan))
         found[method,] = names, [*values, *phi, ty], sigma
     table = _parameter_table(["method"], found)
@@ -393,15 +379,10 @@ def sweeps_table(session):
         sweep = session.sweep(placement)
         pitch, valid = np.rad2deg(sweep.pitch), np.isfinite(sweep.ranges)
         rows.append({
-            "placement": placement,
-            "n_scan_lines": len(pitch),
-            "n_returns": int(valid.sum()),
-            "invalid_percent": 100 * (1 - valid.mean()),
-            "pitch_from_deg": pitch[0],
-            "pitch_to_deg": pitch[-1],
+            "placement": placement, "n_scan_lines": len(pitch), "n_returns": int(valid.sum()),
+            "invalid_percent": 100 * (1 - valid.mean()), "pitch_from_deg": pitch[0], "pitch_to_deg": pitch[-1],
             "pitch_step_deg": float(np.median(np.abs(np.diff(pitch)))) if len(pitch) > 1 else 0.0,
-            "direction": session.sweep_direction(placement),
-            "n_images": len(session.images(placement=placement)),
+            "direction": session.sweep_direction(placement), "n_images": len(session.images(placement=placement)),
         })  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -496,10 +477,7 @@ def axis_knowledge_table(platform):
     data, rough = np.sqrt(np.diag(platform.parameters()["line_3d"][1])), np.repeat(platform.stated_sigma, 2)
     units, factors = zip(*map(unit_of, AXIS_NAMES), strict=True)
     return pd.DataFrame({
-        "parameter": AXIS_NAMES,
-        "unit": units,
-        "sigma_data": factors * data,
-        "sigma_rough": factors * rough,
+        "parameter": AXIS_NAMES, "unit": units, "sigma_data": factors * data, "sigma_rough": factors * rough,
         "better": np.where(data < rough, "data", "rough measurement"),
     })  # fmt: skip
 
@@ -526,7 +504,7 @@ def stereo_check(solutions, cameras, T_second_first):
     for method in (*METHODS, "joint"):
         if (first, method) in solutions and (second, method) in solutions:
             found = solutions[second, method].transform * solutions[first, method].transform.inv()
-            angle, distance = transform_difference(found, T_second_first)
+            angle, distance = geometry.transform_difference(found, T_second_first)
             length = np.linalg.norm(found.translation)
             rows.append((method, 1000 * length, 1000 * (length - baseline), 1000 * distance, np.rad2deg(angle)))
     columns = ["method", "baseline_mm", "baseline_error_mm", "translation_error_mm", "rotation_error_deg"]
@@ -567,7 +545,7 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         for placement in prepared.session.board_placements:
             lengths, across = {}, frozenset()
             if placement in prepared.names:
-                with suppress(DegenerateGeometry):
+                with suppress(geometry.DegenerateGeometry):
                     measured, across = measure(placement, variant)
                     lengths = measured.lengths
             views = [views[placement] for views in prepared.views.values() if placement in views]
