@@ -283,7 +283,7 @@ def test_render_shows_the_nearer_point_whatever_the_order():
 def test_render_leaves_out_what_cannot_be_seen():
     points = [[0, 0, -1.0], [np.nan, 0, 1], [50.0, 0, 1.0]]
     assert (rig.render(points, np.zeros((3, 3)), IDENTITY, (8, 8)) == 255).all()
-    assert (rig.render(np.empty((0, 3)), np.empty((0, 3)), IDENTITY, (8, 8), background=0) == 0).all()
+    assert (rig.render(np.empty((0, 3)), np.empty((0, 3)), IDENTITY, (8, 8)) == 255).all()
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
