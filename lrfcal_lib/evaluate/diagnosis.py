@@ -22,14 +22,7 @@ SAME_TURN = 0.5  # two cameras whose turns differ by less than this share of the
 class Diagnosis:
     """What a recording says about itself before anything is calibrated.
 
-    Attributes
-    ----------
-    steadiness : dict of str to Steadiness
-        By camera.
-    bends : BoardBends
-    pitch_errors : PitchErrors or None
-    problems : dict
-        Of the prepared session: what cannot be used and why.
+    `steadiness` has a Steadiness by camera; `problems` of the prepared session: what cannot be used and why.
     """
 
     steadiness: dict
@@ -39,17 +32,9 @@ class Diagnosis:
 
 
 def diagnose(prepared, pitch_errors=None):
-    """Ask a recording whether its cameras stood still and its boards were flat.
+    """Ask a recording (Prepared) whether its cameras stood still and its boards were flat: a :class:`Diagnosis`.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    pitch_errors : PitchErrors, optional
-        Of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
-
-    Returns
-    -------
-    Diagnosis
+    `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
     """
     steadiness = {
         camera: camera_steadiness(prepared.session, camera, views, prepared.models[camera])
@@ -60,17 +45,10 @@ def diagnose(prepared, pitch_errors=None):
 
 
 def board_maps(prepared):
-    """Where points of each sweep lie on the board, through the first camera that sees it.
+    """Where points of each sweep lie on the board, through the first camera that sees it: dict of int to callable.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    dict of int to callable
-        By placement; from LRF points (n, 3) and their pitch (n,) to the board frame (n, 3). Cameras posed from the
-        planes alone, so good to about a centimetre.
+    From LRF points (n, 3) and their pitch (n,) to the board frame (n, 3). Cameras posed from the planes alone, so good
+    to about a centimetre.
     """
     rough = rough_poses(replace(prepared, problems={}))  # its findings are in the problems already
     head, maps = platform_of(prepared), {}
@@ -86,17 +64,10 @@ def board_maps(prepared):
 
 
 def bends_table(bends):
-    """Bend of the board at every placement.
+    """Bend of the board (BoardBends) at every placement.
 
-    Parameters
-    ----------
-    bends : BoardBends
-
-    Returns
-    -------
-    DataFrame
-        placement, bend_mm, sigma_mm (in the scan), p_value, bends, sheet_bend_mm, sheet_sigma_mm (in the images; NaN
-        where not known), reason.
+    Columns placement, bend_mm, sigma_mm (in the scan), p_value, bends, sheet_bend_mm, sheet_sigma_mm (in the images;
+    NaN where not known), reason.
     """
     columns = ["placement", "bend_mm", "sigma_mm", "p_value", "bends", "sheet_bend_mm", "sheet_sigma_mm", "reason"]
     rows = [
@@ -107,17 +78,7 @@ def bends_table(bends):
 
 
 def findings_in_words(diagnosis):
-    """What a recording says about itself, one sentence a finding.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-
-    Returns
-    -------
-    list of str
-        Empty for a recording without fault.
-    """
+    """What a recording says about itself, one sentence a finding; none for a recording without fault."""
     found = pitch_words(diagnosis.pitch_errors) + motion_words(diagnosis.steadiness)
     return found + bend_words(diagnosis.bends) + problem_words(diagnosis.problems)
 

@@ -29,22 +29,12 @@ FRAMES = (
 
 
 def calibration_record(calibration, method, judged=None):
-    """Everything a calibration says, ready for JSON.
+    """Everything that a Calibration says about the results of a method, ready for JSON.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    method : str
-        The method whose results are handed over; 'joint' brings its own platform, range offset and pitch terms.
-    judged : Verdict, optional
-        On these results, where :func:`lrfcal_lib.evaluate.verdict.judge` was asked already.
-
-    Returns
-    -------
-    dict
-        Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for
-        each camera its pose, intrinsics, covariance, and residual statistics; with the joint estimate also what it says
-        about the sensor.
+    Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for each
+    camera its pose, intrinsics, covariance, and residual statistics. 'joint' brings its own platform, range offset and
+    pitch terms, and what it says about the sensor. `judged` is the Verdict on these results, where ``judge`` was asked
+    already.
     """
     session, platform = calibration.prepared.session, calibration.platform
     axis, every = platform.axis_with(method), calibration.solutions.items()
@@ -123,17 +113,8 @@ def write_calibration(path, record):
 def calibrate_session(path, out=None):
     """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and ``cloud.ply``.
 
-    Parameters
-    ----------
-    path : path-like
-        Folder of the session.
-    out : path-like, optional
-        ``reports/<name>`` under the current folder when left out.
-
-    Returns
-    -------
-    int
-        0, or 3 where the verdict is 'no' (also when no camera could be calibrated and nothing is written).
+    They go to `out`, ``reports/<name>`` under the current folder when left out. Returns 0, or 3 where the verdict is
+    'no' (also when no camera could be calibrated and nothing is written).
     """
     found, scale = calibrate(open_session(path)), np.repeat([np.rad2deg(1.0), 1000.0], 3)
     folder = Path(out or Path("reports") / Path(path).resolve().name)

@@ -36,23 +36,9 @@ def range_residuals(solution):
 
 
 def view_residuals(solution, camera, model):
-    """Where the boards' middles were seen in the images of a camera, and how far off the calibration puts them.
+    """Where the boards' middles were seen in the images of a camera, and predicted minus seen; pixels, shapes (n, 2).
 
-    Parameters
-    ----------
-    solution : JointSolution
-    camera : str
-    model : CameraModel
-
-    Returns
-    -------
-    uv, shift : ndarray, shape (n, 2)
-        As seen, and predicted minus seen, pixels.
-
-    Raises
-    ------
-    ValueError
-        If there is no such camera.
+    A ValueError if there is no such camera.
     """
     if camera not in solution.transforms:
         raise ValueError(f"cameras are {', '.join(solution.transforms) or 'none'}; got '{camera}'")
@@ -70,17 +56,10 @@ def view_residuals(solution, camera, model):
 
 
 def joint_table(joint):
-    """Every shared unknown of the joint estimate.
+    """Every shared unknown of the joint estimate (JointCalibration).
 
-    Parameters
-    ----------
-    joint : JointCalibration
-
-    Returns
-    -------
-    DataFrame
-        parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the placements, model errors
-        included; NaN where unknown), sigma (the larger one).
+    Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the placements, model
+    errors included; NaN where unknown), sigma (the larger one).
     """
     solution = joint.solution.solution
     units, factors = zip(*map(unit_of, solution.names), strict=True)
@@ -103,14 +82,7 @@ def noise_table(joint):
 def edge_bias_mm(joint):
     """By how much boards look larger at each side: mean over the beams of every edge, millimetres.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-
-    Returns
-    -------
-    DataFrame
-        placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
+    Columns placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
     """
     solution = joint.solution
     beams, sensor, rows = solution.data.beam, solution.sensor["edge_log_odds"], []
@@ -126,17 +98,10 @@ def edge_bias_mm(joint):
 
 
 def joint_fit(joint):
-    """How well ranges and edges fit the joint estimate.
+    """How well ranges and edges fit the joint estimate: ``plane_rms_mm`` and ``edge_rms_px``.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-
-    Returns
-    -------
-    dict of str to float
-        ``plane_rms_mm`` (face points from their boards), ``edge_rms_px`` (all half-step crossings of scan lines
-        from the image edges, the estimated edge bias taken off, over all cameras).
+    Of face points from their boards, and of all half-step crossings of scan lines from the image edges, the estimated
+    edge bias taken off, over all cameras.
     """
     solution = joint.solution
     plane = on_board(solution.state, solution.data)[..., 2][solution.data.face["used"]]
@@ -187,18 +152,10 @@ def size_error(joint):
 def random_halves(joint, pairs=8):
     """How far estimates from two random halves of the placements differ, beside what their sigmas predict.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-    pairs : int
-
-    Returns
-    -------
-    DataFrame
-        pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg, predicted_translation_mm (root
-        mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma,
-        without the part of the intrinsics, which the halves share).
-        Splits of which a half leaves something open are missing.
+    Columns pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg, predicted_translation_mm
+    (root mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma,
+    without the part of the intrinsics, which the halves share). Splits of which a half leaves something open are
+    missing.
     """
     rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
     for pair in range(pairs):
@@ -218,18 +175,10 @@ def random_halves(joint, pairs=8):
 
 
 def joint_errors(joint, truth):
-    """Errors of axis and cameras against the truth, beside the predicted standard deviations.
+    """Errors of axis and cameras against the :class:`~lrfcal_lib.evaluate.tables.Truth`, beside their predicted sigmas.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-    truth : Truth
-
-    Returns
-    -------
-    DataFrame
-        what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm; no axis where it was
-        not estimated.
+    Columns what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm; no axis where it
+    was not estimated.
     """
     solution, found = joint.solution, {}
     if joint.settings["axis"]:

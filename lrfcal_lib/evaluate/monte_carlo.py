@@ -63,7 +63,7 @@ class Trials:
 
 
 def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0, softness=0.1, pitch_scale=0.0):
-    """The truth behind drawn observations, in the form and gauge of the joint estimate.
+    """The truth behind drawn JointObservations, in the form (JointState) and gauge of the joint estimate.
 
     Parameters
     ----------
@@ -80,10 +80,6 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
         spot radii.
     pitch_scale : float
         The head turns ``1 + pitch_scale`` times as far as recorded.
-
-    Returns
-    -------
-    JointState
     """
     count, edges = len(boards), len(obs.edges)
     state = JointState(
@@ -99,7 +95,7 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
 
 
 def monte_carlo(draw, solve, seeds, *, bounds=True):
-    """Solve many draws whose truth is known.
+    """Solve many draws whose truth is known: :class:`Trials`.
 
     Parameters
     ----------
@@ -111,10 +107,6 @@ def monte_carlo(draw, solve, seeds, *, bounds=True):
         One generator each.
     bounds : bool
         Whether to compute the Cramer-Rao bound of every draw.
-
-    Returns
-    -------
-    Trials
 
     Raises
     ------
@@ -157,27 +149,12 @@ def pose_errors(poses, true):
 
 
 def bound(obs, truth, unknowns, **levels):
-    """Cramer-Rao bound of the shared unknowns from the expected information at the truth.
+    """Cramer-Rao bound of the shared unknowns from the expected information at the truth, shape (c, c).
 
     Nothing of the drawn values enters but which beams and views there are, so it checks the covariance that a solver
-    takes from its own residuals. Board poses, and whatever else a placement owns, count as unknown.
-
-    Parameters
-    ----------
-    obs : JointObservations
-    truth : JointState
-    unknowns : Unknowns
-    **levels
-        Noise levels of :class:`lrfcal_lib.fit.residuals.JointData`, e.g. ``face_scale=2.0``.
-
-    Returns
-    -------
-    ndarray, shape (c, c)
-
-    Raises
-    ------
-    DegenerateGeometry
-        When the data leave a direction of the shared unknowns open.
+    takes from its own residuals. Board poses, and whatever else a placement owns, count as unknown. `levels` are noise
+    levels of :class:`lrfcal_lib.fit.residuals.JointData`, e.g. ``face_scale=2.0``. DegenerateGeometry when the data
+    leave a direction of the shared unknowns open.
     """
     data = replace(gather(obs), **levels)
     read, missed = (
@@ -212,18 +189,7 @@ def groups_of(names):
 
 
 def spread(covariance, names):
-    """Standard deviation of each group of unknowns: root of the trace, in the group's unit.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (k, k)
-    names : tuple of str
-
-    Returns
-    -------
-    dict of str to float
-        E.g. ``{"axis direction": 0.05, "axis offset": 1.3}``, degrees and millimetres.
-    """
+    """Standard deviation of each group of unknowns, by its words: root of the trace of `covariance`, in its unit."""
     variance = np.diagonal(covariance)
     return {words: float(factor * np.sqrt(variance[i].sum())) for words, (i, _, factor) in groups_of(names).items()}
 
@@ -231,22 +197,10 @@ def spread(covariance, names):
 def consistency(trials):
     """How errors compare with the bound and with what the solver states, by group of unknowns and pooled.
 
-    Parameters
-    ----------
-    trials : Trials
-
-    Returns
-    -------
-    DataFrame
-        group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated covariances where there are
-        none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals, nees (mean normalised squared error by number
-        of unknowns), limits of chance of three of them (_low, _high), trials, failed. The last row pools all unknowns,
-        each by its own bound.
-
-    Raises
-    ------
-    ValueError
-        With fewer than ten trials, or errors that are not finite.
+    Columns group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated covariances where there are
+    none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals, nees (mean normalised squared error by number of
+    unknowns), limits of chance of three of them (_low, _high), trials, failed. The last row pools all unknowns, each by
+    its own bound. A ValueError with fewer than ten trials, or errors that are not finite.
     """
     count = len(trials.seeds)
     if count < FEWEST_TRIALS:
@@ -291,21 +245,11 @@ def _freedom(C):
 
 
 def crossings(shots, setup, last_beam=False):
-    """Edge points of drawn shots, as the preprocessing makes them of a scan line.
+    """Edge points of drawn shots (:func:`lrfcal_lib.simulate.draw.draw_shots`), as the preprocessing makes them.
 
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-    last_beam : bool
-        The last beam on the board instead of the half step to the first one off it.
-
-    Returns
-    -------
-    dict of ndarray
-        points, half_step (t, n, 3), covariance, noise (t, n, 3, 3), lines (t, n, 3), radius, background, line_sigma
-        (t, n), with n = 2 p crossings a trial; groups (n,), the placement of each.
+    points, half_step (t, n, 3), covariance, noise (t, n, 3, 3), lines (t, n, 3), radius, background, line_sigma (t, n),
+    with n = 2 p crossings a trial; groups (n,), the placement of each. `last_beam`: on the board, instead of the half
+    step.
     """
     bearings, (t, p, _) = setup.bearings(), shots["ranges"].shape
     flat = shots["ranges"].reshape(t * p, -1)
@@ -352,20 +296,7 @@ def faces(shots, setup):
 
 
 def solve_shots(shots, setup, T0):
-    """All trials by every method.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-    setup : ShotSetup
-    T0 : RigidTransform
-        Start values, one a trial.
-
-    Returns
-    -------
-    dict of str to Solution
-        With a leading trial axis: line_last_beam (weighted), line, line_ml, zhang_pless.
-    """
+    """All trials by every method from start values `T0`, one a trial: dict of str to Solution with a trial axis."""
     half, last = crossings(shots, setup), crossings(shots, setup, last_beam=True)
     basic = ("points", "covariance", "lines", "line_sigma")
     full = ("points", "covariance", "half_step", "noise", "radius", "background", "lines", "line_sigma")
@@ -381,18 +312,9 @@ def solve_shots(shots, setup, T0):
 def shots_table(shots, setup, solutions):
     """Errors of every method over the trials.
 
-    Parameters
-    ----------
-    shots : dict of ndarray
-    setup : ShotSetup
-    solutions : dict of str to Solution
-
-    Returns
-    -------
-    DataFrame
-        method, rotation_median_deg, rotation_rms_deg, translation_median_mm, translation_rms_mm, nees (mean normalised
-        squared error of the pose over 6), bias_error (median absolute error of the edge bias in spot radii, NaN for
-        methods without), converged (share).
+    Columns method, rotation_median_deg, rotation_rms_deg, translation_median_mm, translation_rms_mm, nees (mean
+    normalised squared error of the pose over 6), bias_error (median absolute error of the edge bias in spot radii, NaN
+    for methods without), converged (share).
     """
     rows = []
     for method, found in solutions.items():

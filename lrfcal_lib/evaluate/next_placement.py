@@ -323,11 +323,7 @@ def candidate_information(boards, pitches, solution, models, rate):
 class Direction:
     """A combination of unknowns that is known more or less well by itself.
 
-    Attributes
-    ----------
-    words : str
-    sigma : float
-        Standard deviation, metres at a distance of 2 m; inf where it is not observed.
+    `sigma` is its standard deviation, metres at a distance of 2 m; inf where it is not observed.
     """
 
     words: str
@@ -344,16 +340,9 @@ def scales_of(solution, names):
 
 
 def observability(solution):
-    """Singular values and directions of the scaled information.
+    """Directions of the scaled information of a JointSolution, the least known first: list of Direction.
 
-    Parameters
-    ----------
-    solution : JointSolution
-
-    Returns
-    -------
-    list of Direction
-        The least known first. Softness of the edges and sizes of the board are eliminated.
+    Softness of the edges and sizes of the board are eliminated.
     """
     names = np.array(solution.solution.names)
     index = [i for i, n in enumerate(names) if n != "edge_log_softness" and not n.startswith("size_")]
@@ -449,7 +438,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     ----------
     solution : JointSolution
     models : dict of str to CameraModel
-        Of every camera of the solution.
+        Of every camera of the solution; a ValueError where one is missing.
     field_of_view : tuple of float
         Bearings that the LRF measures, radians.
     features : ndarray, shape (k, 3), optional
@@ -457,14 +446,8 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     places : dict of str to sequence of float, optional
         Replaces entries of `PLACES`.
 
-    Returns
-    -------
-    Suggestion
-
     Raises
     ------
-    ValueError
-        For a camera without a model.
     DegenerateGeometry
         When no pose of the grid is seen by all.
     """

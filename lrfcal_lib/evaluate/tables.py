@@ -104,15 +104,7 @@ def axis_errors(T_head_lrf, truth):
 def edge_point_table(prepared, truth):
     """Bias of each rule for the edge point against the true edge, across the edge within the board's plane.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    truth : Truth
-
-    Returns
-    -------
-    DataFrame
-        variant, edge, n, bias_mm (positive outside the board), sd_mm.
+    Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
     """
     rows, lines = [], dict(zip(truth.board.edges, truth.board.lines(), strict=True))
     for variant in VARIANTS:
@@ -132,17 +124,8 @@ def edge_point_table(prepared, truth):
 def placements_table(prepared, observations):
     """Every placement of the board: what is usable of it, and why not.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    observations : dict of (str, str) to CameraObservations
-        By camera and variant.
-
-    Returns
-    -------
-    DataFrame
-        placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>`` a camera: the number of
-        edges of the board that a scan crosses and the camera sees.
+    Columns placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>`` a camera: the number of
+    edges of the board that a scan crosses and the camera sees. `observations` by camera and variant.
     """
     rows, own = [], {camera: observations[camera, "half_step"] for camera in prepared.views}
     for placement in prepared.session.board_placements:
@@ -186,24 +169,11 @@ def plane_residuals_of(obs, solution):
 
 
 def left_out_residuals(obs, judge, solve, full):
-    """Residuals of every placement under a calibration from all the others.
+    """Residuals of every placement under a calibration from all the others: edge_px (n,), plane_m (m,).
 
-    Parameters
-    ----------
-    obs : CameraObservations
-        What the method works on.
-    judge : CameraObservations
-        What it is judged on; the same placements.
-    solve : callable
-        ``solve(observations, T0) -> Solution``.
-    full : Solution
-        The calibration from all placements; the start of each solve.
-
-    Returns
-    -------
-    edge_px : ndarray, shape (n_crossings of `judge`,)
-    plane_m : ndarray, shape (n_plane_points of `judge`,)
-        NaN where the remaining placements do not determine the camera.
+    The method ``solve(observations, T0)`` works on `obs` and is judged on `judge`, CameraObservations of the same
+    placements; `full` is the calibration from all of them, the start of each solve. NaN where the remaining placements
+    do not determine the camera.
     """
     edge_px = np.full(len(judge.crossing_points), np.nan)
     plane_m = np.full(len(judge.plane_points), np.nan)
@@ -283,21 +253,9 @@ def best_method(comparison, among=("line", "zhang_pless")):
 
 
 def handed_over(calibration):
-    """The method whose result goes into ``calibration.json`` and colours the cloud.
+    """The method of a Calibration whose result goes into ``calibration.json`` and colours the cloud.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
-    Returns
-    -------
-    str
-        'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
-
-    Raises
-    ------
-    ValueError
-        If no method was judged on left-out placements.
+    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
     """
     joint = calibration.joint
     if joint is not None and joint.solution.converged and not joint.solution.unobservable:
@@ -316,38 +274,20 @@ def _parameter_table(keys, found):
 
 
 def camera_calibration_table(solutions):
-    """Parameters of every calibration with their standard deviations.
+    """Parameters of every calibration (Solutions by camera and method) with their standard deviations.
 
-    Parameters
-    ----------
-    solutions : dict of (str, str) to Solution
-        By camera and method.
-
-    Returns
-    -------
-    DataFrame
-        camera, method, parameter, unit, value, sigma. sigma is the larger of the propagated noise and the spread over
-        placements.
+    Columns camera, method, parameter, unit, value, sigma: the larger of propagated noise and spread over placements.
     """
     found = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
     return _parameter_table(["camera", "method"], found)
 
 
 def platform_calibration_table(platform, truth=None):
-    """The tilt axis by every method with its standard deviations, and the paper's own parameters.
+    """The tilt axis by every method (PlatformCalibration) with its sigmas, and the paper's own parameters.
 
-    Parameters
-    ----------
-    platform : PlatformCalibration
-    truth : Truth, optional
-        Of a simulated session.
-
-    Returns
-    -------
-    DataFrame
-        method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and axis_offset_error_mm of the
-        method. The four numbers of the axis are its angles out of and within the scan plane and its offsets within and
-        across it; phi and t_y are the same axis in the paper's chart.
+    Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and axis_offset_error_mm of
+    the method. The four numbers of the axis are its angles out of and within the scan plane and its offsets within and
+    across it; phi and t_y are the same axis in the paper's chart.
     """
     names, found = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y"), {}
     for method, (values, covariance) in platform.parameters().items():
@@ -362,17 +302,10 @@ def platform_calibration_table(platform, truth=None):
 
 
 def sweeps_table(session):
-    """What was recorded at every placement.
+    """What a session recorded at every placement.
 
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    DataFrame
-        placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg, pitch_step_deg (median),
-        direction (+1 up, -1 down, 0 neither), n_images.
+    Columns placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg, pitch_step_deg (median),
+    direction (+1 up, -1 down, 0 neither), n_images.
     """
     rows = []
     for placement in session.placements:
@@ -388,17 +321,10 @@ def sweeps_table(session):
 
 
 def scans_table(prepared):
-    """The board in every sweep: noise, rejected points, and the sides that scans cross.
+    """The board in every sweep (Prepared): noise, rejected points, and the sides that scans cross.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    DataFrame
-        placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan lines), sides_across (where the
-        sweep enters or leaves the board).
+    Columns placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan lines), sides_across (where
+    the sweep enters or leaves the board).
     """
     rows = []
     for placement, board in prepared.scans.items():
@@ -412,16 +338,9 @@ def scans_table(prepared):
 
 
 def intrinsics_table(models):
-    """Intrinsics of every camera with their standard deviations.
+    """Intrinsics of every camera (CameraModels by name) with their standard deviations.
 
-    Parameters
-    ----------
-    models : dict of str to CameraModel
-
-    Returns
-    -------
-    DataFrame
-        camera, parameter, unit, value, sigma (NaN where the session states the intrinsics).
+    Columns camera, parameter, unit, value, sigma (NaN where the session states the intrinsics).
     """
     unknown = np.full((9, 9), np.nan)
     sigmas = {c: np.sqrt(np.diag(unknown if m.covariance is None else m.covariance)) for c, m in models.items()}
@@ -431,10 +350,7 @@ def intrinsics_table(models):
 def outline_table(outline):
     """Edge lengths of a board (:class:`lrfcal_lib.preprocess.survey.Outline`) as the images show them.
 
-    Returns
-    -------
-    DataFrame
-        edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
+    Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
     """
     rows = [(n, 1000 * v, 1000 * outline.length_sd[n], outline.n_lengths[n]) for n, v in outline.lengths.items()]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
@@ -443,10 +359,7 @@ def outline_table(outline):
 def pitch_models_table(errors):
     """Which errors of the recorded pitch (PitchErrors) the data ask for.
 
-    Returns
-    -------
-    DataFrame
-        model, n_parameters, plane_rms_mm, F, p_value (against the model before).
+    Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
     models = errors.models.values()
     rows = [(m.name, m.n_parameters, 1000 * np.mean(list(m.rms.values())), m.F, m.p_value) for m in models]
@@ -462,17 +375,9 @@ def pitch_errors_table(errors):
 
 
 def axis_knowledge_table(platform):
-    """Who knows each number of the tilt axis better: the data, or the rough measurement.
+    """Who knows each number of the tilt axis better: the data (solution 'line_3d'), or the rough measurement.
 
-    Parameters
-    ----------
-    platform : PlatformCalibration
-        With a ``line_3d`` solution.
-
-    Returns
-    -------
-    DataFrame
-        parameter, unit, sigma_data, sigma_rough, better.
+    Columns parameter, unit, sigma_data, sigma_rough, better.
     """
     data, rough = np.sqrt(np.diag(platform.parameters()["line_3d"][1])), np.repeat(platform.stated_sigma, 2)
     units, factors = zip(*map(unit_of, AXIS_NAMES), strict=True)
@@ -483,21 +388,10 @@ def axis_knowledge_table(platform):
 
 
 def stereo_check(solutions, cameras, T_second_first):
-    """What the cameras, each calibrated on its own, say about each other, against the chessboard.
+    """What two cameras, each calibrated on its own, say about each other, against the chessboard in both images.
 
-    Parameters
-    ----------
-    solutions : dict of (str, str) to Solution
-    cameras : (str, str)
-        First and second camera.
-    T_second_first : RigidTransform
-        From the chessboard in both images.
-
-    Returns
-    -------
-    DataFrame
-        method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both calibrations use the same
-        LRF points, so the check cannot see an error of the cloud.
+    Columns method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both calibrations use the
+    same LRF points, so the check cannot see an error of the cloud.
     """
     (first, second), rows = cameras, []
     baseline = np.linalg.norm(T_second_first.translation)
@@ -571,10 +465,7 @@ def ends_of(edges, name, across):
 def edge_summary(table):
     """Errors of an :func:`edge_lengths` table, of measured edges only.
 
-    Returns
-    -------
-    DataFrame
-        source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm.
+    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm.
     """
     table = table[table.measured_mm.notna()]
     groups = table.assign(size=table.error_mm.abs()).groupby(["source", "ends", "variant"], sort=False)

@@ -148,10 +148,8 @@ def carried(chain, bearing, pitch, distance, image_pitch=0.0):
     -------
     points : ndarray, shape (..., 3)
         Camera frame; without a camera the LRF frame of a scan at `image_pitch`. Metres.
-    jacobian : ndarray, shape (..., 3, 13)
-        By `COLUMNS`.
-    by_pitch : ndarray, shape (..., 3)
-        By the pitch of the beam.
+    jacobian, by_pitch : ndarray, shapes (..., 3, 13) and (..., 3)
+        By `COLUMNS`, and by the pitch of the beam.
     """
     bearing, pitch, distance = np.broadcast_arrays(*(np.asarray(a, float) for a in (bearing, pitch, distance)))
     R, t = chain.head[:, :3], chain.head[:, 3]
@@ -185,18 +183,9 @@ def spread(chain, jacobian):
 
 
 def beams_to(points, T_head_lrf):
-    """Bearing, pitch and range at which scans of a pitching LRF reach points.
+    """Bearing, pitch (radians) and range (metres) at which scans of a pitching LRF reach points of the platform frame.
 
-    Parameters
-    ----------
-    points : ndarray, shape (..., 3)
-        Platform frame, metres.
-    T_head_lrf : RigidTransform
-
-    Returns
-    -------
-    bearing, pitch, distance : ndarray, shape (...)
-        Radians, radians, metres; NaN where the scan plane never gets there.
+    Shapes (...) for points (..., 3); NaN where the scan plane never gets there.
     """
     points = np.asarray(points, float)
     R, t = T_head_lrf.rotation.as_matrix(), T_head_lrf.translation

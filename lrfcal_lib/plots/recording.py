@@ -28,13 +28,8 @@ BESIDE = 14  # beams shown on either side of the end of a board
 def range_image(ax, sweep, mask=None):
     """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch.
 
-    Parameters
-    ----------
-    ax : Axes
-    sweep : Sweep
-        With a pitch that stands still, scan lines are numbered instead.
-    mask : ndarray of bool, shape (L, B), optional
-        What was found to be the board; outlined.
+    With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found to be the board; it
+    is outlined.
     """
     moves, bearing = np.ptp(sweep.pitch) > 0, np.degrees(sweep.bearings)
     height = np.degrees(sweep.pitch) if moves else np.arange(len(sweep.pitch))
@@ -55,17 +50,7 @@ def range_image(ax, sweep, mask=None):
 
 
 def scan_line(ax, sweep, line, mask):
-    """One scan line in the scan plane; x to the right, y ahead.
-
-    Parameters
-    ----------
-    ax : Axes
-    sweep : Sweep
-    line : int
-        Row of `sweep.ranges`.
-    mask : ndarray of bool, shape (L, B)
-        Beams on the board.
-    """
+    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on the board."""
     points, on = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2], mask[line]
     ax.plot(*points[~on].T, ".", color=COLORS["raw"], label="scene" if on.any() else "returns")
     ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
@@ -81,18 +66,10 @@ def to_scale(ax, x, y):
 
 
 def edge_of_line(ax, scan, line, end=1, edges=()):
-    """Where a scan line leaves the board: raw, filtered and fitted ranges, after figure 5.
+    """Where a scan line of a BoardScan leaves the board: raw, filtered and fitted ranges, after figure 5.
 
-    Parameters
-    ----------
-    ax : Axes
-    scan : BoardScan
-    line : int
-        Scan line.
-    end : int
-        +1 for the end at the larger bearings, -1 for the other one.
-    edges : sequence of ScanEdges
-        Their crossings of this line and end are drawn as upright lines.
+    `end` is +1 for the end at the larger bearings, -1 for the other one. Crossings of this line and end in `edges` (a
+    sequence of ScanEdges) are drawn as upright lines.
     """
     on = np.flatnonzero(scan.mask[line])
     if on.size == 0:
@@ -134,14 +111,9 @@ def projection(ax, edges, plane, lines=None):
     edges : dict of str to ndarray, shape (n, 3)
         Points by edge, metres.
     plane : str
-        'xz', 'yz' or 'xy'.
+        'xz', 'yz' or 'xy'; a ValueError for another one.
     lines : dict of str to (point, direction), optional
         Fitted lines in space, drawn over the extent of their points.
-
-    Raises
-    ------
-    ValueError
-        For another plane.
     """
     if plane not in PLANES:
         raise ValueError(f"plane must be one of {', '.join(PLANES)}, got '{plane}'")
@@ -159,32 +131,17 @@ def projection(ax, edges, plane, lines=None):
 
 
 def picture(ax, image):
-    """An image as cameras and OpenCV give it (blue first), without axes.
-
-    Parameters
-    ----------
-    ax : Axes
-    image : ndarray of uint8, shape (h, w, 3) or (h, w)
-    """
+    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes."""
     color = image[..., ::-1] if image.ndim == 3 else image
     ax.imshow(color, cmap=None if image.ndim == 3 else "gray", interpolation="antialiased")
     ax.set_axis_off()
 
 
 def board_view(ax, image, view, model, margin=60):
-    """An image with the corners and edges found in it, cut to the board.
+    """An image with the corners and edges that a BoardView found in it, cut to `margin` pixels around the board.
 
-    Parameters
-    ----------
-    ax : Axes
-    image : ndarray of uint8, shape (h, w, 3)
-        As recorded.
-    view : BoardView
-        The title names the edges that were not used.
-    model : CameraModel
-        Puts edges, which are kept in undistorted pixels, back through the lens.
-    margin : float
-        Pixels around the board.
+    The title names edges that were not used. `model` puts edges, which are kept in undistorted pixels, back through the
+    lens.
     """
     picture(ax, image)
     color, drawn = color_of(view.camera), []
@@ -250,15 +207,7 @@ def _cut(ax, drawn, image, margin):
 
 
 def outline(ax, measured, exaggerate=20):
-    """The measured outline of the board with the spread of each edge over the images.
-
-    Parameters
-    ----------
-    ax : Axes
-    measured : Outline
-    exaggerate : float
-        Spread is drawn this many times larger than it is.
-    """
+    """The measured Outline of the board with the spread of each edge over the images, `exaggerate` times larger."""
     corners = corners_of_lines(measured.lines)
     closed = np.vstack([corners, corners[:1]])
     ax.plot(*closed.T, "-", color=COLORS["truth"])

@@ -21,17 +21,7 @@ def by_placement(ax, names, label):
 
 
 def residual_strips(ax, residuals, placement, label, color):
-    """Residuals by placement, with their root mean square as a bar.
-
-    Parameters
-    ----------
-    ax : Axes
-    residuals : ndarray, shape (n,)
-    placement : ndarray of int, shape (n,)
-    label : str
-        Quantity and unit.
-    color : str
-    """
+    """Residuals (n,) by placement (n,), with their root mean square as a bar; `label` is the quantity with its unit."""
     names, column, count = np.unique(placement, return_inverse=True, return_counts=True)
     spread = np.empty(len(column))
     spread[np.argsort(column, kind="stable")] = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in count])
@@ -44,16 +34,7 @@ def residual_strips(ax, residuals, placement, label, color):
 
 
 def pitch_offsets(ax, placement, offset, sigma, direction):
-    """Pitch offset of each sweep, coloured by the direction in which the head moved.
-
-    Parameters
-    ----------
-    ax : Axes
-    placement, direction : ndarray of int, shape (n,)
-        Direction is +1 (upwards), -1 or 0 (unknown).
-    offset, sigma : ndarray, shape (n,)
-        Radians.
-    """
+    """Pitch offset of each sweep and its sigma (radians), coloured by the direction of the head: +1 (up), -1 or 0."""
     offset, sigma = np.degrees(offset), np.degrees(sigma)
     for sign, color, label in ((1, SERIES[0], "upwards"), (-1, SERIES[1], "downwards"), (0, COLORS["raw"], "unknown")):
         rows = np.flatnonzero(np.equal(direction, sign))
@@ -65,16 +46,7 @@ def pitch_offsets(ax, placement, offset, sigma, direction):
 
 
 def parameter_comparison(ax, values, sigmas, label):
-    """One parameter as each method finds it, with one-sigma bars.
-
-    Parameters
-    ----------
-    ax : Axes
-    values, sigmas : dict of str to float
-        By method; a sigma that is NaN draws no bar.
-    label : str
-        Parameter and unit.
-    """
+    """One parameter as each method finds it, with one-sigma bars (none for NaN): values and sigmas by method."""
     for row, (method, value) in enumerate(values.items()):
         looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
         ax.errorbar(value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks)
@@ -83,14 +55,7 @@ def parameter_comparison(ax, values, sigmas, label):
 
 
 def edge_errors(ax, errors):
-    """Errors of edge lengths by rule for the edge point (or method), one dot an edge, the mean as a bar.
-
-    Parameters
-    ----------
-    ax : Axes
-    errors : dict of str to ndarray, shape (n,)
-        Measured minus true, millimetres.
-    """
+    """Errors of edge lengths (measured minus true, mm) by rule or method, one dot an edge, the mean as a bar."""
     for column, values in enumerate(errors.values()):
         spread = (np.arange(len(values)) + 0.5) / max(len(values), 1) - 0.5
         color = SERIES[column % len(SERIES)]
@@ -101,16 +66,7 @@ def edge_errors(ax, errors):
 
 
 def method_bars(ax, table, column, label):
-    """One column of a method comparison, a bar for each method and camera.
-
-    Parameters
-    ----------
-    ax : Axes
-    table : DataFrame
-        With the columns ``camera``, ``method`` and `column`.
-    column, label : str
-        What is drawn, and its name with the unit.
-    """
+    """One column of a :func:`lrfcal_lib.evaluate.tables.method_comparison`, a bar for each method and camera."""
     methods, cameras = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.camera))
     height, rows = 0.8 / len(cameras), np.arange(len(methods))
     for i, camera in enumerate(cameras):
@@ -122,17 +78,9 @@ def method_bars(ax, table, column, label):
 
 
 def projection_map(ax, found, index=0, name=""):
-    """Standard deviation over an image of where points of the LRF project.
+    """Standard deviation over an image of where points of the LRF project, at one of the distances of a map.
 
-    Parameters
-    ----------
-    ax : Axes
-    found : SigmaMap
-        Of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN stay white.
-    index : int
-        Of the distance.
-    name : str
-        Of the camera.
+    `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN stay white.
     """
     _sigma_map(ax, found.columns, found.rows, found.sigma[index], "px")
     ax.invert_yaxis()
@@ -141,16 +89,7 @@ def projection_map(ax, found, index=0, name=""):
 
 
 def point_map(ax, found, index=0):
-    """Standard deviation of reconstructed points over the field of view.
-
-    Parameters
-    ----------
-    ax : Axes
-    found : SigmaMap
-        Of :func:`lrfcal_lib.evaluate.uncertainty.point_sigma`.
-    index : int
-        Of the distance.
-    """
+    """Standard deviation of reconstructed points over the field of view, a SigmaMap of ``uncertainty.point_sigma``."""
     _sigma_map(ax, np.degrees(found.columns), np.degrees(found.rows), 1000 * found.sigma[index], "mm")
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
@@ -176,14 +115,7 @@ def _sigma_map(ax, columns, rows, sigma, unit):
 
 
 def point_parts(ax, found):
-    """What axis, range offset and pitch contribute to the error of a point, by distance.
-
-    Parameters
-    ----------
-    ax : Axes
-    found : SigmaMap
-        Of :func:`lrfcal_lib.evaluate.uncertainty.point_sigma`, at several distances.
-    """
+    """What axis, range offset and pitch add to the error of a point, by distance; SigmaMap of ``point_sigma``."""
     rows = {k: np.sqrt(np.mean(v**2, axis=(1, 2))) for k, v in found.parts.items()} | {"calibration": found.rms()}
     rows = {name: value for name, value in rows.items() if np.any(value > 0)}
     for index, (name, value) in enumerate(rows.items()):
@@ -195,14 +127,7 @@ def point_parts(ax, found):
 
 
 def observability_bars(ax, directions):
-    """The least known combinations of unknowns, in words.
-
-    Parameters
-    ----------
-    ax : Axes
-    directions : list of Direction
-        Of :func:`lrfcal_lib.evaluate.next_placement.observability`, the least known first; six are drawn.
-    """
+    """The six least known combinations of unknowns, in words (``next_placement.observability``)."""
     shown = directions[:6]
     sigma = 1000 * np.array([d.sigma for d in shown])
     known = np.isfinite(sigma)
@@ -223,12 +148,7 @@ def observability_bars(ax, directions):
 def misfit_bars(ax, misfit, limit=4.0):
     """Normalised mean squared residuals by placement; 1 is what the noise explains.
 
-    Parameters
-    ----------
-    ax : Axes
-    misfit : dict of int to float
-    limit : float
-        Placements above this multiple of the median are drawn as outliers.
+    Placements above `limit` times the median are drawn as outliers.
     """
     values, every = np.array(list(misfit.values())), 1 if len(misfit) < 16 else 2
     bad = values > limit * max(np.median(values), 1.0)
@@ -242,13 +162,9 @@ def misfit_bars(ax, misfit, limit=4.0):
 
 
 def residuals_by_range(ax, distance, residual):
-    """Range residuals over distance, with the mean and its standard error in bins: noise scatters, a model error bends.
+    """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in bins.
 
-    Parameters
-    ----------
-    ax : Axes
-    distance, residual : ndarray, shape (n,)
-        Metres; see :func:`lrfcal_lib.evaluate.jointly.range_residuals`.
+    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.jointly.range_residuals`.
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
@@ -268,14 +184,8 @@ def residuals_by_range(ax, distance, residual):
 def residuals_by_region(ax, uv, shift, model, name):
     """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the image's width.
 
-    Parameters
-    ----------
-    ax : Axes
-    uv, shift : ndarray, shape (n, 2)
-        Pixels; see :func:`lrfcal_lib.evaluate.jointly.view_residuals`.
-    model : CameraModel
-    name : str
-        Of the camera: its colour.
+    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.jointly.view_residuals`. The camera's name is its
+    colour.
     """
     length, title = np.linalg.norm(shift, axis=1), f"{name}: no board in any image"
     if len(uv):
@@ -292,16 +202,7 @@ def residuals_by_region(ax, uv, shift, model, name):
 def background_motion(ax, steadiness):
     """How far the background moved in the images of cameras fixed to the base, by placement; steps are marked.
 
-    Parameters
-    ----------
-    ax : Axes
-    steadiness : dict of str to Steadiness
-        By camera; those on the head are left out.
-
-    Raises
-    ------
-    ValueError
-        If none of the cameras could be judged.
+    `steadiness` has a Steadiness by camera; those on the head are left out. A ValueError if none could be judged.
     """
     judged = {camera: found for camera, found in steadiness.items() if not found.reason}
     if not judged:
@@ -332,17 +233,9 @@ def background_motion(ax, steadiness):
 
 
 def board_bend(ax, bends):
-    """How bent each board looks in the scan, beside the printed sheet in the images.
+    """How bent each board looks in the scan, beside the printed sheet in the images (BoardBends).
 
-    Parameters
-    ----------
-    ax : Axes
-    bends : BoardBends
-
-    Raises
-    ------
-    ValueError
-        If no placement has a bend.
+    A ValueError if no placement has a bend.
     """
     found = [b for b in bends.placements.values() if np.isfinite(b.size)]
     if not found:

@@ -14,13 +14,7 @@ SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0, "antialiased"
 def frames(ax, transforms, length=0.1):
     """Coordinate frames in space: x red, y green, z blue.
 
-    Parameters
-    ----------
-    ax : Axes3D
-    transforms : dict of str to RigidTransform
-        From each frame to the one drawn in.
-    length : float
-        Of the arrows, metres.
+    `transforms` lead from each frame, by name, to the one drawn in; `length` of the arrows in metres.
     """
     for name, transform in transforms.items():
         for axis, color in zip(np.eye(3), AXES_RGB, strict=True):
@@ -42,19 +36,10 @@ def rays(ax, origin, points):
 
 
 def space(ax, points, elev=22.0, azim=-60.0, zoom=1.0, labels=True):
-    """Equal scales and a view for axes in space, limits from the points to show.
+    """Equal scales and a view for axes in space, limits from the points (n, 3) to show, metres.
 
-    Parameters
-    ----------
-    ax : Axes3D
-    points : ndarray, shape (n, 3)
-        Metres.
-    elev, azim : float
-        Where one looks from, degrees.
-    zoom : float
-        Matplotlib leaves wide margins around flat scenes.
-    labels : bool
-        Without them the axes are not drawn at all.
+    One looks from `elev` and `azim` (degrees); `zoom`: Matplotlib leaves wide margins around flat scenes. Without
+    `labels` the axes are not drawn at all.
     """
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -106,10 +91,6 @@ def render(points, colors, T_view, size, focal=None, splat=1):
         Pixels; the width (53 deg across) unless given.
     splat : int
         Each point covers (2 splat + 1)^2 pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
     """
     height, width = size
     seen = T_view.apply(np.asarray(points, float))
@@ -128,19 +109,9 @@ def render(points, colors, T_view, size, focal=None, splat=1):
 
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)):
-    """The view from one point to another for :func:`render`, as RigidTransform from the points' frame.
+    """The view from one point to another (metres) for :func:`render`, as RigidTransform from the points' frame.
 
-    Parameters
-    ----------
-    eye, target : array_like, shape (3,)
-        Metres.
-    up : array_like, shape (3,)
-        Shown upwards; not along the line of sight.
-
-    Raises
-    ------
-    ValueError
-        If eye and target coincide, or `up` is the line of sight.
+    `up` is shown upwards. A ValueError if eye and target coincide, or `up` is the line of sight.
     """
     eye, ahead = np.asarray(eye, float), np.subtract(target, eye)
     right = np.cross(ahead, up)

@@ -46,18 +46,7 @@ SOURCE_OF_SESSIONS = (
 
 @dataclass(frozen=True)
 class Run:
-    """One executed notebook.
-
-    Attributes
-    ----------
-    name : str
-        File name without suffix.
-    title, thesis : str
-        First heading and first paragraph.
-    seconds : float
-    error : str
-        Traceback of the cell that failed, '' if none did.
-    """
+    """One executed notebook: file name without suffix, first heading, first paragraph; `error` is a traceback or ''."""
 
     name: str
     title: str
@@ -74,9 +63,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session_path : path
         Folder of a session.
     out : path, optional
-        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and
-        takes its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that
-        are no report's are kept.
+        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and takes
+        its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that are no
+        report's are kept.
     jobs : int
         Notebooks executed at the same time.
     notebooks : sequence of path, optional
@@ -85,12 +74,8 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     Returns
     -------
     list of Run
-        In the order of the notebooks. A notebook that fails is reported, the others still run.
-
-    Raises
-    ------
-    SessionError
-        If the session is not sound, or the folder of the report cannot be written.
+        In the order of the notebooks. A notebook that fails is reported, the others still run. A SessionError if the
+        session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
     session_path = Path(session_path).resolve()
@@ -110,14 +95,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
 
 
 def execute(path, environment):
-    """Execute a notebook in a fresh kernel, with variables on top of this process's own.
+    """Execute a notebook in a fresh kernel with variables on top of this process's own.
 
-    Returns
-    -------
-    notebook : NotebookNode
-        With outputs, up to the cell that failed if one did.
-    error : str
-        Traceback of that cell, or ''.
+    Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback of that cell or ''.
     """
     import nbformat
     from nbclient import NotebookClient
@@ -142,25 +122,11 @@ def execute(path, environment):
 
 
 def store(path, session_path, cache=""):
-    """Execute a notebook and store it in place as run from top to bottom.
+    """Execute a notebook and store it in place as run from top to bottom; the traceback of a cell that failed, or ''.
 
-    Parameters
-    ----------
-    path : Path
-    session_path : Path or None
-        What the notebook works on if it asks for a session.
-    cache : str
-        Folder of stages that other notebooks have worked out (see :mod:`lrfcal_lib.session.cache`).
-
-    Returns
-    -------
-    str
-        Traceback of the cell that failed (the file is then left alone), or ''.
-
-    Notes
-    -----
-    Outputs made from a recording that is not simulated are dropped (its pictures may carry no licence), execution
-    counts are kept.
+    A notebook that fails is left alone. Outputs made from a recording that is not simulated are dropped (its pictures
+    may carry no licence), execution counts are kept. `cache` is the folder of stages that other notebooks have worked
+    out.
     """
     import nbformat
 
