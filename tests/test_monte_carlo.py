@@ -22,7 +22,7 @@ def normal_trials(rng, count=200, scale=1.0, names=NAMES):
     roots = rng.normal(size=(count, len(names), len(names))) + 2 * np.eye(len(names))
     covariances = roots @ np.swapaxes(roots, 1, 2)
     errors = scale * (roots @ rng.normal(size=(count, len(names), 1)))[..., 0]
-    return Trials(names, np.arange(count), errors, covariances, covariances)
+    return Trials(names, np.arange(count), errors, covariances, covariances, {})
 
 
 # the arithmetic
@@ -55,14 +55,13 @@ def test_wrong_covariances_fail(scale):
     assert row.rmse_over_crb == pytest.approx(scale, rel=0.1)
 
 
-def test_units_and_rows():
+def test_units():
     trials = normal_trials(np.random.default_rng(0))
-    wide, long = consistency(trials), consistency(trials, names=True)
-    assert list(long.group) == [*NAMES, "all"]
+    wide = consistency(trials)
     assert wide.unit.tolist() == ["deg", "deg", "mm", "mm", ""]
     turn = np.degrees(np.sqrt(np.mean(np.sum(trials.errors[:, :2] ** 2, axis=1))))
     assert wide.rmse[0] == pytest.approx(turn)
-    assert groups_of(("size_ab", "edge_log_odds"))["board size"][2] == "mm"
+    assert groups_of(("size_ab", "edge_log_odds"))["board size"][1] == "mm"
 
 
 def test_spread_is_the_root_of_the_trace_in_its_unit():

@@ -93,12 +93,7 @@ class Verdict:
         return {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
 
     def sentences(self):
-        """For the first page: the warning before anything else, the errors, what to record next.
-
-        Returns
-        -------
-        list of str
-        """
+        """For the first page: the warning before anything else, the errors, what to record next."""
         first = {
             YES: "This calibration can be trusted.",
             CARE: "Use this calibration with care: ",
@@ -129,7 +124,7 @@ def _error_words(errors):
 
 
 def verdict(solution, models, *, suggest=True, **options):
-    """Judge a joint estimate.
+    """Judge a joint estimate: a :class:`Verdict`.
 
     Parameters
     ----------
@@ -140,10 +135,6 @@ def verdict(solution, models, *, suggest=True, **options):
         Also look for the next placement.
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
-
-    Returns
-    -------
-    Verdict
     """
     groups, suggestion, problem = (solution.data.face, solution.data.beam), None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
@@ -186,20 +177,11 @@ def _answered(found, reasons):
 
 
 def judge(calibration, method=None, **options):
-    """Judge what a calibration hands over, by itself and by what became of the recording.
+    """Judge what a calibration hands over, by itself and by what became of the recording: a :class:`Verdict`.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    method : str, optional
-        Whose camera poses are handed over; as :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out.
-    **options
-        Of :func:`verdict`; what the LRF sees and the board's features are known.
-
-    Returns
-    -------
-    Verdict
-        'no' without errors where nothing is handed over.
+    'no' without errors where nothing is handed over. `method` is that whose camera poses are handed over, as
+    :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out; options of :func:`verdict` (what the LRF sees and
+    the board's features are known).
     """
     prepared, joint = calibration.prepared, calibration.joint
     # also where the joint estimate is not handed over: a wrong size may be why
@@ -248,10 +230,11 @@ def _without_joint(calibration, method):
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
     head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
-    chains = {None: Chain(head, None, "head", (sigma,), *rest)}
+    chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
         sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
-        chains[camera] = Chain(head, pose_array(found.transform), session.cameras[camera].mount, (sigma,), *rest)
+        on_head = session.cameras[camera].mount == "head"
+        chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
     noise = np.median([board.sigma_range for board in prepared.scans.values()])
     return replace(_expected(chains, prepared.models, pitch, noise, reasons), sweep_mm=0.0)
@@ -297,16 +280,7 @@ def _left_out(calibration, method):
 
 
 def diagnose(solution):
-    """Weaknesses of a joint estimate and of the recording behind it.
-
-    Parameters
-    ----------
-    solution : JointSolution
-
-    Returns
-    -------
-    list of Reason
-    """
+    """Weaknesses of a JointSolution and of the recording behind it: list of Reason."""
     iterations, view = solution.solution.iterations, solution.data.view
     seen = {
         name: int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
