@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -14,11 +15,12 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import image_size, open_session, validate
 from lrfcal_lib.session.stated import (
     CameraInfo,
+    LensStated,
     LrfInfo,
     SessionError,
     board_from_json,
     board_to_json,
-    model_from_json,
+    from_json,
     model_to_json,
     transform_from_json,
     transform_to_json,
@@ -30,6 +32,8 @@ LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np
 HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
 MODEL = CameraModel(32, 24, 30.0, 31.0, 15.5, 11.5, np.array([0.1, -0.02, 0.001, 0.002, 0.003]), np.eye(9), 0.25)
 CAMERAS = (CameraInfo("left", "head", 32, 24, MODEL, HEAD), CameraInfo("right", "platform", 32, 24))
+
+CHESSBOARD = {"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 0.1}
 
 
 def pixels(seed=0):
@@ -56,14 +60,6 @@ def write(path, **options):
 @pytest.fixture
 def path(tmp_path):
     return write(tmp_path / "trip")
-
-
-def edit(path, change):
-    """Apply a change to the object in session.json."""
-    file = path / "session.json"
-    data = json.loads(file.read_text())
-    change(data)
-    file.write_text(json.dumps(data))
 
 
 def edit_scans(path, **arrays):
@@ -141,10 +137,10 @@ def test_boards_models_and_transforms_survive_json():
     assert board_from_json(json.loads(json.dumps(board_to_json(board)))) == board
     triangle = board_from_json(json.loads(json.dumps(board_to_json(triangle_board()))))
     np.testing.assert_array_equal(triangle.corners, triangle_board().corners)
-    model = model_from_json(json.loads(json.dumps(model_to_json(MODEL))), 32, 24)
+    model = from_json(LensStated, json.loads(json.dumps(model_to_json(MODEL)))).made(32, 24)
     np.testing.assert_array_equal(model.parameters, MODEL.parameters)
     np.testing.assert_array_equal(model.covariance, MODEL.covariance)
-    assert transform_from_json(transform_to_json(None)) is None and model_from_json(None, 1, 1) is None
+    assert transform_from_json(transform_to_json(None)) is None and model_to_json(None) is None
     same(transform_from_json(json.loads(json.dumps(transform_to_json(HEAD)))), HEAD)
 
 
@@ -247,51 +243,53 @@ def test_json_of_another_kind(path):
         open_session(path)
 
 
-def lens(data):
-    return data["rig"]["cameras"]["left"]["intrinsics"]
+CHANGES = [  # place in session.json, what stands there instead ("gone": nothing), message
+    ("schema", "lrfcal-session/9", "schema is 'lrfcal-session/9', this version reads"),
+    ("schema", "gone", "schema is None"),
+    ("board", "gone", "json: board is missing"),
+    ("rig.cameras", "gone", r"rig\.cameras is missing"),
+    ("rig.lrf.file", "../scans.npz", "must stay inside the session's folder, got '../scans.npz'"),
+    ("rig.lrf.file", "/etc/passwd", "must stay inside the session's folder, got '/etc/passwd'"),
+    ("rig.lrf.file", "C:\\a", r"must stay inside the session's folder, got 'C:\\a'"),
+    ("rig.lrf.file", "lrf/scans.csv", "the LRF's file is one of"),
+    ("name", "../up", "name is '../up': this becomes a file name"),
+    ("rig.cameras.a/", {}, r"name is 'a/': this becomes a file name"),
+    ("placements", [1, 1], r"placements is \[1, 1\]: placements are different numbers"),
+    ("placements", [1, "o"], "placements.1 is 'o': a valid integer"),
+    ("rig.platform.T_head_lrf.translation_m", [0, 0, 157], "translation_m.2 is 157: less than .* 10 .*millimetres"),
+    ("rig.platform.T_head_lrf.translation_m", [0, 0], "translation_m.2 is missing"),
+    ("board.corners_m", [[0, 0], [315, 0], [0, 380]], "board is 380 m large: millimetres"),
+    ("board.corners_m", [[0, 0], [1, 0]], "corners_m must be one corner for each of 3 edges, got 2"),
+    ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
+    ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
+    ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
+    ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
+    ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
+    ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
+    ("board.pattern", CHESSBOARD | {"columns": 500}, "up to 1000 inner corners in all"),
+    ("board.pattern", CHESSBOARD | {"kind": "dots"}, "pattern.kind is 'dots': 'chessboard' is needed"),
+    ("rig.cameras.left.mount", "wall", "left.mount is 'wall': 'head' or 'platform' is needed"),
+    ("rig.cameras.left.width", 0, "left.width is 0: greater than or equal to 1"),
+    ("rig.cameras.left.intrinsics.fx", -1, "left.intrinsics.fx is -1: greater than 0 is needed"),
+    ("rig.cameras.left.intrinsics.distortion", [0, 0], "distortion.2 is missing"),
+    ("rig.cameras.left.intrinsics.covariance", [0.0], r"covariance.0 is 0\.0: a valid tuple"),
+    ("rig.lrf.field_of_view_deg", [120, 60], r"field_of_view_deg is \[120, 60\]: two ascending"),
+    ("rig.lrf.bearing_step_deg", 0, "bearing_step_deg is 0: greater than 0"),
+    ("rig.lrf.sigma_range_m", 5, "sigma_range_m is 5: .*millimetres"),
+    ("rig.lrf.sigma_range_m", math.nan, "sigma_range_m is nan: a finite number is needed"),
+    ("rig.lrf.spot_exit_m", 12, "spot_exit_m is 12: .*millimetres"),
+    ("rig.platform.sigma_offset_m", 5, "sigma_offset_m is 5: .*millimetres"),
+]
 
 
-CHANGES = {
-    "schema is 'lrfcal-session/9', this version reads": lambda d: d.update(schema="lrfcal-session/9"),
-    "schema is None": lambda d: d.pop("schema"),
-    "key 'board' is missing": lambda d: d.pop("board"),
-    "key 'cameras' is missing": lambda d: d["rig"].pop("cameras"),
-    "must stay inside the session's folder, got '../scans.npz'": lambda d: d["rig"]["lrf"].update(file="../scans.npz"),
-    "must stay inside the session's folder, got '/etc/passwd'": lambda d: d["rig"]["lrf"].update(file="/etc/passwd"),
-    r"must stay inside the session's folder, got 'C:\\a'": lambda d: d["rig"]["lrf"].update(file="C:\\a"),
-    "the LRF's file is one of": lambda d: d["rig"]["lrf"].update(file="lrf/scans.csv"),
-    "becomes a file name.* got '../up'": lambda d: d.update(name="../up"),
-    r"becomes a file name.* got 'a/\.\.'": lambda d: d["rig"]["cameras"].update({"a/..": {}}),
-    "placements are different numbers": lambda d: d.update(placements=[1, 1]),
-    "a placement is a whole number up to 1000000, got 'o'": lambda d: d.update(placements="one"),
-    "translation_m is .*millimetres": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0, 157]),
-    "translation_m must be 3 finite": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0]),
-    "board is 380 m large: millimetres": lambda d: d["board"].update(corners_m=[[0, 0], [315, 0], [0, 380]]),
-    "corners_m must be 3 x 2": lambda d: d["board"].update(corners_m=[[0, 0], [1, 0]]),
-    "three or more edges": lambda d: d["board"].update(edges=["ab", "ab", "ca"]),
-    "features are two of the edges": lambda d: d["board"].update(features=["ab", "xy"]),
-    "square_m is 77.5: millimetres": lambda d: d["board"].update(
-        pattern={"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 77.5}
-    ),
-    "three or more inner corners": lambda d: d["board"].update(
-        pattern={"kind": "chessboard", "columns": 1, "rows": 6, "square_m": 0.1}
-    ),
-    "pattern kind is 'chessboard', got 'dots'": lambda d: d["board"].update(pattern={"kind": "dots"}),
-    "mount is one of head, platform, got 'wall'": lambda d: d["rig"]["cameras"]["left"].update(mount="wall"),
-    "width and height must be positive": lambda d: d["rig"]["cameras"]["left"].update(width=0),
-    "fx must be positive": lambda d: lens(d).update(fx=-1),
-    "distortion must be 5 finite": lambda d: lens(d).update(distortion=[0, 0]),
-    "covariance must be 9 x 9": lambda d: lens(d).update(covariance=[0.0]),
-    "field_of_view_deg is two ascending": lambda d: d["rig"]["lrf"].update(field_of_view_deg=[120, 60]),
-    "bearing_step_deg must be positive, got 0": lambda d: d["rig"]["lrf"].update(bearing_step_deg=0),
-    "sigma_range_m is 5: millimetres": lambda d: d["rig"]["lrf"].update(sigma_range_m=5),
-    "sigma_range_m must be one finite": lambda d: d["rig"]["lrf"].update(sigma_range_m=math.nan),
-}
-
-
-@pytest.mark.parametrize("message", CHANGES)
-def test_a_wrong_statement_is_named(path, message):
-    edit(path, CHANGES[message])
+@pytest.mark.parametrize(("place", "value", "message"), CHANGES)
+def test_a_wrong_statement_is_named(path, place, value, message):
+    file = path / "session.json"
+    data = json.loads(file.read_text())
+    *way, key = place.split(".")
+    holder = reduce(dict.__getitem__, way, data)
+    holder.pop(key) if value == "gone" else holder.update({key: value})
+    file.write_text(json.dumps(data))
     with pytest.raises(SessionError, match=message):
         open_session(path)
 
@@ -378,7 +376,7 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path):
         writer.add_image("left", pixels(), purpose="fun")
     with pytest.raises(SessionError, match="31 x 24 pixels, but camera 'left' has 32 x 24"):
         writer.add_image("left", pixels()[:, 1:])
-    with pytest.raises(SessionError, match="mount is one of"):
+    with pytest.raises(SessionError, match="mount is 'car'"):
         SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
     assert not (tmp_path / "t").exists()
 

@@ -22,7 +22,6 @@ from lrfcal_lib.session.stated import (
     check_amount,
     listed,
     naming,
-    numbers,
     opened,
     parse_session,
     read_bytes,
@@ -30,7 +29,6 @@ from lrfcal_lib.session.stated import (
     read_table,
     reading,
     short,
-    whole,
 )
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
@@ -213,11 +211,6 @@ def _check_angles(bearings, pitch):
         raise ValueError("bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round")
 
 
-def unfinished_of(data):
-    """Placements that session.json says are being recorded; None for a session that is not being recorded."""
-    return None if data.get("unfinished") is None else tuple(whole(p, "a placement") for p in data["unfinished"])
-
-
 def missing_parts(placements, scans, records, cameras, unfinished=None):
     """What a session states and does not hold, as sentences; the rest can be used."""
     seen = np.unique(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)])
@@ -285,7 +278,9 @@ def read_edges(path, stated, records):
                 raise ValueError(f"images.csv has no '{row['file']}' of camera '{row['camera']}'")
             if row["edge"] not in stated["board"].edges:
                 raise ValueError(f"edge is one of {short(stated['board'].edges)}, got '{row['edge']}'")
-            ends = numbers([float(row[k]) for k in EDGE_COLUMNS[3:]], (4,), "u1, v1, u2, v2").reshape(2, 2)
+            ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
+            if not np.isfinite(ends).all():
+                raise ValueError(f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}")
             if np.linalg.norm(ends[1] - ends[0]) < 5:
                 raise ValueError(f"the two pixels {ends.tolist()} are too close for a direction: pick them far apart")
             out.append(EdgePick(row["camera"], target, row["edge"], ends))
@@ -563,7 +558,7 @@ def open_session(path):
         raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
     with naming(path / "session.json"):
         stated = parse_session(data)
-        unfinished = unfinished_of(data)
+        unfinished = stated.pop("unfinished")
         scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
     records = read_images(path, stated, unfinished)
     picks = read_edges(path, stated, records)
