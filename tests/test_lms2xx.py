@@ -181,7 +181,7 @@ def test_the_two_scans_of_the_fact_sheet():
     raw = bytes.fromhex("02 80 0A 00 B0 03 40 D2 04 D2 24 FE 1F 10 5B 90")
     scan = decode_scan(raw)
     np.testing.assert_allclose(scan.ranges, [[1.234, 1.234, np.nan]])
-    assert scan.flags.tolist() == [[0, 1, 0]] and MODES[0].flags[0] == "field A"
+    assert scan.flags.tolist() == [[0, 1, 0]]
     assert REASONS[scan.reasons[0, 2]] == "dazzled" and scan.unit == "mm"
     assert encode_scan([1.234, 1.234, 0], flags=[0, 1, 0], reasons=[0, 0, 2]) == raw
 
@@ -348,7 +348,7 @@ def test_both_directions_are_told_apart():
 def test_configuration_survives_and_says_its_mode():
     raw = next(bytes.fromhex(text) for text in FROM_DEVICE if text.startswith("02 80 24 00 F4"))
     read = lms2xx_codec.parse_configuration(raw)
-    assert (read.measuring_mode, read.unit, read.realtime_indices, read.blanking_m) == (4, "mm", False, 0.0)
+    assert (read.measuring_mode, read.unit, read.realtime_indices) == (4, "mm", False)
     assert lms2xx_codec.encode_configuration(read) == raw
     changed = read.changed(measuring_mode=6, unit="cm", realtime_indices=True)
     again = lms2xx_codec.parse_configuration(lms2xx_codec.encode_configuration(changed))
@@ -363,16 +363,12 @@ def test_the_factory_configuration_is_that_of_an_outdoor_device():
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
-def test_variant_type_errors_and_status_byte():
+def test_type_and_errors():
     by_head = {text[12:17]: bytes.fromhex(text) for text in FROM_DEVICE}
-    assert lms2xx_codec.parse_variant(by_head["BB 00"]) == (False, 180.0, 0.5)
     assert lms2xx_codec.parse_type(by_head["BA 4C"]) == ("LMS221", "302063", "X01.27")
     assert lms2xx_codec.parse_errors(by_head["B2 10"]) == []
     old = encode_telegram(0xB2, bytes.fromhex("84 16 01 31 07 02"), status=0x12)
     assert lms2xx_codec.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
-    byte = lms2xx_codec.parse_status_byte
-    assert byte(0x10) == lms2xx_codec.StatusByte("ok", False, False, False)
-    assert byte(0xF3) == lms2xx_codec.StatusByte("error", True, True, True)
 
 
 def test_bad_replies_are_refused():
@@ -381,7 +377,6 @@ def test_bad_replies_are_refused():
         (lms2xx_codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
         (lms2xx_codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
         (lms2xx_codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
-        (lms2xx_codec.parse_variant, encode_telegram(0xBB, b"\1", status=16), "1 bytes of data, needs 5"),
         (lms2xx_codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
     ):
         with pytest.raises(TelegramError, match=message):
@@ -418,7 +413,7 @@ def test_100000_random_and_damaged_strings_never_raise():
 
 
 PARSERS = {
-    "parse_status": 0xB1, "parse_type": 0xBA, "parse_errors": 0xB2, "parse_variant": 0xBB, "parse_configuration": 0xF4
+    "parse_status": 0xB1, "parse_type": 0xBA, "parse_errors": 0xB2, "parse_configuration": 0xF4
 }  # fmt: skip
 
 
