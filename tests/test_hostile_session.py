@@ -193,7 +193,7 @@ def test_check_finds_what_two_writers_left(folder, monkeypatch):
     path = folder / "telegrams"
     fuzz.recorder(path).finish()
     assert not [text for text in validate(path) if " line " in text]
-    monkeypatch.setattr("lrfcal_lib.session.write.alone", lambda path: contextlib.nullcontext())
+    monkeypatch.setattr("lrfcal_lib.session.stated.alone", lambda path: contextlib.nullcontext())
     both = [fuzz.recorder(path) for _ in range(2)]
     for writer in both:
         writer.begin_placement(5)

@@ -19,16 +19,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    PlainSerializer,
-    TypeAdapter,
-    ValidationError,
-)
+import pydantic
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, PlainSerializer
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
@@ -146,7 +138,16 @@ def _refuse_other(file, status, kind, wanted):
 @contextmanager
 def alone(path):
     """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
-    with _locked(Path(path)) as stream:
+    with opened(Path(path) / LOCK, path, os.O_RDWR | os.O_CREAT) as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = stream.read(200).decode(errors="replace") or "another process"
+            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+        if not os.fstat(stream.fileno()).st_nlink:  # who held it has removed it meanwhile
+            with alone(path):
+                yield
+            return
         stream.truncate()
         stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
         stream.flush()
@@ -155,24 +156,6 @@ def alone(path):
         finally:
             with suppress(OSError), folder(Path(path) / LOCK, path) as handle:  # gone with its session?
                 os.unlink(LOCK, dir_fd=handle)
-
-
-def _locked(path):
-    """The lock file, locked; who removes one holds its lock, so one that was removed meanwhile is opened anew."""
-    while True:
-        stream = opened(path / LOCK, path, os.O_RDWR | os.O_CREAT)
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            with stream:
-                holder = stream.read(200).decode(errors="replace") or "another process"
-            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
-        except BaseException:
-            stream.close()
-            raise
-        if os.fstat(stream.fileno()).st_nlink:
-            return stream
-        stream.close()
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
@@ -293,14 +276,14 @@ def in_words(error):
     return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
 
 
-adapter = lru_cache(TypeAdapter)
+adapter = lru_cache(pydantic.TypeAdapter)
 
 
 def from_json(kind, data):
     """What is stated in JSON as one of the types below; ValueError in words for anything else."""
     try:
         return adapter(kind).validate_python(data)
-    except ValidationError as error:
+    except pydantic.ValidationError as error:
         raise ValueError(in_words(error)) from None
 
 

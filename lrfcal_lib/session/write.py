@@ -11,36 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lrfcal_lib.session.read import (
-    DROPPED,
-    IMAGE_COLUMNS,
-    PART,
-    PLATFORM_COLUMNS,
-    PURPOSES,
-    check_image_size,
-    check_scans,
-    image_size,
-    read_npz,
-)
-from lrfcal_lib.session.stated import (
-    LOCK,
-    SCHEMA,
-    SessionError,
-    alone,
-    board_to_json,
-    camera_to_json,
-    folder,
-    listed,
-    lrf_to_json,
-    naming,
-    opened,
-    parse_session,
-    read_bytes,
-    read_json,
-    read_table,
-    short,
-    transform_to_json,
-)
+from lrfcal_lib.session import read, stated
+from lrfcal_lib.session.stated import SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 
@@ -86,39 +58,39 @@ class SessionWriter:
         self.cameras = {camera.name: camera for camera in cameras}
         self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
-        platform = {"T_head_lrf": transform_to_json(T_head_lrf)}
+        platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
         if platform_sigma is not None:
             platform["sigma_direction_deg"] = round(math.degrees(platform_sigma[0]), 9)
             platform["sigma_offset_m"] = platform_sigma[1]
         self.data = {
-            "schema": SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source,
-            "simulated": simulated, "board": board_to_json(board),
-            "rig": {"lrf": lrf_to_json(lrf), "platform": platform,
-                    "cameras": {c.name: camera_to_json(c) for c in self.cameras.values()}},
+            "schema": stated.SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source,
+            "simulated": simulated, "board": stated.board_to_json(board),
+            "rig": {"lrf": stated.lrf_to_json(lrf), "platform": platform,
+                    "cameras": {c.name: stated.camera_to_json(c) for c in self.cameras.values()}},
             "placements": [int(p) for p in placements], "reference": reference or {},
         }  # fmt: skip
         with naming(self.path):
-            parse_session(json.loads(json.dumps(self.data)))
+            stated.parse_session(json.loads(json.dumps(self.data)))
         if self.path.exists() and not self.path.is_dir():
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self.path.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            stack.enter_context(alone(self.path))
+            stack.enter_context(stated.alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
     def _create(self):
-        if set(os.listdir(self.path)) - {LOCK}:
+        if set(os.listdir(self.path)) - {stated.LOCK}:
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self._make_folders()
         self._write_index()
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            with folder(self.path / name / "any", self.path, make=True):
+            with stated.folder(self.path / name / "any", self.path, make=True):
                 pass
         if self.cameras:
-            self._begin_table("images.csv", IMAGE_COLUMNS)
+            self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
     def __enter__(self):
         return self
@@ -177,7 +149,7 @@ class SessionWriter:
         scans = {"ranges": ranges, "bearings": bearings, "pitch": pitch, "time_s": time_s, "intensities": intensities}
         scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
         with naming(f"{self.path}: placement {placement}"):
-            scans = check_scans(scans | {"placement": np.full(len(ranges), placement)})
+            scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
         self.bearings, self.parts = bearings, self.parts + 1
@@ -244,15 +216,15 @@ class SessionWriter:
         SessionError
             For an unknown camera or purpose, or an image of another size than the camera's.
         """
-        if camera not in self.cameras or purpose not in PURPOSES:
-            known = f"cameras are {short(self.cameras)}, purposes {short(PURPOSES)}"
+        if camera not in self.cameras or purpose not in read.PURPOSES:
+            known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
         pixels = isinstance(image, np.ndarray)
-        size = image.shape[1::-1] if pixels else image_size(image)
-        check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
+        size = image.shape[1::-1] if pixels else read.image_size(image)
+        read.check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
         self.shots[camera] += 1
         name = f"images/{camera}/{self.shots[camera]:04d}{'.png' if pixels else Path(image).suffix.lower()}"
-        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else read_bytes(image))
+        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else stated.read_bytes(image))
         self._note_placement(placement)
         number = "" if placement < 0 else placement
         self._append_rows("images.csv", [[cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]])
@@ -273,7 +245,7 @@ def finish(path):
         If there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
-        with alone(path):
+        with stated.alone(path):
             complete(Path(path))
     except FileNotFoundError as error:
         raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
@@ -284,10 +256,10 @@ def complete(path):
     mend_tables(path)
     if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    parts = [path / "lrf" / name for name in listed(path / "lrf", path) if PART.fullmatch(name)]
+    parts = [path / "lrf" / name for name in stated.listed(path / "lrf", path) if read.PART.fullmatch(name)]
     if not parts:
         raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
-    sweeps = [read_npz(part, path) for part in parts]
+    sweeps = [read.read_npz(part, path) for part in parts]
     shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
     scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
     write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, np.savez_compressed)
@@ -298,7 +270,7 @@ def complete(path):
 def mend_tables(path):
     """Remove rows that a crash cut off at the end of a session's tables."""
     for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
-        if os.path.lexists(table) and not (data := read_bytes(table, path)).endswith(b"\n"):
+        if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
             write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
 
 
@@ -310,10 +282,10 @@ def cell(value):
 def write_file(file, content, within, save=np.savez):
     """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
     draft = file.with_name(file.name + ".draft")
-    with folder(file, within) as inside:
+    with stated.folder(file, within) as inside:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(draft.name, dir_fd=inside)
-        with opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+        with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
             if isinstance(content, dict):
                 save(stream, **content)
             else:
@@ -327,7 +299,7 @@ def write_file(file, content, within, save=np.savez):
 def append_file(file, content, within):
     """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
     left = memoryview(content.encode() if isinstance(content, str) else content)
-    with opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+    with stated.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
         handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
         try:
             while left:
@@ -375,13 +347,13 @@ class SessionRecorder(SessionWriter):
     def _create(self):
         if self._resume and os.path.lexists(self.path / "session.json"):
             self._go_on()
-        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
+        elif set(os.listdir(self.path)) - {"session.json.draft", stated.LOCK}:
             hint = "choose another name" if self._resume else "record with --resume to go on with it, or choose another"
             raise SessionError(f"{self.path}: exists already; {hint}")
         else:  # session.json comes first, so that a recording killed at once can go on
             self._state(unfinished=[])
         self._make_folders()
-        self._begin_table("platform.csv", PLATFORM_COLUMNS)
+        self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
     def _state(self, **changes):
         """Change session.json; where that cannot be written, nothing is changed."""
@@ -394,21 +366,21 @@ class SessionRecorder(SessionWriter):
 
     def _go_on(self):
         """Take over what an earlier recording wrote, without the placement that it did not finish."""
-        mine, data = json.loads(json.dumps(self.data)), read_json(self.path / "session.json", self.path)
+        mine, data = json.loads(json.dumps(self.data)), stated.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
-            stated = parse_session(data)
+            known = stated.parse_session(data)
             for key in ("board", "rig"):
                 if data[key] != mine[key]:
                     where = _first_difference(data[key], mine[key], key)
                     raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
-        self.data = {**data, "placements": list(stated["placements"]), "unfinished": list(stated["unfinished"] or ())}
+        self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
         self._make_folders()
         mend_tables(self.path)
         for placement in self.data["unfinished"]:
             self._mark_dropped(placement)
         self._state(unfinished=[])
         for camera in self.cameras:
-            there = listed(self.path / "images" / camera, self.path)
+            there = stated.listed(self.path / "images" / camera, self.path)
             names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
             self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
 
@@ -456,7 +428,7 @@ class SessionRecorder(SessionWriter):
 
     def shots_of(self, purpose):
         """Numbers of images of a purpose, a dict by camera."""
-        rows = read_table(self.path / "images.csv", IMAGE_COLUMNS, self.path)[0] if self.cameras else []
+        rows = stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0] if self.cameras else []
         return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
 
     def _note_placement(self, placement):
@@ -464,10 +436,13 @@ class SessionRecorder(SessionWriter):
             raise SessionError(f"{self.path}: placement {placement} was not begun")
 
     def _mark_dropped(self, placement):
-        marks = ("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}), ("images.csv", IMAGE_COLUMNS, {"purpose": DROPPED})
+        marks = (
+            ("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}),
+            ("images.csv", read.IMAGE_COLUMNS, {"purpose": read.DROPPED}),
+        )
         for name, columns, mark in marks:
             if os.path.lexists(self.path / name):
-                rows = read_table(self.path / name, columns, self.path)[0]
+                rows = stated.read_table(self.path / name, columns, self.path)[0]
                 rows = [row | mark if row["placement"] == str(placement) else row for row in rows]
                 self._write(name, "\n".join([",".join(columns), *(",".join(row.values()) for row in rows)]) + "\n")
 
