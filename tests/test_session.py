@@ -225,24 +225,6 @@ def test_scan_lines_of_an_unknown_placement_are_listed(path):
 # ---------------------------------------------------------------------------------------------- session.json
 
 
-def test_no_session_at_all(tmp_path):
-    with pytest.raises(SessionError, match=r"session\.json: No such file"):
-        open_session(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["", "{", '{"schema": "lrfcal', "\xff"])
-def test_bad_json(path, text):
-    (path / "session.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(SessionError, match="not JSON"):
-        open_session(path)
-
-
-def test_json_of_another_kind(path):
-    (path / "session.json").write_text("[1]")
-    with pytest.raises(SessionError, match="holds a list"):
-        open_session(path)
-
-
 CHANGES = [  # place in session.json, what stands there instead ("gone": nothing), message
     ("schema", "lrfcal-session/9", "schema is 'lrfcal-session/9', this version reads"),
     ("schema", "gone", "schema is None"),
@@ -294,140 +276,111 @@ def test_a_wrong_statement_is_named(path, place, value, message):
         open_session(path)
 
 
-# ---------------------------------------------------------------------------------------------- scan lines
+# ---------------------------------------------------------------------------------------------- damaged files
 
 
-def test_missing_scans(path):
-    (path / "lrf" / "scans.npz").unlink()
-    with pytest.raises(SessionError, match=r"scans\.npz: no such file"):
-        open_session(path)
+def arrays(**values):
+    return lambda path: edit_scans(path, **values)
 
 
-@pytest.mark.parametrize("part", [0, 10, 0.5, 0.98])
-def test_truncated_scans(path, part):
-    file = path / "lrf" / "scans.npz"
-    data = file.read_bytes()
-    file.write_bytes(data[: int(part * len(data) if part < 1 else part)])
-    with pytest.raises(SessionError, match="cannot be read.*truncated"):
-        open_session(path)
+def written(name, content):
+    """Other bytes in a file; a function makes them of those that are there."""
+
+    def change(path):
+        file = path / name
+        there = file.read_bytes() if file.exists() else b""
+        file.write_bytes(content(there) if callable(content) else content)
+
+    return change
 
 
-def test_damaged_scans(path):
-    file = path / "lrf" / "scans.npz"
-    data = bytearray(file.read_bytes())
-    data[100:160] = bytes(60)
-    file.write_bytes(data)
-    with pytest.raises(SessionError, match=r"scans\.npz: cannot be read"):
-        open_session(path)
+def gone(name):
+    return lambda path: (path / name).unlink()
 
 
-def test_pickles_are_not_read(path):
-    edit_scans(path, pitch=np.array([{}] * 6))
-    with pytest.raises(SessionError, match="cannot be read.*without pickles"):
-        open_session(path)
+def cell(column, value):
+    """Another value in the first row of images.csv."""
+
+    def change(path):
+        with (path / "images.csv").open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        rows[0][column] = value
+        with (path / "images.csv").open("w", newline="") as stream:
+            table = csv.DictWriter(stream, rows[0].keys())
+            table.writeheader()
+            table.writerows(rows)
+
+    return change
 
 
-def test_telegrams_need_their_index(path):
-    (path / "lrf" / "scans.npz").unlink()
-    (path / "lrf" / "telegrams.bin").write_bytes(b"\x02")
-    with pytest.raises(SessionError, match=r"index\.csv: No such file.*needs this file"):
-        open_session(path)
+def pick(row):
+    return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
 
 
-ARRAYS = {
-    "median range is .* m: millimetres": {"ranges": np.full((6, 61), 2000.0)},
-    r"all NaN\): nothing was recorded": {"ranges": np.full((6, 61), np.nan)},
-    "negative ranges are no measurements": {"ranges": np.r_[[[-1.0] * 61], np.ones((5, 61))]},
-    "ranges must be scan lines x beams": {"ranges": np.ones(61)},
-    "a bearing is 120 rad: degrees": {"bearings": np.arange(60.0, 121.0)},
-    "a pitch is 20 rad: degrees": {"pitch": np.linspace(-20.0, 20.0, 6)},
-    "3 values of pitch are not finite": {"pitch": np.r_[np.full(3, np.nan), 0, 0, 0]},
-    "bearings must ascend": {"bearings": BEARINGS[::-1]},
-    r"time_s has shape \(2,\)": {"time_s": np.zeros(2)},
-}
-
-
-@pytest.mark.parametrize("message", ARRAYS)
-def test_wrong_arrays_are_named(path, message):
-    edit_scans(path, **ARRAYS[message])
-    with pytest.raises(SessionError, match=r"scans\.npz: .*" + message):
-        open_session(path)
-
-
-def test_a_missing_array_is_named(path):
-    np.savez(path / "lrf" / "scans.npz", ranges=np.ones((2, 61)), bearings=BEARINGS)
-    with pytest.raises(SessionError, match="key 'placement' is missing"):
-        open_session(path)
-
-
-def test_the_writer_refuses_what_the_reader_would(tmp_path):
-    writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
-    ranges, bearings, pitch = wall()
-    with pytest.raises(SessionError, match="placement 1: the median range .*millimetres"):
-        writer.add_sweep(1, 1000 * ranges, bearings, pitch)
-    with pytest.raises(SessionError, match="pitch has shape"):
-        writer.add_sweep(1, ranges, bearings, pitch[:2])
-    writer.add_sweep(1, ranges, bearings, pitch)
-    with pytest.raises(SessionError, match="one grid a session"):
-        writer.add_sweep(2, ranges, bearings + 0.1, pitch)
-    with pytest.raises(SessionError, match="camera 'up', purpose 'board': cameras are left, right"):
-        writer.add_image("up", pixels())
-    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
-        writer.add_image("left", pixels(), purpose="fun")
-    with pytest.raises(SessionError, match="31 x 24 pixels, but camera 'left' has 32 x 24"):
-        writer.add_image("left", pixels()[:, 1:])
-    with pytest.raises(SessionError, match="mount is 'car'"):
-        SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
-    assert not (tmp_path / "t").exists()
-
-
-# ---------------------------------------------------------------------------------------------- images and tables
-
-
-def rewrite(path, column, value, row=0, file="images.csv"):
-    with (path / file).open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    rows[row][column] = value
-    with (path / file).open("w", newline="") as stream:
-        table = csv.DictWriter(stream, rows[0].keys())
-        table.writeheader()
-        table.writerows(rows)
-
-
-ROWS = {
-    "must stay inside the session's folder, got '../trip/session.json'": ("file", "../trip/session.json"),
-    "must stay inside the session's folder, got '/etc/passwd'": ("file", "/etc/passwd"),
-    "must stay inside the session's folder, got ''": ("file", ""),
-    r"must stay inside the session's folder, got '\.\.\\": ("file", "..\\x.png"),
-    "0009.png: No such file": ("file", "images/left/0009.png"),
-    "neither PNG nor JPEG": ("file", "session.json"),
-    "no camera 'up' in session.json, which has left, right": ("camera", "up"),
-    "purpose is one of intrinsics, board, scene, got 'fun'": ("purpose", "fun"),
-    "placement 12 is not in session.json": ("placement", "12"),
-    "line 2: invalid literal": ("placement", "first"),
-    "line 2: could not convert string to float: 'up'": ("pitch_deg", "up"),
-}
-
-
-@pytest.mark.parametrize("message", ROWS)
-def test_wrong_rows_are_named(path, message):
-    rewrite(path, *ROWS[message])
-    with pytest.raises(SessionError, match=message):
-        open_session(path)
-
-
-def test_a_link_out_of_the_session_is_refused(path, tmp_path):
-    target = path / "images" / "left" / "0001.png"
-    outside = tmp_path / "secret.png"
-    target.rename(outside)
-    target.symlink_to(outside)
-    with pytest.raises(SessionError, match=r"0001\.png: is a link, not a file"):
-        open_session(path)
-
-
-def test_an_image_of_another_size(path):
+def another_size(path):
     cv2.imwrite(str(path / "images" / "left" / "0002.png"), pixels()[:20])
-    with pytest.raises(SessionError, match=r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"):
+
+
+def telegrams_alone(path):
+    gone("lrf/scans.npz")(path)
+    written("lrf/telegrams.bin", b"\x02")(path)
+
+
+SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the session's folder, got "
+DAMAGE = [
+    (gone("session.json"), r"session\.json: No such file"),
+    (written("session.json", b""), "not JSON"),
+    (written("session.json", b"{"), "not JSON"),
+    (written("session.json", b"\xff"), "not JSON"),
+    (written("session.json", b"[1]"), "holds a list"),
+    (gone(SCANS), r"scans\.npz: no such file"),
+    (written(SCANS, b""), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[:10]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[: len(data) // 2]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[: int(0.98 * len(data))]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[:100] + bytes(60) + data[160:]), r"scans\.npz: cannot be read"),
+    (lambda path: np.savez(path / SCANS, ranges=np.ones((2, 61)), bearings=BEARINGS), "key 'placement' is missing"),
+    (arrays(pitch=np.array([{}] * 6)), "cannot be read.*without pickles"),
+    (arrays(ranges=np.full((6, 61), 2000.0)), r"scans\.npz: the median range is .* m: millimetres"),
+    (arrays(ranges=np.full((6, 61), np.nan)), r"all NaN\): nothing was recorded"),
+    (arrays(ranges=np.r_[[[-1.0] * 61], np.ones((5, 61))]), "negative ranges are no measurements"),
+    (arrays(ranges=np.ones(61)), "ranges must be scan lines x beams"),
+    (arrays(bearings=np.arange(60.0, 121.0)), "a bearing is 120 rad: degrees"),
+    (arrays(pitch=np.linspace(-20.0, 20.0, 6)), "a pitch is 20 rad: degrees"),
+    (arrays(pitch=np.r_[np.full(3, np.nan), 0, 0, 0]), "3 values of pitch are not finite"),
+    (arrays(bearings=BEARINGS[::-1]), "bearings must ascend"),
+    (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
+    (telegrams_alone, r"index\.csv: No such file.*needs this file"),
+    (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
+    (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
+    (cell("file", ""), OUT + "''"),
+    (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
+    (cell("file", "images/left/0009.png"), "0009.png: No such file"),
+    (cell("file", "session.json"), "neither PNG nor JPEG"),
+    (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
+    (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
+    (cell("placement", "12"), "placement 12 is not in session.json"),
+    (cell("placement", "first"), "line 2: invalid literal"),
+    (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
+    (another_size, r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"),
+    (gone(IMAGES), r"images\.csv: No such file"),
+    (written(IMAGES, b""), "got an empty file"),
+    (written(IMAGES, b"\xff\xfe"), "not a CSV file in UTF-8"),
+    (written(IMAGES, lambda data: data.replace(b"_deg", b"")), r"columns must be t_s, .*; got t_s, .*, pitch, purpose"),
+    (written(IMAGES, lambda data: data + b",left,images"), "line 7: 3 values for 6 columns; truncated"),
+    (pick("left,images/left/0009.png,ab,1,2,20,3"), "no 'images/left/0009.png' of camera 'left'"),
+    (pick("left,../0001.png,ab,1,2,20,3"), OUT),
+    (pick("left,images/left/0001.png,top,1,2,20,3"), "edge is one of ab, bc, ca, got 'top'"),
+    (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
+    (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
+    (pick("left,images/left/0001.png,ab,1,2,x,3"), "could not convert"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE)
+def test_damage_is_named(path, damage, message):
+    damage(path)
+    with pytest.raises(SessionError, match=message):
         open_session(path)
 
 
@@ -444,55 +397,27 @@ def test_truncated_images(tmp_path, kind):
 
 
 def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
-    file = path / "images" / "left" / "0001.png"
-    data = bytearray(file.read_bytes())
-    data[60:200] = bytes(140)
-    file.write_bytes(data)
+    written("images/left/0001.png", lambda data: data[:60] + bytes(140) + data[200:])(path)
     (problem,) = validate(path)
     assert "0001.png: cannot be decoded" in problem
 
 
-def test_wrong_columns(path):
-    file = path / "images.csv"
-    file.write_text(file.read_text().replace("pitch_deg", "pitch"))
-    with pytest.raises(SessionError, match=r"images\.csv: columns must be t_s, .*; got t_s, .*, pitch, purpose"):
-        open_session(path)
-    file.write_text("")
-    with pytest.raises(SessionError, match="got an empty file"):
-        open_session(path)
-
-
-def test_a_short_row(path):
-    with (path / "images.csv").open("a") as table:
-        table.write(",left,images")
-    with pytest.raises(SessionError, match="line 7: 3 values for 6 columns; truncated"):
-        open_session(path)
-
-
-def test_a_table_in_another_encoding(path):
-    (path / "images.csv").write_bytes(b"\xff\xfe")
-    with pytest.raises(SessionError, match="not a CSV file in UTF-8"):
-        open_session(path)
-
-
-def test_missing_images_table(path):
-    (path / "images.csv").unlink()
-    with pytest.raises(SessionError, match=r"images\.csv: No such file"):
-        open_session(path)
-
-
-PICKS = {
-    "no 'images/left/0009.png' of camera 'left'": "left,images/left/0009.png,ab,1,2,20,3",
-    "must stay inside": "left,../0001.png,ab,1,2,20,3",
-    "edge is one of ab, bc, ca, got 'top'": "left,images/left/0001.png,top,1,2,20,3",
-    "too close for a direction": "left,images/left/0001.png,ab,1,2,2,3",
-    "u1, v1, u2, v2 must be 4 finite": "left,images/left/0001.png,ab,1,2,nan,3",
-    "could not convert": "left,images/left/0001.png,ab,1,2,x,3",
-}
-
-
-@pytest.mark.parametrize("message", PICKS)
-def test_wrong_picks_are_named(path, message):
-    (path / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + PICKS[message] + "\n")
-    with pytest.raises(SessionError, match=message):
-        open_session(path)
+def test_the_writer_refuses_what_the_reader_would(tmp_path):
+    writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
+    ranges, bearings, pitch = wall()
+    writer.add_sweep(1, ranges, bearings, pitch)
+    for wrong, message in (
+        (lambda: writer.add_sweep(2, 1000 * ranges, bearings, pitch), "placement 2: the median range .*millimetres"),
+        (lambda: writer.add_sweep(2, ranges, bearings, pitch[:2]), "pitch has shape"),
+        (lambda: writer.add_sweep(2, ranges, bearings + 0.1, pitch), "one grid a session"),
+        (lambda: writer.add_image("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
+        (lambda: writer.add_image("left", pixels(), purpose="fun"), "purposes intrinsics, board, scene"),
+        (lambda: writer.add_image("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
+        (
+            lambda: SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)]),
+            "left.mount is 'car'",
+        ),
+    ):
+        with pytest.raises(SessionError, match=message):
+            wrong()
+    assert not (tmp_path / "t").exists()
