@@ -1,6 +1,7 @@
 """Speed, as ratios within one run: ours against scipy, OpenCV, or itself one by one. Run with ``make bench``."""
 
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from synthetic import camera_observations, random_board_poses, random_rig
 from lrfcal_lib.calibrate.reconstruct import color_points
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project
 from lrfcal_lib.session.lms2xx_codec import decode_scans, encode_scan, split_stream
-from lrfcal_lib.solvers.lines import solve_lines, solve_lines_batch
+from lrfcal_lib.solvers import solve_camera
 
 REPEATS = 7
 
@@ -33,7 +34,7 @@ def solving():
     rng = np.random.default_rng(0)
     rig = random_rig(rng)
     obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig), noise=1.0)
-    start = solve_lines(obs).transform
+    start = solve_camera(obs).transform
 
     def residuals(x):
         T = RigidTransform.from_components(x[3:], Rotation.from_rotvec(x[:3]))
@@ -41,10 +42,10 @@ def solving():
 
     x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
     T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
-    ours, theirs = seconds(lambda: solve_lines(obs, T0)), seconds(lambda: least_squares(residuals, x0, method="lm"))
-    points = np.broadcast_to(obs.crossing_points, (1000,) + obs.crossing_points.shape)
-    data = (points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
-    batch = seconds(lambda: solve_lines_batch(*data, T0)) / 1000
+    ours = seconds(lambda: solve_camera(obs, "line", T0))
+    theirs = seconds(lambda: least_squares(residuals, x0, method="lm"))
+    trials = replace(obs, crossing_points=np.broadcast_to(obs.crossing_points, (1000,) + obs.crossing_points.shape))
+    batch = seconds(lambda: solve_camera(trials, "line", T0)) / 1000
     yield (
         f"line calibration, {len(obs.crossing_points)} crossings",
         1000 * ours,

@@ -83,7 +83,7 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     ]
     given |= {"placements": numbers, "board_poses": np.array([T.as_matrix() for T in known])}
     covariance = np.repeat(np.diag(SIGMA_BOARD**2)[None], len(poses), axis=0)
-    return bare_observations(model, camera="left", source=source, board_covariance=covariance, **given)
+    return CameraObservations(model, camera="left", source=source, board_covariance=covariance, **given)
 
 
 def _images(rng, poses, model, corners, edges, noise, sigma_px, pattern):
@@ -216,20 +216,3 @@ def meet(p_platform, T_head_lrf):
     both = (np.stack([base + reach, base - reach]) + np.pi) % (2 * np.pi) - np.pi
     pitch = np.where(np.abs(both[0]) < np.abs(both[1]), both[0], both[1])
     return T_head_lrf.inv().apply(tilt(p_platform, -pitch)) * [1.0, 1.0, 0.0], pitch
-
-
-def bare_observations(model, **given):
-    """`CameraObservations` with nothing in it but what is given."""
-    n, p = (len(given.get(name, ())) for name in ("crossing_points", "placements"))
-    zeros = {
-        "crossing_points": (0, 3), "crossing_covariance": (0, 3, 3), "crossing_lines": (0, 3),
-        "crossing_line_sigma": 0, "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3), "crossing_background": n,
-        "plane_points": (0, 3), "plane_covariance": (0, 3, 3), "board_poses": (0, 4, 4), "board_covariance": (0, 6, 6),
-        "pattern_points": (0, 3), "pattern_pixels": (p, 0, 2), "scene_points": (0, 3), "scene_covariance": (0, 3, 3),
-        "scene_pixels": (0, 2), "scene_sigma_px": 0,
-    }  # fmt: skip
-    empty = {name: np.zeros(shape) for name, shape in zeros.items()}
-    whole = ("crossing_placement", "plane_placement", "placements", "scene_placement")
-    empty |= {name: np.zeros(0, int) for name in whole} | {"crossing_radius": np.full(n, 0.005)}
-    empty |= {"crossing_edge": np.zeros(0, "<U8"), "crossing_across": np.zeros(0, bool), "pattern_sigma_px": 0.2}
-    return CameraObservations(**({"camera": "camera", "source": "lrf", "model": model} | empty | given))

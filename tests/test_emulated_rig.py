@@ -16,10 +16,9 @@ import serial
 
 from lrfcal_lib.drivers.port import ask
 from lrfcal_lib.drivers.rig_file import read_rig_file
-from lrfcal_lib.emulators import EmulatedRig
 from lrfcal_lib.emulators.head import Head
 from lrfcal_lib.emulators.line import Clock
-from lrfcal_lib.emulators.rig import main, summary
+from lrfcal_lib.emulators.rig import EmulatedRig, main, summary
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.session.lms2xx_codec import REASONS, split_stream
 from lrfcal_lib.session.stated import parse_session
@@ -120,12 +119,12 @@ def rig(setup, placements):
 
 
 def test_cameras_open_as_any_stream_and_show_the_place(rig):
-    rig.place(1)
+    rig.world.put(1)
     video = cv2.VideoCapture(rig.camera_urls["left"])
     assert video.isOpened()
     ok, first = video.read()
     assert ok and first.shape == (48, 64, 3)
-    rig.place(None)
+    rig.world.put(None)
     until(lambda: np.abs(video.read()[1].astype(int) - first).mean() > 3, "an image without the board")
     video.release()
 
@@ -151,7 +150,7 @@ def test_no_image_while_the_head_moves(rig):
 def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
     """The drawing process is replaced by one that ends when it is told."""
     world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
-    server, asked = CameraServer(world), []
+    server, asked = CameraServer(world, world.setup), []
 
     def submit(function, index, place, pitch, *_):
         asked.append((pitch, Future()))
@@ -170,7 +169,7 @@ def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
 def test_an_image_is_drawn_only_where_the_head_rests_long_enough(setup, placements):
     world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
     for rest_s, drawn in ((1e6, False), (0.0, True)):
-        server, asked = CameraServer(world, rest_s=rest_s), []
+        server, asked = CameraServer(world, world.setup, rest_s=rest_s), []
         server._pool.submit = lambda *args, asked=asked: asked.append(args) or Future()
         world.head.go(world.clock.now(), 0.01 if drawn else -0.01, 2.0)
         until(lambda: world.head.settled(world.clock.now()), "rest")
@@ -184,7 +183,7 @@ def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
         until(lambda: rig.camera_server.image("left")[0] is not None, "an image")
         for process in rig.camera_server._pool._processes.values():
             process.kill()
-        rig.place(2)
+        rig.world.put(2)
         until(lambda: rig.camera_server.image("left") == (None, None) and rig.error() is not None, "the error")
     assert "the process that draws the images ended" in caplog.text
 
@@ -199,7 +198,7 @@ def test_a_rig_file_lets_cameras_be_silent_while_the_head_moves(rig):
 
 
 def test_control_socket(rig):
-    assert ask(rig.control, "place 2") == {} and rig.truth()["place"] == ["placement", 2]
+    assert ask(rig.control, "place 2") == {} and rig.world.truth()["place"] == ["placement", 2]
     assert ask(rig.control, {"command": "place", "arguments": ["none"]}) == {}
     assert ask(rig.control, "close right 1") == {} and rig.world.place.key == ("close", "right", 1)
     assert ask(rig.control, "fault head mute 2") == {"armed": ["mute"]}
@@ -226,8 +225,8 @@ def test_control_refuses(rig, line, match):
 
 def test_the_devices_share_one_world(rig):
     """The head moves by Pelco-D, and the scans that leave the other port are of where it then is."""
-    rig.place(1)
-    head, port = serial.Serial(rig.head_port, 2400), serial.Serial(rig.lrf_port, 9600, timeout=0.2)
+    rig.world.put(1)
+    head, port = serial.Serial(rig.pan_tilt.path, 2400), serial.Serial(rig.lrf.path, 9600, timeout=0.2)
     head.write(bytes.fromhex("FF 01 00 4D 01 F4 43"))  # 5 deg down
     until(lambda: rig.world.head.settled(rig.clock.now()) and rig.pitch() < -0.08, "the move")
     before, data, end = len(rig.scans), b"", time.monotonic() + DEADLINE
@@ -248,7 +247,7 @@ def test_rig_file_states_what_a_session_states(rig, setup, tmp_path):
     assert len(read_rig_file(tmp_path / "rig.json").plan.to_do()) == 4
     parsed = parse_session({**stated, "placements": [1]})
     assert parsed["board"].name == setup.rig.board.name and parsed["cameras"]["left"].width == 64
-    assert stated["devices"]["lrf"]["port"] == rig.lrf_port and stated["devices"]["lrf"]["variant"] == [100, 0.25]
+    assert stated["devices"]["lrf"]["port"] == rig.lrf.path and stated["devices"]["lrf"]["variant"] == [100, 0.25]
     assert stated["devices"]["head"]["pitch_limits_deg"] == [-60, 45]
     assert stated["plan"]["placements"][1]["pitch_deg"][0] > stated["plan"]["placements"][1]["pitch_deg"][1]
     low, high, step = stated["plan"]["pitch_deg"]
@@ -259,7 +258,7 @@ def test_rig_file_states_what_a_session_states(rig, setup, tmp_path):
 def test_own_placements_and_unknown_setups(setup, tmp_path):
     mine = [Placement(7, placements_of(setup)[0].T_platform_board, (-0.1, 0.1), (0.0,))]
     with EmulatedRig(setup, placements=mine, cameras=False, folder=tmp_path / "rig") as rig:
-        rig.place(7)
+        rig.world.put(7)
         assert rig.rig_file()["rig"]["cameras"] == {} and (tmp_path / "rig" / "lrf").is_symlink()
     assert list((tmp_path / "rig").iterdir()) == []
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):

@@ -9,8 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 
 from lrfcal_lib.evaluate import tables
-from lrfcal_lib.solvers.lines import solve_lines
-from lrfcal_lib.solvers.planes import solve_zhang_pless
+from lrfcal_lib.solvers import solve_camera
 
 
 @pytest.fixture(scope="module")
@@ -28,28 +27,28 @@ def test_rms_ignores_what_is_missing():
 
 def test_left_out_errors_vanish_without_noise(observed):
     obs = observed[0.0]
-    edge, plane = tables.left_out_residuals(obs, obs, solve_lines, solve_lines(obs))
+    edge, plane = tables.left_out_residuals(obs, obs, "line", solve_camera(obs))
     assert np.abs(edge).max() < 1e-6 and np.nanmax(np.abs(plane)) < 1e-8
 
 
 def test_left_out_errors_are_larger_than_fitted_ones(observed):
     obs = observed[1.0]
-    full = solve_zhang_pless(obs)
-    _, plane = tables.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    full = solve_camera(obs, "zhang_pless")
+    _, plane = tables.left_out_residuals(obs, obs, "zhang_pless", full)
     assert tables.rms(plane) > tables.rms(tables.plane_residuals_of(obs, full))
 
 
 def test_placements_that_leave_too_little_are_nan(observed):
     obs = observed[0.0].select(observed[0.0].placements[:3])
-    full = SimpleNamespace(transform=solve_zhang_pless(observed[0.0]).transform)
-    edge, plane = tables.left_out_residuals(obs, obs, solve_zhang_pless, full)
+    full = SimpleNamespace(transform=solve_camera(observed[0.0], "zhang_pless").transform)
+    edge, plane = tables.left_out_residuals(obs, obs, "zhang_pless", full)
     assert np.isnan(edge).all() and np.isnan(plane).all()
 
 
 def test_comparison_has_a_row_a_method(observed):
     obs = observed[1.0]
     observations = {("left", "half_step"): obs, ("left", "last_beam"): obs}
-    solutions = {("left", "line"): solve_lines(obs), ("left", "zhang_pless"): solve_zhang_pless(obs)}
+    solutions = {("left", "line"): solve_camera(obs), ("left", "zhang_pless"): solve_camera(obs, "zhang_pless")}
     table = tables.method_comparison(observations, solutions)
     assert table.method.tolist() == ["line", "zhang_pless"] and (table.n_placements == 14).all()
     without = tables.method_comparison(observations, solutions, left_out=False)
@@ -64,7 +63,7 @@ def test_poses_under_the_same_intrinsics_stay(observed):
 
 
 def test_camera_table_shows_degrees_and_millimetres(observed):
-    solution = solve_lines(observed[1.0])
+    solution = solve_camera(observed[1.0])
     table = tables.camera_calibration_table({("left", "line"): solution}).set_index("parameter")
     np.testing.assert_allclose(table.value[["rx", "ry", "rz"]], np.rad2deg(solution.parameters[:3]))
     np.testing.assert_allclose(table.value[["tx", "ty", "tz"]], 1000 * solution.parameters[3:])

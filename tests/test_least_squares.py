@@ -1,13 +1,11 @@
 """The least-squares core: convergence, batches, losses, covariances, what is unobservable."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case
 
 from lrfcal_lib.fit.least_squares import (
     Block,
@@ -15,13 +13,9 @@ from lrfcal_lib.fit.least_squares import (
     null_space,
     placement_covariance,
     pseudo_inverse,
-    robust_rho,
-    robust_weights,
+    robust,
     solve,
-    unobservable_motions,
-    whiten,
 )
-from lrfcal_lib.fit.residuals import line_block
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     apply_pose,
@@ -31,7 +25,6 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.solvers.lines import solve_lines_batch
 
 
 def line_problem(x, y, sigma=1.0):
@@ -106,8 +99,8 @@ def test_losses_resist_outliers(data, loss):
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy"])
 def test_weights_are_the_slope_of_the_loss(loss):
     z = np.array([0.01, 0.5, 1.0, 1.4, 3.0, 20.0])
-    slope = (robust_rho(z + 1e-6, loss) - robust_rho(z - 1e-6, loss)) / 2e-6
-    np.testing.assert_allclose(robust_weights(z, loss), slope / (2 * z), rtol=1e-6)
+    slope = (robust(z + 1e-6, loss)[0] - robust(z - 1e-6, loss)[0]) / 2e-6
+    np.testing.assert_allclose(robust(z, loss)[1], slope / (2 * z), rtol=1e-6)
 
 
 def test_robust_result_matches_scipy(data):
@@ -234,8 +227,6 @@ def test_null_space_names_the_lost_direction():
     directions, values = null_space(A.T @ A, np.ones(6))
     np.testing.assert_allclose(directions, [[0, 0, 0, 1, 0, 0]], atol=1e-12)
     assert values[0] < 1e-6
-    words = unobservable_motions(A.T @ A, np.ones(6), lambda d: motion_words(d, "left"), 1.0)
-    assert words == ("translation along x of the left frame",)
 
 
 def test_rounding_errors_below_zero_are_no_information():
@@ -266,19 +257,6 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
     assert state[0] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_thousand_trials_take_less_than_half_a_second():
-    rng, (rig, obs) = np.random.default_rng(8), camera_case(8, 20)
-    points = obs.crossing_points[None] + rng.normal(0, 0.003, (1000, *obs.crossing_points.shape))
-    arguments = (obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model, rig.T_camera_lrf)
-    assert points.shape[1] >= 36
-    best = np.inf
-    for _ in range(3):
-        start = time.perf_counter()
-        found = solve_lines_batch(points, *arguments)
-        best = min(best, time.perf_counter() - start)
-    assert found.converged.all() and best < 0.5
-
-
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-7])
 def test_pose_moves_compose_like_transforms(scale):
     rng = np.random.default_rng(9)
@@ -303,16 +281,3 @@ def test_pose_moves_compose_like_transforms(scale):
 )
 def test_motions_in_words(delta, words):
     assert motion_words(delta, "right") == words
-
-
-def test_corrected_jacobian_is_the_derivative_of_whitened_residuals():
-    rig, obs = camera_case(10, 6, noise=1.0)
-    pose = pose_array(rig.T_camera_lrf)
-    data = (obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
-    _, J = whiten(line_block(pose, *data))
-    steps = 1e-6 * np.eye(6)
-    numeric = [
-        (whiten(line_block(move_pose(pose, s), *data))[0] - whiten(line_block(move_pose(pose, -s), *data))[0]) / 2e-6
-        for s in steps
-    ]
-    np.testing.assert_allclose(J, np.stack(numeric, -1), atol=1e-5 * np.abs(J).max())

@@ -14,14 +14,13 @@ from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
 from lrfcal_lib.acquire.panel import (
     Panel,
-    SweepPicture,
-    TopView,
     error_html,
     jpeg,
     lights_html,
     png,
-    reach_of,
     result_html,
+    scan_picture,
+    sweep_picture,
 )
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
@@ -121,7 +120,7 @@ def test_stop_ends_a_capture_and_nothing_of_it_counts(connected):
     def stop_at_third(share, text):
         if text.startswith("stop 3"):
             threads.append(in_background(connected.stop))
-            connected._stopped.wait(WAIT_S)
+            connected.stopped.wait(WAIT_S)
 
     threads, head = [], connected.rig.head
     with pytest.raises(Interrupted, match="placement 1 does not count"):
@@ -265,36 +264,36 @@ def test_data_without_a_board_give_no_calibration(connected):
 
 
 def test_a_scan_from_above_is_drawn_where_it_is():
-    view, bearings = TopView(VIEW, (400, 300)), np.radians([60.0, 90.0, 120.0])
-    empty = view.draw(np.array([1.5, np.nan, np.nan]) * np.nan, bearings)
-    middle, right = (view.draw(np.where(np.arange(3) == i, 1.5, np.nan), bearings) for i in (1, 0))
+    bearings = np.radians([60.0, 90.0, 120.0])
+    empty, middle, right = (scan_picture(ranges, bearings, VIEW) for ranges in np.where(
+        [[0, 0, 0], [0, 1, 0], [1, 0, 0]], 1.5, np.nan))  # fmt: skip
     painted = [np.argwhere((image != empty).any(axis=2)).mean(axis=0) for image in (middle, right)]
     assert painted[0][1] == pytest.approx(199.5, abs=1.5) and painted[1][1] > 240  # bearing 60 deg is to the right
     assert painted[0][0] < painted[1][0]  # straight ahead is up
-    far = view.draw(np.full(3, 7.0), bearings)
-    assert far.shape == (300, 400, 3) and (far != middle).any()
 
 
-@pytest.mark.parametrize("far, reach", [(0.5, 2.0), (3.5, 4.0), (81.0, 82.0), (300.0, 82.0)])
-def test_the_view_reaches_as_far_as_the_points(far, reach):
-    assert reach_of(np.column_stack([np.zeros(20), np.full(20, far)])) == reach
-    assert reach_of(np.zeros((0, 2))) == 2.0
+@pytest.mark.parametrize("near, far, same", [(0.5, 1.9, True), (0.5, 3.5, False), (81.0, 300.0, True)])
+def test_the_view_reaches_as_far_as_the_points(near, far, same):
+    bearing = np.full(20, np.pi / 2)
+    circles = [(scan_picture(np.full(20, r), bearing, VIEW)[:, 250:] for r in (near, far))]
+    assert all(np.array_equal(*pair) == same for pair in circles)
+    assert scan_picture(np.full(20, far), bearing, VIEW).shape == (300, 400, 3)
 
 
 def test_a_sweep_grows_line_by_line():
-    picture = SweepPicture(VIEW, np.radians([-10.0, 10.0]), np.radians(1.0), (400, 300))
-    bearings = np.linspace(*VIEW, 101)
-    empty = picture.draw({}, bearings)
-    ranges = np.full(101, 4.0)
+    bearings, ranges = np.linspace(*VIEW, 101), np.full(101, 4.0)
     ranges[80:] = 1.0  # near at the large bearings, which are on the left
-    high = picture.draw({np.radians(9.0): ranges}, bearings)
+
+    def drawn(rows):
+        return sweep_picture(rows, bearings, VIEW, np.radians([-10.0, 10.0]), np.radians(1.0))
+
+    empty, high, low = drawn({}), drawn({np.radians(9.0): ranges}), drawn({np.radians(-9.0): ranges})
     rows, columns = np.nonzero((high != empty).any(axis=2))
     assert rows.max() < 75 and columns.min() < 50 and columns.max() > 380
     left, right = high[rows[0] + 2, 60].astype(int), high[rows[0] + 2, 350].astype(int)
     assert left.sum() > right.sum() + 100  # near is bright
-    low = picture.draw({np.radians(-9.0): ranges}, bearings)
     assert np.nonzero((low != empty).any(axis=2))[0].min() > 200
-    nothing = picture.draw({0.0: np.full(101, np.nan)}, bearings)
+    nothing = drawn({0.0: np.full(101, np.nan)})
     assert (np.ptp(nothing[(nothing != empty).any(axis=2)], axis=1) == 0).all()  # grey
 
 
@@ -355,7 +354,7 @@ def panel(monkeypatch, tmp_path):
 def pressed(panel, name):
     """Press a button and wait until its work is done."""
     getattr(panel.parts, name).click()
-    panel._job.result(WAIT_S)
+    panel.job.result(WAIT_S)
     return panel.parts
 
 
@@ -426,18 +425,18 @@ def test_drivers_report_into_the_panel(panel):
     logging.getLogger("lrfcal_lib.drivers").warning("the head does not tell its tilt")
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
-    assert panel._notes not in logging.getLogger("lrfcal_lib").handlers
+    assert panel.notes not in logging.getLogger("lrfcal_lib").handlers
 
 
 def test_stop_ends_what_a_button_began(panel):
     panel.connect()
     begun = threading.Event()
     note = panel.collector._note
-    panel.collector._note = lambda *event: (note(*event), begun.set(), panel.collector._stopped.wait(WAIT_S))
+    panel.collector._note = lambda *event: (note(*event), begun.set(), panel.collector.stopped.wait(WAIT_S))
     panel.parts.capture.click()
     assert begun.wait(WAIT_S)
     panel.parts.stop.click()
-    panel._job.result(WAIT_S)
+    panel.job.result(WAIT_S)
     assert "does not count" in panel.parts.error.value and panel.collector.finished == ()
 
 

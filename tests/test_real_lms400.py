@@ -16,7 +16,7 @@ from lrfcal_lib.model.geometry import axis_difference, axis_of, lrf_to_platform,
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import transform_from_json
-from lrfcal_lib.solvers.planes import solve_zhang_pless
+from lrfcal_lib.solvers import solve_camera
 
 # the chessboard stereo transform of the authors' intrinsics and board poses, and its baseline
 PUBLISHED_STEREO_DEG, PUBLISHED_BASELINE_MM = (0.521, 0.292, -0.014), 117.72
@@ -63,12 +63,12 @@ def with_published_poses(obs, session):
 @pytest.mark.parametrize(("camera", "limit_mm"), [("left", 6.95), ("right", 7.10)])
 def test_zhang_pless_reproduces_the_published_calibration(published, camera, limit_mm):
     obs = published[camera]
-    solution = solve_zhang_pless(obs, weighted=False)
+    solution = solve_camera(obs, "zhang_pless", weighted=False)
     assert 1000 * tables.rms(plane_residuals_m(obs, solution.transform)) <= limit_mm
 
 
 def test_zhang_pless_reproduces_the_published_stereo(published):
-    left, right = (solve_zhang_pless(published[c], weighted=False).transform for c in ("left", "right"))
+    left, right = (solve_camera(published[c], "zhang_pless", weighted=False).transform for c in ("left", "right"))
     T_right_left = right * left.inv()
     assert 1000 * np.linalg.norm(T_right_left.translation) == pytest.approx(PUBLISHED_BASELINE_MM, abs=0.15)
     wanted = Rotation.from_rotvec(np.deg2rad(PUBLISHED_STEREO_DEG))

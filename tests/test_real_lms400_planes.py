@@ -5,13 +5,13 @@ import re
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import bare_observations
 
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
-from lrfcal_lib.solvers.planes import solve_zhang_pless
 
 HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])  # the authors' platform
 
@@ -51,7 +51,7 @@ def cameras(real_data, sweeps):
     for side in ("left", "right"):
         model, poses = published(real_data / "lms400_zed", side)
         points = lrf_to_platform(sweeps.points, sweeps.pitch, HEAD)
-        found[side] = bare_observations(
+        found[side] = CameraObservations(
             model,
             camera=side,
             source="platform",
@@ -66,7 +66,7 @@ def cameras(real_data, sweeps):
 
 
 def test_zhang_pless_reaches_the_reference(cameras):
-    found = {side: solve_zhang_pless(obs, weighted=False).transform for side, obs in cameras.items()}
+    found = {side: solve_camera(obs, "zhang_pless", weighted=False).transform for side, obs in cameras.items()}
     rms = {side: 1000 * np.sqrt(np.mean(plane_residuals_m(obs, found[side]) ** 2)) for side, obs in cameras.items()}
     assert rms["left"] == pytest.approx(6.90, abs=0.01) and rms["right"] == pytest.approx(7.05, abs=0.01)
     stereo = found["right"] * found["left"].inv()
@@ -76,7 +76,7 @@ def test_zhang_pless_reaches_the_reference(cameras):
 
 def test_weights_leave_the_planes_about_as_well_fitted(cameras):
     for side, limit in (("left", 7.1), ("right", 7.25)):
-        found = solve_zhang_pless(cameras[side])
+        found = solve_camera(cameras[side], "zhang_pless")
         assert 1000 * np.sqrt(np.mean(plane_residuals_m(cameras[side], found.transform) ** 2)) < limit
         assert np.all(found.sigma_placements[3:] > 3 * found.sigma[3:])  # errors are common to a placement
 

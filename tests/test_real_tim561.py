@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import scipy.io
-from synthetic import bare_observations
 
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.model.camera import CameraModel, line_through
-from lrfcal_lib.solvers.lines import find_outlying_placements, solve_lines, solve_wasielewski_strauss
-from lrfcal_lib.solvers.planes import start_from_lines
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers import find_outlying_placements, solve_camera
+from lrfcal_lib.solvers.lines import start_from_lines
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def obs(real_data):
         for n in range(3):  # column n belongs to row 4 - n (both from 1); x, 0, z turns into our x, y, 0
             points.append([hits[0, n], hits[2, n], 0.0])
             lines.append(line_through(ends[2 - n, :2], ends[2 - n, 2:]))
-    return bare_observations(
+    return CameraObservations(
         CameraModel(1280, 1024, 726.928, 780.887, 641.600, 476.630),
         crossing_points=np.array(points),
         crossing_covariance=np.tile(np.diag([1e-4, 1e-4, 0.0]), (69, 1, 1)),
@@ -29,7 +29,6 @@ def obs(real_data):
         crossing_line_sigma=np.ones(69),
         crossing_placement=np.repeat(np.arange(23), 3),
         crossing_edge=np.tile(["1", "2", "3"], 23),
-        crossing_across=np.zeros(69, bool),
     )
 
 
@@ -40,7 +39,7 @@ def rms_px(obs, solution):
 @pytest.mark.parametrize("frames, expected", [(20, 3.528), (23, 3.845)])
 def test_line_constraint_reaches_the_reference(obs, frames, expected):
     some = obs.select(range(frames))
-    found = solve_lines(some, weighted=False)
+    found = solve_camera(some, weighted=False)
     assert found.converged and rms_px(some, found) == pytest.approx(expected, abs=1e-3)
 
 
@@ -52,8 +51,8 @@ def test_it_starts_without_a_guess(obs):
 
 def test_weighted_and_spatial_variants_stay_near(obs):
     some = obs.select(range(20))
-    assert rms_px(some, solve_lines(some)) < 4.1
-    assert rms_px(some, solve_wasielewski_strauss(some)) < 4.1
+    assert rms_px(some, solve_camera(some)) < 4.1
+    assert rms_px(some, solve_camera(some, "wasielewski_strauss")) < 4.1
 
 
 def test_frame_21_is_flagged(obs):

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import scipy.io
-from synthetic import bare_observations
 
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.solvers.lines import find_outlying_placements
-from lrfcal_lib.solvers.planes import solve_zhang_pless
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +17,7 @@ def obs(real_data):
     poses = np.moveaxis(demo["Planes"].astype(float), 2, 0).copy()
     poses[:, :3, 3] /= 1000
     points = np.concatenate([np.column_stack([scan, np.zeros(len(scan))]) for scan in scans])
-    return bare_observations(
+    return CameraObservations(
         CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0),
         plane_points=points,
         plane_covariance=np.tile(0.01**2 * np.eye(3), (len(points), 1, 1)),
@@ -34,7 +33,7 @@ def rms_mm(obs, solution):
 
 
 def test_all_twelve_planes_disagree(obs):
-    assert rms_mm(obs, solve_zhang_pless(obs)) == pytest.approx(39.57, abs=0.01)
+    assert rms_mm(obs, solve_camera(obs, "zhang_pless")) == pytest.approx(39.57, abs=0.01)
 
 
 def test_gross_outliers_are_found_untold(obs):
@@ -42,17 +41,17 @@ def test_gross_outliers_are_found_untold(obs):
     assert report.outlying == (3, 5)
     assert report.rms[[2, 4]].min() > 0.1
     inliers = obs.select(report.inliers)
-    assert rms_mm(inliers, solve_zhang_pless(inliers)) < 5.76
+    assert rms_mm(inliers, solve_camera(inliers, "zhang_pless")) < 5.76
 
 
 def test_nine_inliers_give_the_reference(obs):
     inliers = obs.select([1, 2, 4, 6, 7, 8, 10, 11, 12])
-    found = solve_zhang_pless(inliers)
+    found = solve_camera(inliers, "zhang_pless")
     assert rms_mm(inliers, found) == pytest.approx(5.7558, abs=1e-3)
     np.testing.assert_allclose(1000 * found.transform.translation, [1470.28, 434.34, 118.20], atol=0.05)
 
 
 def test_a_robust_loss_reaches_the_same(obs):
-    found = solve_zhang_pless(obs, loss="cauchy", scale="auto")
+    found = solve_camera(obs, "zhang_pless", loss="cauchy", scale="auto")
     inliers = obs.select([1, 2, 4, 6, 7, 8, 9, 10, 11, 12])
     assert rms_mm(inliers, found) < 5.9

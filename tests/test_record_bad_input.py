@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lrfcal_lib.emulators import EmulatedRig
-from lrfcal_lib.emulators.rig import practice_setup, quick_file
+from lrfcal_lib.emulators.rig import EmulatedRig, practice_setup, quick_file
 from lrfcal_lib.session.read import open_session, validate
 
 DEADLINE = 120.0  # s, against hanging
@@ -107,11 +106,11 @@ def stands_still(rig):
 
 
 def swapped(data, rig):
-    data["devices"]["lrf"]["port"], data["devices"]["head"]["port"] = rig.head_port, rig.lrf_port
+    data["devices"]["lrf"]["port"], data["devices"]["head"]["port"] = rig.pan_tilt.path, rig.lrf.path
 
 
 def shared(data, rig):
-    data["devices"]["lrf"]["port"] = rig.head_port
+    data["devices"]["lrf"]["port"] = rig.pan_tilt.path
 
 
 def missing(data, rig):

@@ -258,14 +258,14 @@ def test_median_filter_is_the_median_of_what_exists():
             assert out[line, beam] == np.nanmedian(taken[line, max(beam - 2, 0) : beam + 3])
         else:
             assert np.isnan(out[line, beam])
-    np.testing.assert_array_equal(board_in_scan.median_filter(ranges, width=1), ranges)
-    assert np.isnan(board_in_scan.median_filter(np.full((2, 3), np.nan))).all()
+    np.testing.assert_array_equal(board_in_scan.median_filter(ranges, True, 1), ranges)
+    assert np.isnan(board_in_scan.median_filter(np.full((2, 3), np.nan), True)).all()
 
 
 @pytest.mark.parametrize("width", [0, 4, -1])
 def test_median_filter_needs_an_odd_width(width):
     with pytest.raises(ValueError, match=f"odd and positive, got {width}"):
-        board_in_scan.median_filter(np.ones((1, 5)), width=width)
+        board_in_scan.median_filter(np.ones((1, 5)), True, width)
 
 
 def test_lines_are_fitted_exactly_and_outliers_do_not_count():
@@ -298,13 +298,6 @@ def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
     assert len(rows) * 0.95 <= b.n_jump_points <= len(rows) * 1.1
     before, after = board_in_scan.count_jump_points(b)
     assert before == b.n_jump_points and after < 0.05 * before
-    profile = board_in_scan.edge_profile(b, rows[30], +1, 10)
-    assert len(profile.bearings) == 21
-    assert np.isfinite(profile.fitted[:11]).all() and np.isnan(profile.fitted[11:]).all()
-    assert abs(profile.original[11] - profile.original[10]) > 0.3
-    assert np.abs(profile.filtered[:11] - profile.fitted[:11]).max() < 0.02
-    with pytest.raises(ValueError, match="scan line 0 of placement 1 does not hit the board"):
-        board_in_scan.edge_profile(b, 0)
 
 
 # ---------------------------------------------------------------------------------------------- edges
@@ -582,7 +575,7 @@ def test_face_points_lie_on_the_face_and_away_from_the_edges():
 
 @pytest.mark.parametrize("function", [edges_in_scan.edge_points, edges_in_scan.sweep_edges])
 def test_another_variant_is_refused(function):
-    with pytest.raises(ValueError, match="variant is one of half_step, last_beam, got 'middle'"):
+    with pytest.raises(ValueError, match="variant is one of last_beam, half_step, got 'middle'"):
         function(found(scene()), "middle")
 
 

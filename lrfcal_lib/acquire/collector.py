@@ -33,22 +33,12 @@ GUIDE = (
 
 @dataclass(frozen=True)
 class Task:
-    """What is recorded next.
-
-    Attributes
-    ----------
-    title : str
-    guidance : str
-        Where to put the board.
-    placement : Placement or None
-    close : (str, int) or None
-        Camera and number of a view of the board held close, for its intrinsics.
-    """
+    """What is recorded next."""
 
     title: str
-    guidance: str
+    guidance: str  # where to put the board
     placement: object = None
-    close: tuple | None = None
+    close: tuple | None = None  # camera and number of a view of the board held close, for its intrinsics
 
 
 def next_task(recording, advice=""):
@@ -65,32 +55,21 @@ def next_task(recording, advice=""):
     Task or None
         None where the plan is done.
     """
-    views = recording.close_views_to_do()
-    return _close_task(recording, *views[0]) if views else _placement_task(recording, advice)
-
-
-def _close_task(recording, camera, view):
-    wanted = recording.rig.stated.plan.intrinsics_images
-    title = f"Close view {view + 1} of {wanted}, camera '{camera}'"
-    guidance = "hold the board close, tilted otherwise than before, all of its pattern in the image"
-    return Task(title, guidance, close=(camera, view))
-
-
-def _placement_task(recording, advice):
-    left, plan, finished = recording.to_do(), recording.rig.stated.plan, recording.finished
+    plan, finished = recording.rig.stated.plan, recording.finished
+    for camera, view in recording.close_views_to_do():
+        title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
+        guidance = "hold the board close, tilted otherwise than before, all of its pattern in the image"
+        return Task(title, guidance, close=(camera, view))
+    left = recording.to_do()
     if not left and not plan.placements:  # nothing is listed: one more can always be had
-        left = [p for p in plan.to_do(max(finished) + 1) if p.number not in finished][:1]
+        left = [p for p in plan.to_do(max(finished) + 1) if p.number not in finished]
     if not left:
         return None
-    of, done = max(len(recording.plan), left[0].number), sum(p.number in finished for p in recording.plan)
-    return Task(f"Placement {done + 1} of {of}", _where(left[0], done, advice), left[0])
-
-
-def _where(placement, done, advice):
-    """Where to put the board, in words."""
-    if placement.purpose == "scene":
-        return "take the board away: this sweep shows the room"
-    return advice or f"put the board {GUIDE[done % len(GUIDE)]}"
+    done = sum(p.number in finished for p in recording.plan)
+    guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
+    if left[0].purpose == "scene":
+        guidance = "take the board away: this sweep shows the room"
+    return Task(f"Placement {done + 1} of {max(len(recording.plan), left[0].number)}", guidance, left[0])
 
 
 METHOD = "line"  # the paper's, beside the joint estimate
@@ -123,55 +102,27 @@ class Result:
 
 
 def calibrate_recording(path):
-    """Calibrate a session that may still be growing, and write ``<session>_calibration/calibration.json`` beside it.
+    """The Result of a session that may still be growing, with ``<session>_calibration/calibration.json`` beside it.
 
-    Parameters
-    ----------
-    path : path-like
-        Folder of the session.
-
-    Returns
-    -------
-    Result
-
-    Raises
-    ------
-    ValueError
-        If the session cannot be used.
+    ValueError if the session cannot be used.
     """
-    path = Path(path)
     found = calibrate(open_session(path), [METHOD])
-    judged = judge(found)
+    judged, poses = judge(found), {}
     if not judged.errors:
         return Result(judged.answer, (*judged.sentences(), "Nothing is written."), "", {}, None, found)
     method = handed_over(found)
-    file = path.with_name(f"{path.name}_calibration") / "calibration.json"
-    write_calibration(file, calibration_record(found, method, judged))
-    return Result(judged.answer, tuple(judged.sentences()), method, poses(found, method), file, found)
-
-
-def poses(found, method):
-    """Poses of the cameras as numbers, see :class:`Result`."""
-    out = {}
     for (camera, name), solution in found.solutions.items():
         if name == method:
-            sigma, scale = solution.trusted_sigma[:6], np.repeat([np.degrees(1), 1000.0], 3)
-            values = scale * np.concatenate([solution.transform.rotation.as_rotvec(), solution.transform.translation])
-            out[camera] = (values[:3], values[3:], *np.split(scale * sigma, 2))
-    return out
+            scale, pose = np.repeat([np.degrees(1), 1000.0], 3), solution.transform
+            values = np.concatenate([pose.rotation.as_rotvec(), pose.translation, solution.trusted_sigma[:6]])
+            poses[camera] = tuple((values.reshape(2, 6) * scale).reshape(4, 3))
+    file = path.with_name(f"{path.name}_calibration") / "calibration.json"
+    write_calibration(file, calibration_record(found, method, judged))
+    return Result(judged.answer, tuple(judged.sentences()), method, poses, file, found)
 
 
 def advise(session):
-    """What the next placement should add, in a sentence; '' where all is known well enough.
-
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    str
-    """
+    """What the next placement should add, in a sentence; '' where all is known well enough."""
     prepared = prepare(session)
     try:
         solution = calibrate_jointly(prepared).solution
@@ -200,38 +151,22 @@ class Interrupted(RuntimeError):
 
 @dataclass
 class View:
-    """What the rig sees.
+    """What the rig sees."""
 
-    Attributes
-    ----------
-    ranges, bearings : ndarray, shape (B,), or None
-        Of the newest scan, metres and radians.
-    pitch : float
-        Of the head, radians.
-    measured : bool
-        The head tells its pitch.
-    frames : dict of str to Frame
-        Newest images.
-    rows : dict of float to ndarray, shape (B,)
-        Ranges by pitch, of the placement being recorded or recorded last.
-    trouble : str
-        What cannot be seen, and why.
-    """
-
-    ranges: np.ndarray | None = None
-    bearings: np.ndarray | None = None
-    pitch: float = 0.0
-    measured: bool = False
-    frames: dict = field(default_factory=dict)
-    rows: dict = field(default_factory=dict)
-    trouble: str = ""
+    ranges: np.ndarray | None = None  # (B,), of the newest scan, metres
+    bearings: np.ndarray | None = None  # (B,), radians
+    pitch: float = 0.0  # of the head, radians
+    measured: bool = False  # the head tells its pitch
+    frames: dict = field(default_factory=dict)  # newest Frame by camera
+    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement being recorded or recorded last
+    trouble: str = ""  # what cannot be seen, and why
 
 
 class Collector:
     """Connects a rig, records placements with it and calibrates what was recorded; a context manager.
 
-    All methods may be called from any thread; two that need the devices exclude each other. :meth:`stop` works at any
-    time.
+    All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
+    at any time. What needs a rig raises DeviceError without one.
 
     Parameters
     ----------
@@ -246,19 +181,24 @@ class Collector:
     recording : Recording or None
     """
 
+    connected = property(lambda self: self.rig is not None, doc="Whether a rig is open.")
+    emulated = property(lambda self: self.connected and self.rig.stated.control is not None,
+                        doc="Whether the board moves by itself.")  # fmt: skip
+    limits_deg = property(lambda self: self._needed().stated.head_settings.pitch_limits_deg,
+                          doc="Lowest and highest pitch of the head.")  # fmt: skip
+    finished = property(lambda self: () if self.recording is None else self.recording.finished,
+                        doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
+
     def __init__(self, *, advice=True):
         self.advice, self.rig, self.recording = advice, None, None
-        self.view, self.lights = View(), {}
-        self._devices, self._stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
-        self._told = ""
+        self.view, self.lights, self._told = View(), {}, ""
+        self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
 
     def __enter__(self):
         return self
 
     def __exit__(self, *error):
         self.close()
-
-    # ------------------------------------------------------------------------------------------ connect and close
 
     def connect(self, rig, session):
         """Open a rig and a session; a session that was recorded with the same rig goes on.
@@ -278,12 +218,20 @@ class Collector:
             If a device does not open; those opened before are closed again.
         SessionError, RecordingError
             If the session states another rig, or cannot be written.
-        Busy
-            If something is under way.
         """
         self.close()
         with self._own(), contextlib.ExitStack() as stack:
-            stated, clock = _stated(rig, stack)
+            if str(rig) in PRACTICE_RIGS:
+                from lrfcal_lib.emulators.rig import emulated
+
+                made, data, clock = emulated(str(rig))
+                stack.enter_context(made)
+                stated = checked(rig_of(data(), Path(f"emulated {made.setup.name}")))
+            elif not Path(rig).suffix and not Path(rig).exists():
+                known = ", ".join(PRACTICE_RIGS)
+                raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
+            else:
+                stated, clock = read_rig_file(rig), time.time
             opened = stack.enter_context(Rig.open(stated, clock=clock))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig, self.recording, self._closing = opened, recording, stack.pop_all()
@@ -292,10 +240,7 @@ class Collector:
     def close(self):
         """Stop the head, finish the session, close all devices; a second call does nothing.
 
-        Raises
-        ------
-        RecordingError
-            If the session cannot be finished; the devices are closed all the same.
+        RecordingError if the session cannot be finished; the devices are closed all the same.
         """
         if self.rig is None:
             return
@@ -307,26 +252,6 @@ class Collector:
                 rig.halt()
                 if recording.finished:
                     recording.finish()
-
-    @property
-    def connected(self):
-        """Whether a rig is open."""
-        return self.rig is not None
-
-    @property
-    def emulated(self):
-        """Whether the board moves by itself."""
-        return self.rig is not None and self.rig.stated.control is not None
-
-    @property
-    def limits_deg(self):
-        """Lowest and highest pitch of the head."""
-        return self._needed().stated.head_settings.pitch_limits_deg
-
-    @property
-    def finished(self):
-        """Numbers of the placements that are recorded and safe."""
-        return () if self.recording is None else self.recording.finished
 
     @contextlib.contextmanager
     def _own(self):
@@ -343,54 +268,52 @@ class Collector:
             raise DeviceError("no rig is connected: name a rig file or an emulated rig, and press connect")
         return self.rig
 
-    # ------------------------------------------------------------------------------------------------- the head
-
     def move_to(self, pitch):
-        """Move the head to a pitch, radians; returns where it settled.
-
-        Raises
-        ------
-        OutOfRange, DeviceError
-        Busy
-        """
+        """Move the head to a pitch, radians; returns where it settled. OutOfRange beyond its limits."""
         rig = self._needed()
         with self._own():
-            self._stopped.clear()
-            self.view.pitch = rig.head.move_to(pitch)
-            self.view.measured = rig.head.has_feedback
+            self.stopped.clear()
+            self.view.pitch, self.view.measured = rig.head.move_to(pitch), rig.head.has_feedback
         return self.view.pitch
 
     def stop(self):
         """Stop the head at once, and whatever was under way; returns when it has ended."""
-        rig = self.rig
+        rig, end = self.rig, time.monotonic() + WAIT_S
         if rig is None:
             return
-        self._stopped.set()
+        self.stopped.set()
         rig.head.emergency_stop()
-        end = time.monotonic() + WAIT_S
         while not self._devices.acquire(timeout=AGAIN_S):
             rig.head.emergency_stop()  # the next move of a sweep may have begun in between
             if time.monotonic() > end:
                 return
         self._devices.release()
 
-    # --------------------------------------------------------------------------------------------- live view
-
     def look(self):
-        """Look at the rig, unless it is busy: then what it records is in `view` already.
+        """The View of the rig, unless it is busy: then what it records is in `view` already.
 
-        Returns
-        -------
-        View
-            What could not be read is said in `trouble`; nothing is raised for it.
+        What could not be read is said in `trouble`; nothing is raised for it.
         """
-        rig, view = self.rig, self.view
+        rig, view, troubles = self.rig, self.view, []
         if rig is None:
             return view
-        troubles = [text for name, camera in rig.cameras.items() if (text := _newest(camera, name, view.frames))]
+        for name, camera in rig.cameras.items():
+            try:
+                view.frames[name] = camera.newest(timeout=0)
+            except LineLost as error:
+                view.frames.pop(name, None)
+                troubles.append(str(error))
+            except DeviceError:  # there is none yet
+                continue
         if self._devices.acquire(blocking=False):
             try:
-                self._look(rig, view)
+                view.pitch, view.measured = rig.head.pitch()
+                try:
+                    reading = rig.lrf.request()
+                except LineLost:
+                    rig.lrf.reconnect(RECONNECT_S)
+                    reading = rig.lrf.request()
+                view.ranges, view.bearings = reading.ranges, reading.bearings
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -398,34 +321,16 @@ class Collector:
         view.trouble = "; ".join(troubles)
         return view
 
-    @staticmethod
-    def _look(rig, view):
-        view.pitch, view.measured = rig.head.pitch()
-        try:
-            reading = rig.lrf.request()
-        except LineLost:
-            rig.lrf.reconnect(RECONNECT_S)
-            reading = rig.lrf.request()
-        view.ranges, view.bearings = reading.ranges, reading.bearings
-
-    # --------------------------------------------------------------------------------------------- recording
-
     def task(self):
-        """What to record next.
-
-        Returns
-        -------
-        Task or None
-            None where the plan is done.
-        """
+        """What to record next, a Task; None where the plan is done."""
         return None if self.recording is None else next_task(self.recording, self._told)
 
-    def capture(self, progress=None):
+    def capture(self, progress=lambda share, text: None):
         """Record the next task; the board is where it should be, or an emulated rig puts it there.
 
         Parameters
         ----------
-        progress : callable, optional
+        progress : callable
             ``progress(share, text)`` after every event.
 
         Returns
@@ -437,33 +342,34 @@ class Collector:
         ------
         Interrupted
             If it was stopped: the placement does not count.
-        DeviceError, RecordingError, Busy
+        DeviceError, RecordingError
         """
         self._needed()
-        task, progress = self.task(), progress or (lambda share, text: None)
+        task = self.task()
         if task is None:
             raise RecordingError("the plan of this rig is done: calibrate, or connect with another session")
         with self._own():
-            self._stopped.clear()
+            self.stopped.clear()
             if task.close:
                 self.rig.hold_close(*task.close)
                 return [self.recording.run_close(task.close[0])]
-            self.rig.move_board(task.placement.number)
-            self._sweep(task.placement, progress)
-        return self._checked(task.placement.number, progress)
-
-    def _sweep(self, placement, progress):
-        self.view.rows = {}
-        with contextlib.closing(self.recording.run(placement)) as events:
-            try:
-                for event in events:
-                    self._note(event, progress)
-                    if self._stopped.is_set():
-                        raise DeviceError("stopped")
-            except DeviceError as error:
-                if not self._stopped.is_set():
-                    raise
-                raise Interrupted(f"stopped: placement {placement.number} does not count, record it again") from error
+            number, self.view.rows = task.placement.number, {}
+            self.rig.move_board(number)
+            with contextlib.closing(self.recording.run(task.placement)) as events:
+                try:
+                    for event in events:
+                        self._note(event, progress)
+                        if self.stopped.is_set():
+                            raise DeviceError("stopped")
+                except DeviceError as error:
+                    if not self.stopped.is_set():
+                        raise
+                    raise Interrupted(f"stopped: placement {number} does not count, record it again") from error
+        progress(1.0, "checking what was recorded")
+        scenes = {placement.number for placement in self.recording.plan if placement.purpose == "scene"}
+        advice = self._advise if self.advice and len({*self.finished} - scenes) >= ADVICE_FROM else None
+        self.lights[number] = self.recording.check(number, advice)
+        return self.lights[number]
 
     def _note(self, event, progress):
         """Put an event into the view."""
@@ -472,21 +378,13 @@ class Collector:
             view.pitch, view.measured = event.pitch, event.measured
             progress((event.number - 1) / event.of, f"stop {event.number} of {event.of}")
         elif isinstance(event, Scanned):
-            for reading, pitch in zip(event.readings, event.pitch, strict=True):
-                view.rows[float(pitch)] = reading.ranges
-                view.ranges, view.bearings, view.pitch = reading.ranges, reading.bearings, float(pitch)
+            for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
+                view.rows[pitch] = reading.ranges
+                view.ranges, view.bearings, view.pitch = reading.ranges, reading.bearings, pitch
             if np.isfinite(event.share):
                 progress(event.share, f"{100 * event.share:.0f} % of the sweep")
         elif isinstance(event, Photographed):
             view.frames[event.camera] = event.frame
-
-    def _checked(self, number, progress):
-        """Lights of a placement, and what the next one should add."""
-        progress(1.0, "checking what was recorded")
-        scenes = {placement.number for placement in self.recording.plan if placement.purpose == "scene"}
-        advice = self._advise if self.advice and len({*self.finished} - scenes) >= ADVICE_FROM else None
-        self.lights[number] = self.recording.check(number, advice)
-        return self.lights[number]
 
     def _advise(self, session):
         self._told = advise(session)
@@ -495,10 +393,7 @@ class Collector:
     def again(self):
         """Take the placement recorded last out of the session, to record it again; returns its number.
 
-        Raises
-        ------
-        RecordingError
-            If there is none.
+        RecordingError if there is none.
         """
         self._needed()
         if not self.finished:
@@ -510,44 +405,11 @@ class Collector:
         return number
 
     def calibrate(self):
-        """Calibrate what was recorded so far; the recording can go on afterwards.
+        """The Result of what was recorded so far; the recording can go on afterwards.
 
-        Returns
-        -------
-        Result
-
-        Raises
-        ------
-        RecordingError
-            If nothing was recorded yet.
-        ValueError
-            If it does not determine a calibration.
+        RecordingError if nothing was recorded yet, ValueError if it does not determine a calibration.
         """
         self._needed()
         if not self.finished:
             raise RecordingError("nothing was recorded yet: capture at least three placements of the board")
         return calibrate_recording(self.recording.path)
-
-
-def _stated(rig, stack):
-    """A RigFile and the host clock; an emulated rig is started, and ends with the stack."""
-    if str(rig) not in PRACTICE_RIGS:
-        if not Path(rig).suffix and not Path(rig).exists():
-            raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {', '.join(PRACTICE_RIGS)}")
-        return read_rig_file(rig), time.time
-    from lrfcal_lib.emulators.rig import emulated
-
-    rig, data, clock = emulated(str(rig))
-    stack.enter_context(rig)
-    return checked(rig_of(data(), Path(f"emulated {rig.setup.name}"))), clock
-
-
-def _newest(camera, name, frames):
-    """Put the newest frame of a camera into a dict; returns why there is none, ''."""
-    try:
-        frames[name] = camera.newest(timeout=0)
-    except DeviceError as error:
-        if isinstance(error, LineLost):
-            frames.pop(name, None)
-            return str(error)
-    return ""

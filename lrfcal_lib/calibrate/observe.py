@@ -15,10 +15,9 @@ from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
-from lrfcal_lib.solvers.lines import find_outlying_placements
-from lrfcal_lib.solvers.planes import solve_zhang_pless
 from lrfcal_lib.solvers.platform import PlatformObservations
 
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
@@ -286,7 +285,7 @@ def rough_poses(prepared):
         obs = observe(prepared, camera)
         try:
             judged = find_outlying_placements(obs, "planes")
-            rough[camera] = solve_zhang_pless(obs.select(judged.inliers)).transform
+            rough[camera] = solve_camera(obs.select(judged.inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
             problems[f"camera {camera}"] = str(error)
             continue

@@ -25,7 +25,7 @@ from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import stereo_check
 from lrfcal_lib.session.cache import cached
-from lrfcal_lib.solvers import METHODS
+from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
 from lrfcal_lib.solvers.platform import solve_platform, solve_projected
@@ -323,14 +323,15 @@ def axis_from_chart(parameters):
     return geometry.TiltAxis(direction, np.array([-(direction[1] * y + direction[2] * z) / direction[0], y, z]))
 
 
-def calibrate_cameras(observations, methods=tuple(METHODS)):
+def calibrate_cameras(observations, methods=METHODS):
     """Calibrate every camera by every method.
 
     Parameters
     ----------
     observations : dict of (str, str) to CameraObservations
         Of :func:`observe_all`.
-    methods : sequence of str
+    methods : iterable of str
+        Of :data:`lrfcal_lib.solvers.METHODS`.
 
     Returns
     -------
@@ -342,9 +343,8 @@ def calibrate_cameras(observations, methods=tuple(METHODS)):
     solutions, problems = {}, {}
     for camera in dict.fromkeys(camera for camera, _ in observations):
         for name in methods:
-            method = METHODS[name]
             try:
-                solutions[camera, name] = method.solve(observations[camera, method.variant])
+                solutions[camera, name] = solve_camera(observations[camera, METHODS[name].variant], name)
             except DegenerateGeometry as error:
                 problems[camera, name] = str(error)
     return solutions, problems

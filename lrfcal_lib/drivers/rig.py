@@ -452,7 +452,7 @@ def _open_lrf(stated, **given):
     options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
     if "password" in asked:
         options["password"] = asked["password"].encode()
-    lrf = LMS2xx.open(asked["port"], **options, **given)
+    lrf = LMS2xx(asked["port"], **options, **given)
     try:
         if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
             lrf.set_variant(*asked["variant"])

@@ -15,7 +15,8 @@ import select
 import termios
 import threading
 import tty
-from collections import Counter
+from collections import Counter, defaultdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,30 +26,18 @@ from lrfcal_lib.drivers.host import REAL, VirtualHost
 from lrfcal_lib.drivers.port import PortError
 
 RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-CHUNK_S = 0.005  # bytes that are due within this time are written at once
+CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LONGEST_WAIT_S = 0.25
 CLOSED_LOOK_S = 0.02  # how often to see whether somebody opened the port
 FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
 DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
 ROOM = 4095  # bytes that a port keeps until they are read
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
+SENDING = "sending"  # tag of what is planned for the bytes on their way out
 
 
 class Clock:
-    """Time of the emulated devices.
-
-    Parameters
-    ----------
-    scale : float
-        Seconds of the devices in a second of the host, 8 at most.
-    machine : Host
-        Whose time that is.
-
-    Raises
-    ------
-    ValueError
-        For a scale that no rig can be run at.
-    """
+    """Time of the emulated devices, which runs `scale` times (8 at most) as fast as that of a machine (a Host)."""
 
     def __init__(self, scale=1.0, machine=REAL):
         if not 0 < scale <= FASTEST:
@@ -69,31 +58,38 @@ class Clock:
 
 
 class Fault(NamedTuple):
-    """What can go wrong: 'lrf' or 'head' or both, what happens, and to bytes: (data, place, rng) -> data."""
+    """What can go wrong: with 'lrf', 'head' or both, what happens, and to bytes: (data, place, rng) -> data."""
 
     devices: tuple
     text: str
     change: object = None
 
 
+def _drop(d, i, _):
+    return d[:i] + d[i + 1 :]
+
+
+def _flip(d, i, rng):
+    return d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]
+
+
 BOTH, LMS, HEAD = ("lrf", "head"), ("lrf",), ("head",)
 FAULTS = {
     # on the bytes of a reply
-    "drop": Fault(BOTH, "a byte of a reply is lost", lambda d, i, rng: d[:i] + d[i + 1 :]),
-    "flip": Fault(BOTH, "a bit of a reply is inverted",
-                  lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
-    "duplicate": Fault(BOTH, "a byte of a reply comes twice", lambda d, i, rng: d[: i + 1] + d[i:]),
+    "drop": Fault(BOTH, "a byte of a reply is lost", _drop),
+    "flip": Fault(BOTH, "a bit of a reply is inverted", _flip),
+    "duplicate": Fault(BOTH, "a byte of a reply comes twice", lambda d, i, _: d[: i + 1] + d[i:]),
     "insert": Fault(BOTH, "a byte appears within a reply", lambda d, i, rng: d[: i + 1] + rng.bytes(1) + d[i + 1 :]),
     "swap": Fault(BOTH, "two neighbouring, different bytes of a reply change places",
-                  lambda d, i, rng: d[:i] + d[i + 1 : i + 2] + d[i : i + 1] + d[i + 2 :]),
+                  lambda d, i, _: d[:i] + d[i : i + 2][::-1] + d[i + 2 :]),
     "blank": Fault(BOTH, "up to four bytes of a reply arrive as zero",
-                   lambda d, i, rng: d[:i] + bytes(len(d[i : i + 4])) + d[i + 4 :]),
-    "cut": Fault(BOTH, "a reply ends early", lambda d, i, rng: d[:i]),
-    "headless": Fault(BOTH, "a reply lacks its beginning", lambda d, i, rng: d[i + 1 :]),
+                   lambda d, i, _: d[:i] + bytes(len(d[i : i + 4])) + d[i + 4 :]),
+    "cut": Fault(BOTH, "a reply ends early", lambda d, i, _: d[:i]),
+    "headless": Fault(BOTH, "a reply lacks its beginning", lambda d, i, _: d[i + 1 :]),
     "noise": Fault(BOTH, "1 to 20 bytes of noise come before a reply",
-                   lambda d, i, rng: rng.bytes(int(rng.integers(1, 21))) + d),
+                   lambda d, _, rng: rng.bytes(int(rng.integers(1, 21))) + d),
     "checksum": Fault(BOTH, "a reply has the wrong checksum",
-                      lambda d, i, rng: d[:-1] + bytes([d[-1] ^ int(rng.integers(1, 256))])),
+                      lambda d, _, rng: d[:-1] + bytes([d[-1] ^ int(rng.integers(1, 256))])),
     "address": Fault(BOTH, "a reply with a sound checksum comes from another address"),
     "foreign": Fault(BOTH, "a sound reply that nobody asked for comes first"),
     "length": Fault(LMS, "a telegram states another length; its checksum fits the bytes"),
@@ -104,10 +100,9 @@ FAULTS = {
     "twice": Fault(BOTH, "a reply is sent twice"),
     "stale": Fault(BOTH, "the previous reply of the same kind is sent in place of the present one"),
     # on the line
-    "request_drop": Fault(BOTH, "a byte that the host sends is lost", lambda d, i, rng: d[:i] + d[i + 1 :]),
-    "request_flip": Fault(BOTH, "a bit that the host sends is inverted",
-                          lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
-    "deaf": Fault(BOTH, "what the host sends does not arrive", lambda d, i, rng: b""),
+    "request_drop": Fault(BOTH, "a byte that the host sends is lost", _drop),
+    "request_flip": Fault(BOTH, "a bit that the host sends is inverted", _flip),
+    "deaf": Fault(BOTH, "what the host sends does not arrive", lambda *_: b""),
     "echo": Fault(BOTH, "what the host sends comes back to it first, as on two-wire RS-485"),
     "unplug": Fault(BOTH, "the port vanishes and comes back at the same path (after 0.5 s unless told otherwise)"),
     # in the laser range finder
@@ -130,86 +125,77 @@ REQUEST = ("request_drop", "request_flip", "deaf")
 REPLY = tuple(name for name, fault in FAULTS.items() if fault.change and name not in REQUEST)
 
 
+@dataclass
+class Armed:
+    """When a fault can still happen: `count` times, until an instant, by chance; `seconds` it is to take."""
+
+    count: int = 0
+    until: float = -math.inf
+    chance: float = 0.0
+    seconds: float | None = None
+
+
 class Faults:
-    """Switches of one device; all that is random follows from the seed.
+    """Switches of one device ('lrf' or 'head'); all that is random follows from the seed.
 
-    Parameters
-    ----------
-    device : {'lrf', 'head'}
-    seed : int
-    machine : Host
-    changed : callable
-        Told when a fault was injected.
-
-    Attributes
-    ----------
-    counts : collections.Counter
-        How often each kind was injected.
+    `counts`, a Counter, tells how often each was injected; `changed` is called when one was armed.
     """
 
     def __init__(self, device, seed=0, machine=REAL, changed=lambda: None):
         self.device, self.counts, self.changed, self._now = device, Counter(), changed, machine.now
         self.rng = np.random.default_rng([seed, *device.encode()])
-        self._lock, self._armed, self._until, self._chance, self._seconds = threading.Lock(), Counter(), {}, {}, {}
+        self._lock, self._switches = threading.Lock(), defaultdict(Armed)
 
-    def inject(self, name, count=1, *, seconds=None):
+    def inject(self, name, count=1, *, seconds=None, chance=0.0):
         """Arm a fault.
 
         Parameters
         ----------
         name : str
-            Key of `FAULTS`.
+            Key of `FAULTS`; ValueError for one that this device does not know.
         count : int
             It happens at that many opportunities (replies, requests, ...) from now on.
         seconds : float, optional
             At every opportunity for so long instead; for 'unplug' how long the port is away.
-
-        Raises
-        ------
-        ValueError
-            For a fault that this device does not know.
+        chance : float
+            At every opportunity with this probability instead, until it is cleared.
         """
-        self._known(name)
+        if name not in FAULTS or self.device not in FAULTS[name].devices:
+            known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
+            raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
         with self._lock:
-            if seconds is None or name == "unplug":
-                self._armed[name] += count
-                self._seconds[name] = seconds
+            switch = self._switches[name]
+            if chance:
+                switch.chance = chance
+            elif seconds is None or name == "unplug":
+                switch.count, switch.seconds = switch.count + count, seconds
             else:
-                self._until[name] = self._now() + seconds
+                switch.until = self._now() + seconds
         self.changed()
-
-    def chance(self, name, probability):
-        """Let a fault happen with a probability at every opportunity; 0 ends that."""
-        self._known(name)
-        self._chance[name] = probability
 
     def clear(self, name=None):
         """Disarm one fault, or all."""
         with self._lock:
-            for board in (self._armed, self._until, self._chance):
-                board.clear() if name is None else board.pop(name, None)
+            self._switches.clear() if name is None else self._switches.pop(name, None)
 
     @property
     def armed(self):
         """Names of the faults that can still happen, a set."""
         with self._lock:
-            left = {**self._armed, **{k: v for k, v in self._chance.items() if v}}
-            return {k for k, v in left.items() if v > 0} | {k for k, end in self._until.items() if end > self._now()}
+            return {k for k, s in self._switches.items() if s.count > 0 or s.chance or s.until > self._now()}
 
     def hit(self, name):
         """Whether the fault happens at this opportunity, which is then counted."""
         with self._lock:
-            armed, chance = self._armed[name] > 0, self._chance.get(name, 0)
-            hit = armed or self._now() < self._until.get(name, 0) or bool(chance) and self.rng.random() < chance
-            self._armed[name] -= armed
+            if name not in self._switches:
+                return False
+            switch = self._switches[name]
+            hit = switch.count > 0 or self._now() < switch.until
+            hit = hit or switch.chance > 0 and self.rng.random() < switch.chance
+            switch.count -= switch.count > 0
             if hit:
                 self.counts[name] += 1
             return hit
-
-    def seconds(self, name, default):
-        """How long the fault that was armed last is to take."""
-        seconds = self._seconds.get(name)
-        return default if seconds is None else seconds
 
     def mangle(self, data, names=REPLY):
         """Bytes as they are after those of the faults that hit them; each changes something where it can."""
@@ -219,10 +205,10 @@ class Faults:
                 data = next((changed for changed in tries if changed != data), data)
         return data
 
-    def _known(self, name):
-        if name not in FAULTS or self.device not in FAULTS[name].devices:
-            known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
-            raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
+    def away(self):
+        """Seconds that the port is away after the fault 'unplug' that was armed last."""
+        seconds = self._switches["unplug"].seconds
+        return AWAY_S if seconds is None else seconds
 
 
 def resample(data, sent, read):
@@ -230,35 +216,26 @@ def resample(data, sent, read):
 
     Frames without a stop bit read as zero, as Linux hands them over.
     """
-    if sent == read or not data or not sent or not read:
-        return data if sent == read else b""
+    if sent == read or not data or not read:
+        return data if read else b""
     frames = np.ones((len(data), 10), np.uint8)
     frames[:, 0] = 0
     frames[:, 1:9] = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")
-    level, ratio, out, at = frames.tobytes(), sent / read, bytearray(), 0.0
-
-    def sample(bits):
-        place = int(start + bits * ratio)
-        return level[place] if place < len(level) else 1
-
-    while (low := level.find(0, int(at))) >= 0:
-        start = max(low, at)
+    level, ratio, out, at = frames.ravel(), sent / read, bytearray(), 0.0
+    lows, places = np.flatnonzero(level == 0), (np.arange(10) + 0.5) * ratio
+    level = np.append(level, np.ones(math.ceil(10 * ratio) + 1, np.uint8))  # the line rests at 1
+    while (row := np.searchsorted(lows, int(at))) < len(lows):
+        start = max(lows[row], at)
+        bits = level[(start + places).astype(int)]
         at = start + 9.5 * ratio
-        if sample(0.5):  # too short for a start bit
+        if bits[0]:  # too short for a start bit
             at = start + max(0.5 * ratio, 1)
-        elif sample(9.5):
-            out.append(sum(sample(k + 1.5) << k for k in range(8)))
-        else:
+        elif bits[9]:
+            out += np.packbits(bits[1:9], bitorder="little").tobytes()
+        else:  # no stop bit: on with the next rise of the line
             out.append(0)
-            at = max(level.find(1, min(int(at), len(level))), 0) or len(level)
+            at = int(at) + int(np.argmax(level[int(at) :]))
     return bytes(out)
-
-
-class _Part:
-    """Bytes on their way out: not before `start`; `then` is called with the time at which the last is out."""
-
-    def __init__(self, start, data, then=None):
-        self.start, self.data, self.then, self.begun, self.sent = start, data, then, None, 0
 
 
 class SerialDevice:
@@ -279,6 +256,8 @@ class SerialDevice:
     faults : Faults
     counts : dict
         Bytes 'received', 'sent', 'lost' (buffer full), 'unheard' (port not open), 'garbled' (rates differ).
+    busy_until : float
+        When everything given so far has left.
     error : Exception or None
         What ended the device by itself.
     """
@@ -288,8 +267,9 @@ class SerialDevice:
         self.port = (_Memory if isinstance(clock.machine, VirtualHost) else _Terminal)(self)
         self.faults = Faults(kind, seed, clock.machine, self.port.wake)
         self.counts = dict.fromkeys(("received", "sent", "lost", "unheard", "garbled"), 0)
-        self._agenda, self._order, self._parts, self._last = [], itertools.count(), [], {}
-        self._free, self._heard, self._back = 0.0, 0.0, None
+        self._agenda, self._order, self._last, self.busy_until, self._heard = [], itertools.count(), {}, 0.0, 0.0
+
+    byte_s = property(lambda self: 10 / self.baudrate, doc="Seconds a byte takes.")
 
     def start(self):
         """Let the port appear."""
@@ -317,24 +297,18 @@ class SerialDevice:
 
     def abort(self):
         """Stop sending at once, in the middle of a reply if need be."""
-        self._parts, self._free = [], 0.0
-
-    @property
-    def busy_until(self):
-        """When everything given so far has left."""
-        end = self._free
-        for part in self._parts:
-            end = (max(part.start, end) if part.begun is None else part.begun) + len(part.data) * self.byte_s
-        return end
-
-    @property
-    def byte_s(self):
-        """Seconds a byte takes."""
-        return 10 / self.baudrate
+        self.cancel(SENDING)
+        self.busy_until = 0.0
 
     def write(self, data, at, then=None):
-        """Send bytes as they are, after those given before."""
-        self._parts.append(_Part(at, data, then))
+        """Send bytes as they are, after those given before; ``then(instant)`` is called when the last one is out."""
+        begin, byte_s = max(at, self.busy_until), self.byte_s
+        self.busy_until, some = begin + len(data) * byte_s, max(1, int(CHUNK_S * self.clock.scale / byte_s))
+        for first in range(0, len(data), some):
+            chunk = data[first : first + some]
+            self.at(begin + (first + len(chunk)) * byte_s, lambda _, chunk=chunk: self._put(chunk), SENDING)
+        if then is not None:
+            self.at(self.busy_until, then, SENDING)
 
     def reply(self, kind, data, at, then=None, burst=None, gap=0.0):
         """Send a reply, subject to faults.
@@ -353,48 +327,33 @@ class SerialDevice:
         """
         hit = self.faults.hit
         old, self._last[kind] = self._last.get(kind), data
-        data = old if old is not None and hit("stale") else data
-        data = self.faults.mangle(self.prepare(data))
+        data = self.faults.mangle(self.prepare(old if old is not None and hit("stale") else data))
         at += DELAY_S * hit("delay")
         if hit("silence"):
             data = b""
         for _ in range(1 + hit("twice")):
             if burst is None and len(data) > 1 and hit("pause"):
                 burst, gap = len(data) // 2, len(data) // 2 * self.byte_s + PAUSE_S
-            for first in range(0, max(1, len(data)), burst or max(1, len(data))):
-                self.write(data[first : first + (burst or len(data))], at + (first // burst * gap if burst else 0))
-        self._parts[-1].then = then
+            step = burst or len(data) or 1
+            for k, first in enumerate(range(0, len(data), step)):
+                self.write(data[first : first + step], at + k * gap)
+        self.write(b"", at, then)
 
     # -------------------------------------------------------------------------------------------- for the port
 
-    def wait_s(self):
-        """Seconds of the host until something is due."""
-        now, scale = self.clock.now(), self.clock.scale
-        due = self._agenda[0][0] if self._agenda else math.inf
-        if self._parts:
-            part = self._parts[0]
-            begun = part.begun if part.begun is not None else max(part.start, self._free)
-            due = min(due, begun + len(part.data) * self.byte_s, max(begun, now) + max(CHUNK_S * scale, self.byte_s))
-        back = math.inf if self._back is None else self._back - self.clock.machine.now()
-        return max(0.0, min((due - now) / scale, back))
-
     def due(self):
-        """The same as an instant of the host."""
-        return self.clock.machine.now() + self.wait_s()
+        """When something is to be done, as now() of the machine."""
+        due = self._agenda[0][0] if self._agenda else math.inf
+        return self.clock.machine.now() + max(0.0, (due - self.clock.now()) / self.clock.scale)
 
     def advance(self):
         """Do all that is due by now."""
         if self.port.there and self.faults.hit("unplug"):
             self.port.unplug()
-            self._back = self.clock.machine.now() + self.faults.seconds("unplug", AWAY_S)
-        if self._back is not None and self.clock.machine.now() >= self._back - SOON:
-            self._back = None
-            self.port.plug()
-        now = self.clock.now() + SOON
-        while self._agenda and self._agenda[0][0] <= now:
+            self.at(self.clock.now() + self.faults.away() * self.clock.scale, lambda _: self.port.plug())
+        while self._agenda and self._agenda[0][0] <= self.clock.now() + SOON:
             instant, _, action, _ = heapq.heappop(self._agenda)
             action(instant)
-        self._send(now)
 
     def hear(self, data):
         """Bytes that the host sends."""
@@ -411,25 +370,8 @@ class SerialDevice:
         self.counts["garbled"] += len(data) * (sent != read)
         return resample(data, sent, read)
 
-    def _send(self, now):
-        """Write the bytes that have left the device by now."""
-        while self._parts:
-            part = self._parts[0]
-            if part.begun is None:
-                part.begun = max(part.start, self._free)
-            end = part.begun + len(part.data) * self.byte_s
-            due = len(part.data) if now >= end else max(0, int((now - part.begun) / self.byte_s))
-            self._put(part.data[part.sent : due])
-            part.sent = max(due, part.sent)
-            if now < end:
-                return
-            self._free = end
-            self._parts.pop(0)
-            if part.then is not None:
-                part.then(end)
-
     def _put(self, data):
-        if not data or not self.port.open:
+        if not self.port.open:
             self.counts["unheard"] += len(data)
             return
         data = self._through(data, self.baudrate, self.port.rate)
@@ -463,8 +405,7 @@ class _Memory:
     def unplug(self):
         self._machine.ports.pop(self._device.path, None)
         if self.open:
-            self.handle.lost = True
-        self.handle = None
+            self.handle.lost, self.handle = True, None
 
     def put(self, data):
         data = data[: ROOM - len(self.handle.data)]
@@ -530,6 +471,7 @@ class _Terminal(threading.Thread):
             os.write(self._wake_write, b"x")
 
     def close(self):
+        """Take the port away and end the thread."""
         self._quit = True
         self.wake()
         if self.is_alive():
@@ -539,9 +481,10 @@ class _Terminal(threading.Thread):
                 os.close(fd)
 
     def run(self):
+        """Serve the port until it is closed."""
         try:
             while not self._quit:
-                self._listen(min(self._device.wait_s(), LONGEST_WAIT_S))
+                self._listen(min(self._device.due() - REAL.now(), LONGEST_WAIT_S))
                 self._device.advance()
         except Exception as error:  # a device that dies must say so: the next look at `error` shows it
             self._device.error = error
@@ -551,34 +494,28 @@ class _Terminal(threading.Thread):
 
     def _listen(self, wait):
         """Wait for bytes of the host, a wake-up, or the time; see whether the host holds the port open."""
-        watch = select.poll()
-        watch.register(self._wake_read, select.POLLIN)
-        if self.open:
-            watch.register(self._master, select.POLLIN)
-        elif self.there:  # a port that nobody holds reports so at once: look now and then
+        if self.there and not self.open:  # a port that nobody holds reports so at once: look now and then
             wait = min(wait, CLOSED_LOOK_S)
-        found = dict(watch.poll(wait * 1000))
-        if self._wake_read in found:
+        watched = [self._wake_read, *([self._master] if self.open else [])]
+        if self._wake_read in select.select(watched, [], [], max(0.0, wait))[0]:
             os.read(self._wake_read, 4096)
-        if self.there and (self._master in found or not self.open):
-            watch = select.poll()
-            watch.register(self._master, select.POLLIN)
-            event = dict(watch.poll(0)).get(self._master, 0)
-            if event & select.POLLIN:
-                with contextlib.suppress(OSError):
-                    self._device.hear(os.read(self._master, 4096))
-            if self.open and event & select.POLLHUP:
-                self._flush()
-            self.open = not event & select.POLLHUP
-
-    def _flush(self):
-        """A port forgets what nobody read when it is closed."""
-        with contextlib.suppress(OSError, termios.error):
-            slave = os.open(os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-            termios.tcflush(slave, termios.TCIFLUSH)
-            os.close(slave)
+        if not self.there:
+            return
+        state = select.poll()
+        state.register(self._master, select.POLLIN)
+        event = dict(state.poll(0)).get(self._master, 0)
+        if event & select.POLLIN:
+            with contextlib.suppress(OSError):
+                self._device.hear(os.read(self._master, 4096))
+        if self.open and event & select.POLLHUP:  # a port forgets what nobody read when it is closed
+            with contextlib.suppress(OSError, termios.error):
+                slave = os.open(os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                termios.tcflush(slave, termios.TCIFLUSH)
+                os.close(slave)
+        self.open = not event & select.POLLHUP
 
     def put(self, data):
+        """Send bytes; how many went into the buffer."""
         try:
             return os.write(self._master, data)
         except BlockingIOError:

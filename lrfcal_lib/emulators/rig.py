@@ -26,16 +26,7 @@ from lrfcal_lib.emulators.head import FEEDBACK, REPLIES, EmulatedHead
 from lrfcal_lib.emulators.line import FAULTS, Clock
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
-from lrfcal_lib.session.stated import (
-    SCHEMA,
-    CameraInfo,
-    LrfInfo,
-    board_to_json,
-    camera_to_json,
-    lrf_to_json,
-    model_to_json,
-    transform_to_json,
-)
+from lrfcal_lib.session import stated
 from lrfcal_lib.simulate.beam import LARGEST_WORD
 from lrfcal_lib.simulate.rig import PLACES, SETUPS, pairs, random, sim_quick
 
@@ -65,10 +56,10 @@ class EmulatedRig:
     time_scale : float
         Seconds of the devices in a second of the host; 1 is safe. Up to 8 does for stop-and-go. A stream of scans
         leaves some out, with a warning, where this machine is too slow for it, as with a head that moves. The instants
-        of scans need a host clock that runs as fast (`clock` of `LMS2xx.open` and `Rig.open`): by another one they
+        of scans need a host clock that runs as fast (`clock` of `LMS2xx` and `Rig.open`): by another one they
         are off by tenths of a second.
-    lrf_options : dict, optional
-        Of :class:`EmulatedLms`.
+    model : str, optional
+        Type string of the laser range finder.
     head_options : dict, optional
         Of :class:`EmulatedHead`: feedback, reply, echo, speeds, ...
     platform : dict, optional
@@ -77,7 +68,7 @@ class EmulatedRig:
         Whether there are cameras.
     image_width : int, optional
         Pixels; the field of view stays.
-    quality, fps, rest_s
+    rest_s
         Of :class:`CameraServer`.
     machine : Host
         On a VirtualHost the ports are in memory.
@@ -87,8 +78,8 @@ class EmulatedRig:
     lrf : EmulatedLms
     pan_tilt : EmulatedHead
     world : EmulatedWorld
-    lrf_port, head_port, control : str
-        Paths.
+    control : str
+        Path of the socket.
     camera_server : CameraServer or None
     camera_urls : dict of str to str
     faults : dict of str to Faults
@@ -98,12 +89,12 @@ class EmulatedRig:
     Examples
     --------
     >>> with EmulatedRig("sim_quick", cameras=False) as rig:  # doctest: +SKIP
-    ...     rig.place(1)
+    ...     rig.world.put(1)
     """
 
-    def __init__(self, setup="sim_quick", *, folder=None, seed=0, placements=None, time_scale=1.0, lrf_options=None,
-                 head_options=None, platform=None, cameras=True, image_width=None, quality=97, fps=8.0,
-                 rest_s=0.5, machine=REAL):  # fmt: skip
+    def __init__(self, setup="sim_quick", *, folder=None, seed=0, placements=None, time_scale=1.0, model=None,
+                 head_options=None, platform=None, cameras=True, image_width=None, rest_s=0.5,
+                 machine=REAL):  # fmt: skip
         if isinstance(setup, str) and setup not in SETUPS:
             raise ValueError(f"no set-up '{setup}'; there are {', '.join(SETUPS)}")
         setup = SETUPS[setup]() if isinstance(setup, str) else setup
@@ -114,14 +105,13 @@ class EmulatedRig:
         self.folder = Path(folder or self._own)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.world = EmulatedWorld(setup, self.clock, seed, placements)
-        shared, model = {"clock": self.clock, "seed": seed}, rig.beam.name.split("-")[0]
-        options = {"model": f"{model};302063;{FIRMWARE[model]}", **(lrf_options or {})}
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared, **options)
+        shared, kind = {"clock": self.clock, "seed": seed}, rig.beam.name.split("-")[0]
+        model = model or f"{kind};302063;{FIRMWARE[kind]}"
+        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", model=model, **shared)
         self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
         self.faults, self.scans = {"lrf": self.lrf.faults, "head": self.pan_tilt.faults}, self.lrf.scans
-        self.lrf_port, self.head_port, self.control = self.lrf.path, self.pan_tilt.path, str(self.folder / "control")
-        shown = {"quality": quality, "fps": fps, "seed": seed, "rest_s": rest_s}
-        self.camera_server = CameraServer(self.world, self.setup, **shown) if cameras else None
+        self.control = str(self.folder / "control")
+        self.camera_server = CameraServer(self.world, self.setup, seed=seed, rest_s=rest_s) if cameras else None
         self.camera_urls = self.camera_server.urls if cameras else {}
         parts = (self.lrf, self.pan_tilt, self.camera_server, ControlSocket(self.control, self))
         self._parts = [part for part in parts if part is not None]
@@ -144,21 +134,9 @@ class EmulatedRig:
     def __exit__(self, *_):
         self.close()
 
-    def place(self, number):
-        """Put the board at a placement of the setup, or take it away (None)."""
-        self.world.put(number)
-
-    def hold_close(self, camera, view):
-        """Hold the board close to a camera, for its intrinsics; at pitch 0 the whole pattern is in the image."""
-        self.world.hold_close(camera, view)
-
     def pitch(self, time_s=None):
         """True pitch now, or at instants of the host's clock (time.time()), radians."""
         return self.world.head.pitch(self.clock.now() if time_s is None else self.clock.device(time_s))
-
-    def truth(self):
-        """What only the simulator knows, as JSON."""
-        return self.world.truth()
 
     def error(self):
         """What ended a device by itself, None while all live."""
@@ -166,76 +144,66 @@ class EmulatedRig:
 
     def status(self):
         """The devices now, as JSON."""
-        memory = self.lrf.memory
+        memory, head = self.lrf.memory, self.pan_tilt
         return {
             "place": list(self.world.place.key),
             "pitch_deg": round(math.degrees(float(self.pitch())), 4),
             "lrf": {"baudrate": memory.baudrate, "mode": memory.mode, "variant": list(memory.variant),
                     "unit": memory.configuration.unit, "scans": len(self.scans), "line": self.lrf.counts},
-            "head": {"baudrate": self.pan_tilt.baudrate, "frames": len(self.pan_tilt.frames),
-                     "line": self.pan_tilt.counts},
+            "head": {"baudrate": head.baudrate, "frames": len(head.frames), "line": head.counts},
         }  # fmt: skip
 
     def plan(self):
         """What a recording of this rig can do: the sweep that holds all placements, and each of them."""
-        step = math.degrees(self.setup.step)
-        each = [_planned(p, self.setup) for p in self.world.placements.values()]
+        setup, each = self.setup, []
+        for p in self.world.placements.values():
+            board = p.T_platform_board is not None
+            step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
+            first, last = np.degrees(p.sweep).round(4).tolist()
+            images = np.degrees(p.image_pitch).round(4).tolist()
+            each.append({"number": p.number, "board": board, "pitch_deg": [first, last, step],
+                         "image_pitch_deg": images})  # fmt: skip
         boards = [p for p in each if p["board"]] or each
         ends = np.array([p["pitch_deg"][:2] for p in boards])
-        images = np.unique(np.round(np.concatenate([p["image_pitch_deg"] for p in boards])))
         return {
             "mode": "stop-and-go",
             "scans_per_stop": 1,
-            "intrinsics_images": self.setup.intrinsics_views if self.camera_urls else 0,
-            "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), step],
-            "image_pitch_deg": images.tolist(),
+            "intrinsics_images": setup.intrinsics_views if self.camera_urls else 0,
+            "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), math.degrees(setup.step)],
+            "image_pitch_deg": np.unique(np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))).tolist(),
             "placements": each,
         }
 
     def rig_file(self):
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
-        rig, setup = self.setup.rig, self.setup
-        infos = [CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in rig.cameras]
+        rig, setup, head = self.setup.rig, self.setup, self.pan_tilt
+        beam, bearings, limits = rig.beam, rig.beam.bearings(), np.degrees(rig.platform.limits).round(6).tolist()
+        lrf = stated.LrfInfo(
+            f"{beam.name} (emulated)", (float(bearings[0]), float(bearings[-1])), math.radians(beam.resolution / 100),
+            beam.sigma_range, range_resolution=beam.unit, max_range=LARGEST_WORD * beam.unit,
+            spot=(beam.spot_exit, beam.divergence),
+        )  # fmt: skip
+        cameras = [c for c in rig.cameras if c.name in self.camera_urls]
+        infos = [stated.CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in cameras]
         return {
-            "schema": SCHEMA, "name": f"{setup.name}_emulated", "licence": "CC-BY-4.0", "simulated": True,
+            "schema": stated.SCHEMA, "name": f"{setup.name}_emulated", "licence": "CC-BY-4.0", "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
-            "board": board_to_json(rig.board),
-            "rig": {"lrf": lrf_to_json(_lrf_info(rig.beam)),
-                    "platform": {"T_head_lrf": transform_to_json(rig.T_head_lrf_stated)},
-                    "cameras": {c.name: camera_to_json(c) for c in infos} if self.camera_urls else {}},
-            "devices": self._devices(),
+            "board": stated.board_to_json(rig.board),
+            "rig": {"lrf": stated.lrf_to_json(lrf),
+                    "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
+                    "cameras": {c.name: stated.camera_to_json(c) for c in infos}},
+            "devices": {
+                "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False,
+                        "variant": [beam.field_of_view, beam.resolution / 100],
+                        "unit": "mm" if beam.unit < 0.005 else "cm"},
+                "head": {"port": head.path, "address": head.address, "baudrate": head.baudrate,
+                         "feedback": head.reply_kind != "none", "pitch_limits_deg": limits},
+                "cameras": {c.name: {"source": self.camera_urls[c.name], "silence_s": SILENCE_S,
+                                     "size": [c.width, c.height]} for c in infos},
+                "control": self.control,
+            },
             "plan": self.plan(),
         }  # fmt: skip
-
-    def _devices(self):
-        beam, low_high = self.setup.rig.beam, np.degrees(self.setup.rig.platform.limits)
-        size = {c.name: [c.model.width, c.model.height] for c in self.setup.rig.cameras}
-        return {
-            "lrf": {"port": self.lrf_port, "baudrate": 500000, "variant": [beam.field_of_view, beam.resolution / 100],
-                    "unit": "mm" if beam.unit < 0.005 else "cm", "interlaced": False},
-            "head": {"port": self.head_port, "address": self.pan_tilt.address, "baudrate": self.pan_tilt.baudrate,
-                     "feedback": self.pan_tilt.reply_kind != "none", "pitch_limits_deg": low_high.round(6).tolist()},
-            "cameras": {name: {"source": url, "size": size[name], "silence_s": SILENCE_S}
-                        for name, url in self.camera_urls.items()},
-            "control": self.control,
-        }  # fmt: skip
-
-
-def _planned(placement, setup):
-    board = placement.T_platform_board is not None
-    step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
-    first, last = np.degrees(placement.sweep).round(4).tolist()
-    images = np.degrees(placement.image_pitch).round(4).tolist()
-    return {"number": placement.number, "board": board, "pitch_deg": [first, last, step], "image_pitch_deg": images}
-
-
-def _lrf_info(beam):
-    bearings = beam.bearings()
-    view, step = (float(bearings[0]), float(bearings[-1])), math.radians(beam.resolution / 100)
-    return LrfInfo(
-        f"{beam.name} (emulated)", view, step, beam.sigma_range, range_resolution=beam.unit,
-        max_range=LARGEST_WORD * beam.unit, spot=(beam.spot_exit, beam.divergence),
-    )  # fmt: skip
 
 
 def _faults_of(rig, device):
@@ -255,18 +223,18 @@ def _clear(rig, device=None):
 
 
 COMMANDS = {
-    "place": (lambda rig, number=None: rig.place(None if number in (None, "none", "") else int(number)),
+    "place": (lambda rig, number="none": rig.world.put(None if number in (None, "none", "") else int(number)),
               "place NUMBER|none: put the board there"),
-    "close": (lambda rig, camera, view: rig.hold_close(camera, int(view)), "close CAMERA VIEW: hold it close"),
+    "close": (lambda rig, camera, view: rig.world.hold_close(camera, int(view)), "close CAMERA VIEW: hold it close"),
     "placements": (lambda rig: {"placements": rig.plan()["placements"]}, "placements: where the board can be put"),
     "fault": (_fault, "fault lrf|head NAME [COUNT] [SECONDS]: let something go wrong"),
     "faults": (lambda rig: {"faults": {n: f.text for n, f in FAULTS.items()},
                             "counts": {d: dict(f.counts) for d, f in rig.faults.items()}},
                "faults: what can go wrong, and how often it did"),
     "clear": (_clear, "clear [lrf|head]: no more faults"),
-    "status": (lambda rig: rig.status(), "status: the devices now"),
-    "truth": (lambda rig: {"truth": rig.truth()}, "truth: what only the simulator knows"),
-    "help": (lambda rig: {"commands": [text for _, text in COMMANDS.values()]}, "help: this"),
+    "status": (EmulatedRig.status, "status: the devices now"),
+    "truth": (lambda rig: {"truth": rig.world.truth()}, "truth: what only the simulator knows"),
+    "help": (lambda _: {"commands": [text for _, text in COMMANDS.values()]}, "help: this"),
 }  # fmt: skip
 
 
@@ -285,19 +253,13 @@ def obey(rig, line):
         return {"ok": False, "error": f"{error}"}
 
 
-class ControlSocket(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
-    """Serves the commands on a Unix socket.
-
-    Parameters
-    ----------
-    path : path-like
-    rig : EmulatedRig
-    """
+class ControlSocket(socketserver.ThreadingUnixStreamServer):
+    """Serves the commands on a Unix socket."""
 
     daemon_threads, block_on_close = True, False
 
     def __init__(self, path, rig):
-        super().__init__(str(path), _Obedient)
+        super().__init__(path, _Obedient)
         self.rig, self._serving = rig, threading.Thread(target=self.serve_forever, args=(0.2,), daemon=True)
 
     def start(self):
@@ -342,7 +304,7 @@ def emulated(name):
     Parameters
     ----------
     name : str
-        Of :data:`NAMES`. 'practice' runs twice as fast as real devices, the others as slow.
+        Of :data:`NAMES` (ValueError). 'practice' runs twice as fast as real devices, the others as slow.
 
     Returns
     -------
@@ -351,11 +313,6 @@ def emulated(name):
         Gives the rig file, parsed, once the rig is started.
     clock : callable
         For :meth:`lrfcal_lib.drivers.rig.Rig.open`.
-
-    Raises
-    ------
-    ValueError
-        For another name.
     """
     clock = host_clock()
     if name != PRACTICE:
@@ -372,18 +329,12 @@ def quick_file(rig):
     data = rig.rig_file()
     data["devices"]["head"] |= {"settle_s": 0.05, "poll_s": 0.01, "gap_s": 0.005}
     for camera in rig.setup.rig.cameras:
-        data["rig"]["cameras"][camera.name]["intrinsics"] = model_to_json(camera.model)
+        data["rig"]["cameras"][camera.name]["intrinsics"] = stated.model_to_json(camera.model)
     return data
 
 
 def parser():
-    """The command line.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-    """
-    scale = "2 runs all devices twice as fast, 8 at most; stop-and-go only, as sweeps need scans in real time (1)"
+    """The command line, an ArgumentParser; its options are those of :class:`EmulatedRig`, `head_*` of its head."""
     top = argparse.ArgumentParser(prog="python -m lrfcal_lib emulate", description="Emulate the devices of a rig.")
     top.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
     top.add_argument("--folder", help="where the ports appear (default: a new temporary folder)")
@@ -392,11 +343,13 @@ def parser():
     top.add_argument("--feedback", choices=FEEDBACK, default="full", help="what the head tells of its position")
     top.add_argument("--reply", choices=REPLIES, default="extended", help="how the head answers")
     top.add_argument("--echo", action="store_true", help="the head's line hands back what is sent")
-    top.add_argument("--head-baudrate", type=int, default=2400)
+    top.add_argument("--head-baudrate", type=int, default=2400, dest="baudrate")
     top.add_argument("--model", help="type string of the laser range finder, 21 characters")
     top.add_argument("--image-width", type=int, help="pixels")
-    top.add_argument("--image-rest", type=float, default=0.5, help="s the head rests before an image is drawn (0.5)")
-    top.add_argument("--no-cameras", action="store_true")
+    rest = "s the head rests before an image is drawn (0.5)"
+    top.add_argument("--image-rest", type=float, default=0.5, dest="rest_s", help=rest)
+    top.add_argument("--no-cameras", action="store_false", dest="cameras")
+    scale = "2 runs all devices twice as fast, 8 at most; stop-and-go only, as sweeps need scans in real time (1)"
     top.add_argument("--time-scale", type=float, default=1.0, help=scale)
     return top
 
@@ -418,25 +371,21 @@ def main(argv=None):
     ValueError
         For options that no rig has.
     """
-    args, quit_ = parser().parse_args(argv), threading.Event()
+    options, quit_ = vars(parser().parse_args(argv)), threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
             signal.signal(number, lambda *_: quit_.set())
-    head = {"feedback": args.feedback, "reply": args.reply, "echo": args.echo, "baudrate": args.head_baudrate}
-    with EmulatedRig(
-        args.setup, folder=args.folder, seed=args.seed, time_scale=args.time_scale, cameras=not args.no_cameras,
-        image_width=args.image_width, rest_s=args.image_rest, head_options=head,
-        lrf_options={"model": args.model} if args.model else None,
-    ) as rig:  # fmt: skip
+    file, head = options.pop("rig_file"), {key: options.pop(key) for key in ("feedback", "reply", "echo", "baudrate")}
+    with EmulatedRig(**options, head_options=head) as rig:
         try:
-            if args.rig_file is not None:
-                args.rig_file.write_text(json.dumps(rig.rig_file(), indent=1) + "\n")
-            print(summary(rig, args.rig_file), flush=True)
+            if file is not None:
+                file.write_text(json.dumps(rig.rig_file(), indent=1) + "\n")
+            print(summary(rig, file), flush=True)
             while not quit_.wait(LOOK_S) and rig.error() is None:
                 pass
         finally:
-            if args.rig_file is not None:
-                args.rig_file.unlink(missing_ok=True)
+            if file is not None:
+                file.unlink(missing_ok=True)
         error = rig.error()
     print(f"a device ended: {error!r}" if error else "the emulated rig is gone", flush=True)
     return 1 if error else 0
@@ -444,11 +393,11 @@ def main(argv=None):
 
 def summary(rig, file=None):
     """What other programs need to know of an emulated rig, as text."""
-    beam, head = rig.setup.rig.beam, rig.pan_tilt
+    head = rig.pan_tilt
     lines = [
-        f"emulated rig '{rig.setup.name}' ({beam.name}); Ctrl-C ends it",
-        f"  lrf      {rig.lrf_port}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
-        f"  head     {rig.head_port}   {head.baudrate} Bd, Pelco-D, address {head.address}",
+        f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
+        f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
+        f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.address}",
         *(f"  {name:8s} {url}" for name, url in rig.camera_urls.items()),
         f"  control  {rig.control}   one command a line, such as: place 1",
         f"  boards   placements {', '.join(map(str, rig.world.placements))}, or none",

@@ -37,26 +37,17 @@ LOG = logging.getLogger(__name__)
 DAZZLED, NOT_VALID, WEAK = 2, 1, 4  # index into lms2xx.REASONS
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
-CACHED = 64  # images
+QUALITY = 97  # of JPEG
+FPS = 8.0  # most images a second of a camera
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the board is.
-
-    Attributes
-    ----------
-    key : tuple
-        Tells places apart.
-    T_platform_board : RigidTransform or None
-        None where there is no board but a table with things.
-    stand : bool
-        On its stand, or held by nothing close to a camera.
-    """
+    """Where the board is; places are told apart by their key."""
 
     key: tuple
-    T_platform_board: RigidTransform | None = field(default=None, compare=False)
-    stand: bool = field(default=True, compare=False)
+    T_platform_board: RigidTransform | None = field(default=None, compare=False)  # None: no board, a table with things
+    stand: bool = field(default=True, compare=False)  # on its stand, or held by nothing close to a camera
 
 
 class EmulatedWorld:
@@ -77,6 +68,8 @@ class EmulatedWorld:
     placements : dict of int to Placement
     """
 
+    place = property(lambda self: self._scene[0], doc="Where the board is.")
+
     def __init__(self, setup, clock, seed=0, placements=None):
         self.setup, self.clock = setup, clock
         if placements is None:
@@ -88,13 +81,7 @@ class EmulatedWorld:
         self.put(None)
 
     def put(self, number):
-        """Put the board at a placement; None takes it away.
-
-        Raises
-        ------
-        ValueError
-            For a placement that the setup does not have.
-        """
+        """Put the board at a placement; None takes it away. ValueError for one that the setup does not have."""
         if number is not None and number not in self.placements:
             known = ", ".join(map(str, self.placements))
             raise ValueError(f"no placement {number}; there are {known}, and none")
@@ -102,13 +89,7 @@ class EmulatedWorld:
         self._set(Place(("placement", number), pose))
 
     def hold_close(self, camera, view):
-        """Hold the board close to a camera, in one of the views for its intrinsics, counted from 0.
-
-        Raises
-        ------
-        ValueError
-            For a camera or a view that the setup does not have.
-        """
+        """Hold the board close to a camera, in one of the views for its intrinsics, counted from 0 (ValueError)."""
         rig, names, count = self.setup.rig, [c.name for c in self.setup.rig.cameras], self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
             raise ValueError(f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of {', '.join(names)}")
@@ -122,29 +103,19 @@ class EmulatedWorld:
     def _set(self, place):
         self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
 
-    @property
-    def place(self):
-        """Where the board is."""
-        return self._scene[0]
-
     def scan(self, turn, quarters, times):
         """Readings of the laser range finder; see :meth:`SyntheticSource.scan`."""
-        beam, pitch = self.setup.rig.beam, np.broadcast_to(self.head.pitch(times), times.shape)
-        reading, total, dazzled = self._readings(np.radians(quarters / 4), pitch)
+        (place, world), rig, beam = self._scene, self.setup.rig, self.setup.rig.beam
+        pitch, key = np.broadcast_to(self.head.pitch(times), times.shape), None
+        if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
+            key = place.key, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
+        if key is None or self._still[0] != key:
+            self._still = key, lrf.ideal_readings(beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
+        reading, total, dazzled = self._still[1]
         ranges = reading + beam.systematic + beam.sigma_range * self._rng.standard_normal(len(reading))
         reasons = np.where(np.isfinite(reading), 0, np.where(total > 0, WEAK, NOT_VALID))
         ends = pitch[[np.argmin(times), np.argmax(times)]]
         return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons), ends
-
-    def _readings(self, bearings, pitch):
-        """Readings without noise; a head at rest sees the same again and again."""
-        (place, world), rig, still = self._scene, self.setup.rig, np.ptp(pitch) < STILL
-        key = place.key, len(bearings), bearings[0], round(float(pitch[0]) / STILL)
-        if still and self._still[0] == key:
-            return self._still[1]
-        found = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        self._still = (key, found) if still else self._still
-        return found
 
     def truth(self):
         """What only the simulator knows, as JSON."""
@@ -164,13 +135,7 @@ class EmulatedWorld:
 
 
 def scaled(rig, width):
-    """The rig with images of another width, the same field of view.
-
-    Raises
-    ------
-    ValueError
-        If that makes an odd number of pixels.
-    """
+    """The rig with images of another width, the same field of view; ValueError for an odd number of pixels."""
     cameras = []
     for camera in rig.cameras:
         m, scale = camera.model, width / camera.model.width
@@ -183,28 +148,16 @@ def scaled(rig, width):
     return replace(rig, cameras=tuple(cameras))
 
 
-_setup = None  # of the drawing process
+_setup, _imagers = None, ()  # of the drawing process
 
 
 def _begin(setup):
-    """Furnish the drawing process."""
-    global _setup
+    """Furnish the drawing process, which ends with a parent that was killed."""
+    global _setup, _imagers
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this process
-    threading.Thread(target=_outlive_nobody, daemon=True).start()
-    _setup = setup
+    threading.Thread(target=lambda: wait([parent_process().sentinel]) and os._exit(1), daemon=True).start()
     cv2.setNumThreads(1)
-
-
-def _outlive_nobody():
-    """End with a parent that was killed."""
-    wait([parent_process().sentinel])
-    os._exit(1)
-
-
-@lru_cache
-def _imager(index):
-    camera = _setup.rig.cameras[index]
-    return Imager(camera.model, camera.exposure)
+    _setup, _imagers = setup, [Imager(camera.model, camera.exposure) for camera in setup.rig.cameras]
 
 
 @lru_cache(2)
@@ -215,7 +168,7 @@ def _world(place):
 def _draw(index, place, pitch, seed, quality):
     """JPEG of what a camera sees; runs in the drawing process."""
     pose = _setup.rig.camera_pose(_setup.rig.cameras[index], pitch)
-    image = _imager(index).render(_world(place), pose, np.random.default_rng(seed))
+    image = _imagers[index].render(_world(place), pose, np.random.default_rng(seed))
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
@@ -225,12 +178,8 @@ class CameraServer:
     Parameters
     ----------
     world : EmulatedWorld
-    setup : Setup, optional
-        Whose cameras to show, such as smaller ones; the world's by default.
-    quality : int
-        Of JPEG.
-    fps : float
-        Most images a second of a camera.
+    setup : Setup
+        Whose cameras to show, such as smaller ones than the world's.
     seed : int
     rest_s : float
         Seconds of the devices that the head must rest before an image is drawn. Nobody tells a camera whether its
@@ -243,28 +192,26 @@ class CameraServer:
         What ended the drawing process; there are no more images.
     """
 
-    def __init__(self, world, setup=None, *, quality=97, fps=8.0, seed=0, rest_s=0.5):
-        self.world, self.quality, self.fps, self.seed, self.rest_s = world, quality, fps, seed, rest_s
-        self.names, self.error = [c.name for c in (setup or world.setup).rig.cameras], None
+    def __init__(self, world, setup, *, seed=0, rest_s=0.5):
+        self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
+        self.names = [camera.name for camera in setup.rig.cameras]
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
-        self._quit, self._serving = threading.Event(), None
-        options = {"mp_context": get_context("spawn"), "initializer": _begin, "initargs": (setup or world.setup,)}
-        self._pool = ProcessPoolExecutor(1, **options)
+        self.quit = threading.Event()
+        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (setup,))
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
-        self._server.daemon_threads = True
+        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self.urls = {name: f"http://127.0.0.1:{self._server.server_address[1]}/{name}.mjpg" for name in self.names}
 
     def start(self):
         """Serve, and draw the first images ahead."""
-        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self._serving.start()
         for name in self.names:
             self._drawn(self._key(name))
 
     def close(self):
         """End the server and the drawing process."""
-        self._quit.set()
-        if self._serving is not None:
+        self.quit.set()
+        if self._serving.is_alive():
             self._server.shutdown()
         self._server.server_close()
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -272,7 +219,7 @@ class CameraServer:
     @property
     def serving(self):
         """Whether there are images to come."""
-        return not self._quit.is_set() and self.error is None
+        return not self.quit.is_set() and self.error is None
 
     def image(self, name, timeout=1.0):
         """The image of a camera that shows the rig as it stands now.
@@ -296,7 +243,7 @@ class CameraServer:
                 return key, data
             if time.monotonic() > end:
                 break
-            self._quit.wait(LOOK_S)
+            self.quit.wait(LOOK_S)
         return None, None
 
     def _key(self, name):
@@ -307,20 +254,18 @@ class CameraServer:
         return name, self.world.place, round(float(head.pitch(now)), 7)
 
     def _drawn(self, key):
-        """JPEG of a key; asked for where it is not there yet, and older ones that nobody waits for are dropped."""
+        """JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
         if key is None:
             return None
         try:
             with self._lock:
-                if key not in self._images:
-                    for old in [k for k, one in self._images.items() if k[0] == key[0] and one.cancel()]:
-                        del self._images[old]
-                    for old in list(self._images)[:-CACHED]:
-                        del self._images[old]
+                before, image = self._images.get(key[0], (None, None))
+                if before != key:
+                    if image is not None:
+                        image.cancel()
                     index = self.names.index(key[0])
-                    seed = [self.seed, index, next(self._count)]
-                    self._images[key] = self._pool.submit(_draw, index, *key[1:], seed, self.quality)
-                image = self._images[key]
+                    image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)], QUALITY)
+                    self._images[key[0]] = key, image
             return image.result() if image.done() else None
         except BrokenProcessPool as error:
             if self.serving:
@@ -342,21 +287,21 @@ class _Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(ConnectionError, TimeoutError):
             self._stream(name) if kind == "mjpg" else self._single(name)
 
-    def _begin(self, **headers):
-        self.send_response(200)
-        for key, value in headers.items():
-            self.send_header(key.replace("_", "-"), value)
-        self.end_headers()
-
     def _single(self, name):
         _, data = self.cameras.image(name, timeout=20.0)
         if data is None:
             return self.send_error(503, "the head moves")
-        self._begin(Content_Type="image/jpeg", Content_Length=len(data))
+        self.send_response(200)
+        self.send_header("Content-Type", "image/jpeg")
+        self.send_header("Content-Length", len(data))
+        self.end_headers()
         self.wfile.write(data)
 
     def _stream(self, name):
-        self._begin(Content_Type="multipart/x-mixed-replace; boundary=frame", Cache_Control="no-cache")
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.send_header("Cache-Control", "no-cache")
+        self.end_headers()
         while self.cameras.serving:
             _, data = self.cameras.image(name)
             if data is None:
@@ -364,7 +309,7 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                 self.wfile.write(head.encode() + data + b"\r\n")
-                self.cameras._quit.wait(1 / self.cameras.fps)
+                self.cameras.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass

@@ -13,10 +13,11 @@ from scipy.stats import binom, chi2
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import AXIS_COLUMNS, JointState, disc_share, gather, named_blocks
 from lrfcal_lib.model.geometry import DegenerateGeometry, polar_to_points, pose_array, pose_transform
+from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
+from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
-from lrfcal_lib.solvers.lines import edge_bias, solve_line_ml_batch, solve_lines_batch
-from lrfcal_lib.solvers.planes import PlaneSets, solve_zhang_pless_batch
+from lrfcal_lib.solvers.lines import edge_bias
 
 INTERVAL = 0.9
 HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
@@ -337,8 +338,8 @@ UNIFORM = 1 / np.sqrt(12.0)
 FACE = 24  # face points a placement
 
 
-def crossings(shots, setup, last_beam=False):
-    """Edge points of drawn shots, as the preprocessing makes them of a scan line.
+def observations(shots, setup, last_beam=False):
+    """Drawn shots, as the preprocessing makes observations of a scan line.
 
     Parameters
     ----------
@@ -350,9 +351,8 @@ def crossings(shots, setup, last_beam=False):
 
     Returns
     -------
-    dict of ndarray
-        points, half_step (t, n, 3), covariance, noise (t, n, 3, 3), lines (t, n, 3), radius, background, line_sigma
-        (t, n), with n = 2 p crossings a trial; groups (n,), the placement of each.
+    CameraObservations
+        With a leading trial axis: two crossings and 24 face points a placement.
     """
     ranges, bearings = shots["ranges"], setup.bearings()
     t, p, _ = ranges.shape
@@ -367,8 +367,11 @@ def crossings(shots, setup, last_beam=False):
     radius = setup.radius(np.linalg.norm(points, axis=-1))
     found = {"points": points, "half_step": turned * half[:, None], "noise": noise, "covariance": noise + spacing}
     found |= {"radius": radius, "background": 0 * radius, "line_sigma": np.full(radius.shape, setup.sigma_px)}
-    found = {k: v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
-    return found | {"lines": shots["lines"].reshape(t, 2 * p, 3), "groups": np.repeat(np.arange(p), 2)}
+    crossings = {f"crossing_{k}": v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
+    return CameraObservations(
+        setup.model, crossing_lines=shots["lines"].reshape(t, 2 * p, 3), crossing_placement=np.repeat(np.arange(p), 2),
+        **crossings, **_faces(shots, setup),
+    )  # fmt: skip
 
 
 def _on_lines(lines, information, bearing, sigma):
@@ -387,10 +390,10 @@ def _outer(v):
     return v[..., :, None] * v[..., None, :]
 
 
-def faces(shots, setup):
-    """Face points of drawn shots for the plane method, a PlaneSets with a leading trial axis."""
+def _faces(shots, setup):
+    """Face points of drawn shots for the plane method."""
     ranges, bearings = shots["ranges"], setup.bearings()
-    t, p, b = ranges.shape
+    t, p, _ = ranges.shape
     hit = np.isfinite(ranges)
     order = np.argsort(~hit, axis=-1, kind="stable")
     count = hit.sum(axis=-1)
@@ -400,8 +403,11 @@ def faces(shots, setup):
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
     repeats = np.maximum(FACE / count, 1.0)  # a short line gives some of its points twice
     covariance = _outer(rays) * (setup.sigma_range**2 * repeats)[..., None, None, None] + 1e-10 * np.eye(3)
-    used = np.ones((p, FACE), bool)
-    return PlaneSets(np.arange(p), points, covariance, used, shots["boards"], shots["board_covariance"])
+    return {
+        "plane_points": points.reshape(t, p * FACE, 3), "plane_covariance": covariance.reshape(t, p * FACE, 3, 3),
+        "plane_placement": np.repeat(np.arange(p), FACE), "board_poses": shots["boards"],
+        "board_covariance": shots["board_covariance"],
+    }  # fmt: skip
 
 
 def solve_shots(shots, setup, T0):
@@ -419,16 +425,9 @@ def solve_shots(shots, setup, T0):
     dict of str to Solution
         With a leading trial axis: line_last_beam (weighted), line, line_ml, zhang_pless.
     """
-    half, last = crossings(shots, setup), crossings(shots, setup, last_beam=True)
-    basic = ("points", "covariance", "lines", "line_sigma")
-    full = ("points", "covariance", "half_step", "noise", "radius", "background", "lines", "line_sigma")
-    model, groups = setup.model, half["groups"]
-    return {
-        "line_last_beam": solve_lines_batch(*(last[k] for k in basic), model, T0, groups=groups),
-        "line": solve_lines_batch(*(half[k] for k in basic), model, T0, groups=groups),
-        "line_ml": solve_line_ml_batch(*(half[k] for k in full), model, T0, groups=groups),
-        "zhang_pless": solve_zhang_pless_batch(faces(shots, setup), T0),
-    }
+    half, last = observations(shots, setup), observations(shots, setup, last_beam=True)
+    found = {"line_last_beam": solve_camera(last, "line", T0)}
+    return found | {method: solve_camera(half, method, T0) for method in ("line", "line_ml", "zhang_pless")}
 
 
 def shots_table(shots, setup, solutions):

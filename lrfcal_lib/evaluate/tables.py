@@ -24,7 +24,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
-from lrfcal_lib.solvers import METHODS
+from lrfcal_lib.solvers import METHODS, solve_camera
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ def plane_residuals_of(obs, solution):
     return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
 
 
-def left_out_residuals(obs, judge, solve, full):
+def left_out_residuals(obs, judge, method, full):
     """Residuals of every placement under a calibration from all the others.
 
     Parameters
@@ -245,8 +245,7 @@ def left_out_residuals(obs, judge, solve, full):
         What the method works on.
     judge : CameraObservations
         What it is judged on; the same placements.
-    solve : callable
-        ``solve(observations, T0) -> Solution``.
+    method : str
     full : Solution
         The calibration from all placements; the start of each solve.
 
@@ -260,7 +259,8 @@ def left_out_residuals(obs, judge, solve, full):
     plane_m = np.full(len(judge.plane_points), np.nan)
     for placement in judge.all_placements:
         try:
-            solution = solve(obs.select(obs.all_placements[obs.all_placements != placement]), full.transform)
+            rest = obs.select(obs.all_placements[obs.all_placements != placement])
+            solution = solve_camera(rest, method, full.transform)
         except DegenerateGeometry:
             continue
         held = judge.select([placement])
@@ -302,7 +302,7 @@ def method_comparison(observations, solutions, left_out=True, truth=None, joint=
         if left_out and name == "joint" and joint is not None:
             held_edge, held_plane = jointly_left_out(joint, camera)
         elif left_out and name != "joint":
-            held_edge, held_plane = left_out_residuals(own, judge, METHODS[name].solve, solution)
+            held_edge, held_plane = left_out_residuals(own, judge, name, solution)
         row = {"camera": camera, "method": name, "n_placements": len(np.unique(getattr(own, USED[uses])))}
         row["edge_median_px"] = float(np.median(np.abs(edge))) if len(edge) else np.nan
         row["edge_rms_px"] = rms(edge)

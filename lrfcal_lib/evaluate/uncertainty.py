@@ -96,18 +96,20 @@ def information(solution):
     return reduced_hessian(np.swapaxes(J, -1, -2) @ J, solution.unknowns.shared) / solution.solution.inflation
 
 
-def unseen_motions(solution, index=None):
-    """Directions that the data do not determine, shape (m, k): of all shared unknowns or, by `index`, some of them.
+def marginal(hessian, index):
+    """Information on some unknowns with the others eliminated, shape (k, k)."""
+    order = np.concatenate([index, np.setdiff1d(np.arange(len(hessian)), index)]).astype(int)
+    return reduced_hessian(hessian[np.ix_(order, order)][None], len(index))[0]
+
+
+def unseen_motions(solution, index):
+    """Directions of some unknowns that the data do not determine, shape (m, k).
 
     What stays open beside those leaves no trace: cameras that planes fix are known, whatever the edge bias.
     """
-    names = np.array(solution.solution.names)
-    index = np.arange(len(names)) if index is None else np.asarray(index, int)
-    order = np.concatenate([index, np.setdiff1d(np.arange(len(names)), index)])
-    scales = np.array([SCALES.get(name, 1.0) for name in names[order]])
-    whole = information(solution).sum(axis=0)[np.ix_(order, order)] * scales[:, None] * scales
-    own, ones = reduced_hessian(whole[None], len(index))[0], np.ones(len(index))
-    return null_space(own, ones, UNSEEN)[0] * scales[: len(index)]
+    scales = np.array([SCALES.get(name, 1.0) for name in solution.solution.names])
+    own = marginal(information(solution).sum(axis=0) * scales[:, None] * scales, index)
+    return null_space(own, np.ones(len(index)), UNSEEN)[0] * scales[index]
 
 
 def chain_of(solution, camera=None, clustered=True):

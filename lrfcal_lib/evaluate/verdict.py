@@ -32,6 +32,7 @@ POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
 LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
+SAID = ("not converged", "the data do not determine")  # warnings of the solver that are findings of their own
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def _error_words(errors):
     return ", ".join(words)
 
 
-def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
+def verdict(solution, models, *, suggest=True, **options):
     """Judge a joint estimate.
 
     Parameters
@@ -135,8 +136,6 @@ def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
     solution : JointSolution
         Solved with ``required=False``, so that weak sessions get here.
     models : dict of str to CameraModel
-    distances : sequence of float
-        Metres.
     suggest : bool
         Also look for the next placement.
     **options
@@ -146,24 +145,37 @@ def verdict(solution, models, *, distances=DISTANCES, suggest=True, **options):
     -------
     Verdict
     """
+    groups, suggestion, problem = (solution.data.face, solution.data.beam), None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
-    field = field_pitches(solution)
-    found = _expected(chains, models, distances, field, range_noise(solution), diagnose(solution))
-    suggestion, problem = None, ""
+    pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
+    found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution))
     if suggest:
         try:
             suggestion = suggest_placement(solution, models, **options)
         except DegenerateGeometry as error:
             problem = f"No placement can be suggested: {error}."
-    sweep = 1000 * float(np.sqrt(np.mean(_cloud(chains[None], 2.0, field).parts["sweep"] ** 2)))
-    return replace(found, sweep_mm=sweep, suggestion=suggestion, no_suggestion=problem)
+    return replace(found, suggestion=suggestion, no_suggestion=problem)
 
 
-def _expected(chains, models, distances, field, noise, reasons):
-    """A verdict by reasons and by the errors that are to be expected."""
-    errors = {float(d): expected_errors(chains, models, d, field) for d in distances}
-    large = error_reasons(expected_errors(chains, models, 2.0, field))
-    return _answered(Verdict(YES, (), errors, 1000 * float(noise), 0.0, None), reasons + large)
+def _expected(chains, models, pitch, noise, reasons):
+    """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
+    low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
+    middle = (low + high) / 2
+    field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
+    cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
+    maps, looks = {"cloud_mm": 1000 * cloud.rms()}, {"image_pitch": sum(field) / 2, "pitches": field}
+    for camera, chain in chains.items():
+        if camera is not None:
+            found = projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks)
+            maps[f"{camera}_px"] = found.rms()
+    errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
+    large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
+    if large:
+        bad = any(not value <= BAD[name[-2:]] for name, value in large.items())
+        words = f"the expected error at 2 m is {_error_words(large)}"
+        reasons = [*reasons, Reason(NO if bad else CARE, "error", words)]
+    sweep = 1000 * float(np.sqrt(np.mean(cloud.parts["sweep"][DISTANCES.index(2.0)] ** 2)))
+    return _answered(Verdict(YES, (), errors, 1000 * float(noise), sweep, None), reasons)
 
 
 def _answered(found, reasons):
@@ -191,7 +203,7 @@ def judge(calibration, method=None, **options):
     """
     prepared, joint = calibration.prepared, calibration.joint
     # also where the joint estimate is not handed over: a wrong size may be why
-    sizes = [] if joint is None else [*_range_offset(joint), *_size(joint)]
+    sizes = [] if joint is None else contradicts_stated(joint)
     try:
         method = method or handed_over(calibration)
     except ValueError as error:
@@ -201,7 +213,7 @@ def judge(calibration, method=None, **options):
     if method == "joint":
         found = verdict(joint.solution, prepared.models, **sight_of(prepared) | options)
     else:
-        found = _without_joint(calibration, method, options.get("distances", DISTANCES))
+        found = _without_joint(calibration, method)
     reasons, words = _left_out(calibration, method)
     if reasons:  # with the words of those that the estimate excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
@@ -217,7 +229,7 @@ def sight_of(prepared):
     return {"field_of_view": prepared.session.lrf.field_of_view, "features": features}
 
 
-def _without_joint(calibration, method, distances):
+def _without_joint(calibration, method):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared, problems, joint = calibration.prepared, calibration.problems, calibration.joint
     solved = {camera: found for (camera, name), found in calibration.solutions.items() if name == method}
@@ -231,40 +243,31 @@ def _without_joint(calibration, method, distances):
     for camera in (c for c in prepared.views if c not in solved):
         words = f"camera '{camera}' is not handed over ({problems.get((camera, method), 'no result')})"
         reasons.append(Reason(CARE, "cameras", words))
-    pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
-    noise = np.median([board.sigma_range for board in prepared.scans.values()])
-    field = _wide(pitch.min(), pitch.max())
-    return _expected(_plain_chains(calibration, solved), prepared.models, distances, field, noise, reasons)
-
-
-def _plain_chains(calibration, solved):
-    """Chains of cameras calibrated one by one, and of the cloud, whose range offset may be what the maker admits."""
-    platform, session, noise = calibration.platform, calibration.prepared.session, calibration.prepared.pitch_noise
-    rest = np.zeros((0, len(COLUMNS))), (noise.offset, noise.stretch)
-    head, sigma = pose_array(platform.T_head_lrf), np.zeros((len(COLUMNS),) * 2)
-    sigma[:4, :4], sigma[10, 10] = platform.covariance, session.lrf.admitted_offset**2
+    # the range offset of the cloud may be what the maker admits
+    platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
+    rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
+    head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
+    sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, "head", (sigma,), *rest)}
     for camera, found in solved.items():
-        sigma = block_diag(platform.covariance, found.trusted[:6, :6], np.zeros((3, 3)))
+        sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
         chains[camera] = Chain(head, pose_array(found.transform), session.cameras[camera].mount, (sigma,), *rest)
-    return chains
+    pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
+    noise = np.median([board.sigma_range for board in prepared.scans.values()])
+    return replace(_expected(chains, prepared.models, pitch, noise, reasons), sweep_mm=0.0)
 
 
-def _range_offset(joint):
-    """An offset of all ranges that no working range finder has: something that is stated must be wrong."""
-    solution, admitted = joint.solution.solution, joint.prepared.session.lrf.admitted_offset
-    offset = joint.solution.sensor["range_offset"]
+def contradicts_stated(joint):
+    """Reasons to doubt what is stated of sizes: a range offset that no maker admits, edges of another length."""
+    solution, lrf, reasons = joint.solution.solution, joint.prepared.session.lrf, []
+    offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
             f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
         )
-        yield Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words)
-
-
-def _size(joint):
-    """Edges in the cloud that contradict the stated ones."""
+        reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
     error, sigma = size_error(joint)
     if abs(error) > CONTRADICTS * sigma:
         length = 1000 * error * np.mean(list(joint.prepared.board.lengths().values()))
@@ -273,7 +276,8 @@ def _size(joint):
             f"{'longer' if error > 0 else 'shorter'} in the cloud than stated, {abs(error) / sigma:.0f} times the "
             f"expected error: {SIZES}"
         )
-        yield Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words)
+        reasons.append(Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words))
+    return reasons
 
 
 def _left_out(calibration, method):
@@ -292,43 +296,6 @@ def _left_out(calibration, method):
     return reasons, "" if reasons else f"{words}."
 
 
-def expected_errors(chains, models, distance, field):
-    """Standard deviations at one distance: 'cloud_mm' (chain None), and '<camera>_px' of each camera."""
-    out = {"cloud_mm": 1000 * float(_cloud(chains[None], distance, field).rms()[0])}
-    for camera, chain in chains.items():
-        if camera is not None:
-            middle = (field[0] + field[1]) / 2
-            found = projection_sigma(
-                chain, camera, models[camera], distance, (12, 9), image_pitch=middle, pitches=field
-            )
-            out[f"{camera}_px"] = float(found.rms()[0])
-    return out
-
-
-def _cloud(chain, distance, field):
-    return point_sigma(chain, BEARINGS, np.linspace(*field, 9), distance, reference=(field[0] + field[1]) / 2)
-
-
-def field_pitches(solution):
-    """First and last pitch over which errors are judged: as recorded, but not a narrow strip; radians."""
-    groups = (solution.data.face, solution.data.beam)
-    pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
-    return _wide(*((pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)))
-
-
-def _wide(low, high):
-    return min(low, (low + high) / 2 - LEAST_FIELD), max(high, (low + high) / 2 + LEAST_FIELD)
-
-
-def error_reasons(errors):
-    """Errors at 2 m that are too large for anybody."""
-    large = {name: value for name, value in errors.items() if not value <= POOR[name.rsplit("_", 1)[1]]}
-    if not large:
-        return []
-    bad = any(not value <= BAD[name.rsplit("_", 1)[1]] for name, value in large.items())
-    return [Reason(NO if bad else CARE, "error", f"the expected error at 2 m is {_error_words(large)}")]
-
-
 def diagnose(solution):
     """Weaknesses of a joint estimate and of the recording behind it.
 
@@ -340,56 +307,54 @@ def diagnose(solution):
     -------
     list of Reason
     """
-    checks = (
-        _convergence, _cameras, _unobservable, _placements, _pitch, _parallel, _distances, _misfit, _excluded,
-        _model_error, _noise, _dependent, _warnings,
-    )  # fmt: skip
-    return [reason for check in checks for reason in check(solution)]
+    iterations, view = solution.solution.iterations, solution.data.view
+    seen = {
+        name: int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
+        for number, name in enumerate(solution.transforms)
+    }
+    own = [words for words in solution.warnings if not words.startswith(SAID)]
+    findings = [
+        (not solution.converged, NO, "convergence", f"the estimate has not converged after {iterations} iterations"),
+        *(
+            (count < FEWEST, CARE, "cameras", f"camera '{name}' sees the board in {count} placements only")
+            for name, count in seen.items()
+        ),
+        (solution.unobservable, NO, "unobservable", f"the data do not determine {'; '.join(solution.unobservable)}"),
+        *_of_placements(solution),
+        *_of_residuals(solution),
+        *((True, CARE, "warning", words) for words in own),
+    ]
+    return [Reason(*reason) for found, *reason in findings if found]
 
 
-def _convergence(solution):
-    if not solution.converged:
-        n = solution.solution.iterations
-        yield Reason(NO, "convergence", f"the estimate has not converged after {n} iterations")
-
-
-def _cameras(solution):
-    """Cameras that hardly see a board (those that never do are left out by name)."""
-    view = solution.data.view
-    for number, name in enumerate(solution.transforms):
-        seen = int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
-        if seen < FEWEST:
-            yield Reason(CARE, "cameras", f"camera '{name}' sees the board in {seen} placements only")
-
-
-def _unobservable(solution):
-    if solution.unobservable:
-        yield Reason(NO, "unobservable", "the data do not determine " + "; ".join(solution.unobservable))
-
-
-def _placements(solution):
-    n = len(solution.boards)
-    if n < FEW:
-        words = f"{n} placements only, {FEW} or more are needed to see errors of the model"
-        yield Reason(NO if n < FEWEST else CARE, "placements", words)
-
-
-def _pitch(solution):
-    """Range of the pitch that shows the axis: of each placement, of the recording where a camera stands on the base."""
-    if not any(name in solution.solution.names for name in AXIS_NAMES):
-        return
-    data = solution.data
+def _of_placements(solution):
+    """What is weak about the recorded poses: rows of whether, answer, kind and words."""
+    data, boards, n = solution.data, solution.state.boards, len(solution.boards)
     on_head = data.view["used"] & (data.on_head[data.view["camera"]] if len(data.on_head) else False)
     pitch = np.hstack([data.face["pitch"], data.beam["pitch"], data.view["pitch"]])
     used = np.hstack([data.face["used"], data.beam["used"], on_head])
-    spans = _ranges(pitch, used)
-    span, where = (spans.max(), "within a placement") if np.all(data.on_head) else (np.ptp(pitch[used]), "")
-    if span < SMALL_PITCH:
-        words = f"the recorded pitch ranges over {np.degrees(span):.1f} deg only {where}".strip()
-        yield Reason(NO, "pitch", f"{words}: the tilt axis is hardly determined")
-    elif on_head.any() and _ranges(data.view["pitch"], on_head).max() < SMALL_IMAGE_PITCH:
-        words = "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"
-        yield Reason(CARE, "image pitch", words)
+    # the pitch shows the axis: of each placement, of the whole recording where a camera stands on the base
+    within = " within a placement" if np.all(data.on_head) else ""
+    span = (_ranges(pitch, used) if within else _ranges(pitch.reshape(1, -1), used.reshape(1, -1))).max()
+    axis = any(name in solution.solution.names for name in AXIS_NAMES)
+    flat = on_head.any() and _ranges(data.view["pitch"], on_head).max() < SMALL_IMAGE_PITCH
+    mean = boards[:, :, 2].mean(axis=0)
+    off = np.arccos(np.clip(boards[:, :, 2] @ mean / np.linalg.norm(mean), -1, 1)).max()
+    middles = boards[:, :, :3] @ np.append(outline(solution).mean(axis=0), 0.0) + boards[:, :, 3]
+    distance = np.linalg.norm(middles - solution.T_head_lrf.translation, axis=1)
+    return [
+        (n < FEW, NO if n < FEWEST else CARE, "placements",
+         f"{n} placements only, {FEW} or more are needed to see errors of the model"),
+        (axis and span < SMALL_PITCH, NO, "pitch",
+         f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{within}: the tilt axis is hardly determined"),
+        (axis and span >= SMALL_PITCH and flat, CARE, "image pitch",
+         "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"),
+        (n > 1 and off < PARALLEL, CARE, "parallel",
+         f"all boards are parallel (within {np.degrees(off):.1f} deg): lean them every way by 20 deg and more"),
+        (n > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance), CARE, "distance",
+         f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): errors elsewhere are "
+         "extrapolated, and the range offset is hard to tell from shifts"),
+    ]  # fmt: skip
 
 
 def _ranges(values, used):
@@ -398,81 +363,27 @@ def _ranges(values, used):
     return np.where(used.any(axis=1), high - low, 0.0)
 
 
-def _parallel(solution):
-    normals = solution.state.boards[:, :, 2]
-    mean = normals.mean(axis=0) / np.linalg.norm(normals.mean(axis=0))
-    off = np.arccos(np.clip(normals @ mean, -1, 1)).max()
-    if off < PARALLEL and len(normals) > 1:
-        words = f"all boards are parallel (within {np.degrees(off):.1f} deg): lean them every way by 20 deg and more"
-        yield Reason(CARE, "parallel", words)
-
-
-def _distances(solution):
-    """Spread of the distances of the boards' middles from the head."""
-    middle = board_middles(solution)
-    distance = np.linalg.norm(middle - solution.T_head_lrf.translation, axis=1)
-    if len(distance) > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance):
-        words = (
-            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): errors elsewhere are "
-            "extrapolated, and the range offset is hard to tell from shifts"
-        )
-        yield Reason(CARE, "distance", words)
-
-
-def board_middles(solution):
-    """Middles of the boards in the platform frame, shape (p, 3), metres."""
-    middle = np.append(outline(solution).mean(axis=0), 0.0)
-    return solution.state.boards[:, :, :3] @ middle + solution.state.boards[:, :, 3]
-
-
-def _misfit(solution):
-    found = solution.misfit
-    level = max(np.median(list(found.values())), 1.0) if found else 1.0
-    bad = [p for p, value in found.items() if value > MISFIT * level]
-    if bad:
-        words = ", ".join(f"{p} ({np.sqrt(found[p] / level):.1f} times)" for p in bad)
-        yield Reason(CARE, "misfit", f"placements fit much worse than the others: {words}")
-
-
-def _excluded(solution):
-    if solution.excluded:
-        yield Reason(CARE, "excluded", "; ".join(solution.excluded.values()))
-
-
-def _model_error(solution):
-    """Scatter over placements against the propagated noise."""
-    clustered = solution.solution.covariance_placements
-    if clustered is None:
-        return
-    plain, scatter = group_sigma(solution.solution.covariance, solution), group_sigma(clustered, solution)
-    worst = max(plain, key=lambda name: scatter[name] / max(plain[name], 1e-12))
-    ratio = scatter[worst] / max(plain[worst], 1e-12)
-    if ratio > MODEL_ERROR:
-        what = "the axis" if worst == "axis" else f"camera '{worst}'"
-        words = f"placements disagree about {what} {ratio:.1f} times more than noise explains: an error of the model"
-        yield Reason(CARE, "model error", words)
-
-
-def _noise(solution):
-    """Noise estimated much larger than stated."""
-    found = {"ranges": solution.noise.get("face_scale", 1.0)}
-    found |= {"images": solution.noise.get("view_scale", 1.0)}
-    large = [f"{name} {scale:.1f} times" for name, scale in found.items() if scale > STATED]
-    if large:
-        words = "residuals are larger than the stated noise (" + ", ".join(large) + ")"
-        yield Reason(NO if max(found.values()) > ABSURD else CARE, "noise", words)
-
-
-def _dependent(solution):
-    """Ranges that repeat their neighbours' errors; beams about an edge always do, they share one background."""
-    share = solution.noise.get("face_share", 1.0)
-    if share < DEPENDENT:
-        words = "of the errors of ranges are independent: neighbours err alike (boards that bend, a pitch that is off)"
-        yield Reason(CARE, "dependent", f"only {100 * share:.0f} % {words}")
-
-
-def _warnings(solution):
-    """What the solver itself finds suspicious, as far as no other check says it."""
-    for words in solution.warnings:
-        if not words.startswith(("not converged", "the data do not determine")):
-            yield Reason(CARE, "warning", words)
+def _of_residuals(solution):
+    """What residuals and their scatter say against the model: rows of whether, answer, kind and words."""
+    level = max(np.median([*solution.misfit.values()]), 1.0) if solution.misfit else 1.0
+    bad = {p: np.sqrt(value / level) for p, value in solution.misfit.items() if value > MISFIT * level}
+    misfits = ", ".join(f"{p} ({times:.1f} times)" for p, times in bad.items())
+    clustered, ratio, worst = solution.solution.covariance_placements, {"axis": 0.0}, "axis"
+    if clustered is not None:
+        plain, scatter = (group_sigma(C, solution) for C in (solution.solution.covariance, clustered))
+        ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
+        worst = max(ratio, key=ratio.get)
+    what = "the axis" if worst == "axis" else f"camera '{worst}'"
+    noise = {"ranges": solution.noise.get("face_scale", 1.0), "images": solution.noise.get("view_scale", 1.0)}
+    large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
+    share = solution.noise.get("face_share", 1.0)  # beams about an edge always repeat errors: they share a background
+    return [
+        (bad, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
+        (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
+        (ratio[worst] > MODEL_ERROR, CARE, "model error",
+         f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: an error of the model"),
+        (large, NO if max(noise.values()) > ABSURD else CARE, "noise",
+         f"residuals are larger than the stated noise ({large})"),
+        (share < DEPENDENT, CARE, "dependent", f"only {100 * share:.0f} % of the errors of ranges are independent: "
+         "neighbours err alike (boards that bend, a pitch that is off)"),
+    ]  # fmt: skip

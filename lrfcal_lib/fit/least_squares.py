@@ -23,6 +23,7 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
 HUBER, CAUCHY = 1.345, 2.385  # 95 % efficiency for normal errors
+RANK = 1e-13  # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 
 
 @dataclass(frozen=True)
@@ -60,56 +61,27 @@ class Block:
         return self.whitener.shape[-1] if self.whitener.ndim > self.residuals.ndim else 1
 
 
-@dataclass(frozen=True)
-class Linear:
-    """Normal equations at one state."""
-
-    hessian: np.ndarray
-    gradient: np.ndarray
-    cost: np.ndarray
-    roots: list
-
-
 def whiten(block, jacobian=True):
     """Whitened residuals and (corrected) Jacobian of a block."""
     w, r = block.whitener, block.residuals
     J = block.jacobian if block.corrected is None else block.corrected
     if w.ndim == r.ndim:
         return w * r, (w[..., None] * J if jacobian else None)
-    d = w.shape[-1]
-    groups = r.shape[-1] // d
-    r = (w @ r.reshape(r.shape[:-1] + (groups, d, 1))).reshape(r.shape)
-    if jacobian:
-        J = (w @ J.reshape(J.shape[:-2] + (groups, d, J.shape[-1]))).reshape(J.shape)
-    return r, (J if jacobian else None)
+    groups = r.shape[:-1] + (-1, w.shape[-1])
+    r = (w @ r.reshape(groups + (1,))).reshape(r.shape)
+    return r, ((w @ J.reshape(groups + J.shape[-1:])).reshape(J.shape) if jacobian else None)
 
 
-def robust_weights(z, loss):
-    """Weights of the robust losses at residuals in units of the scale: ``huber``, ``cauchy`` or None (all 1)."""
+def robust(z, loss):
+    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale: huber, cauchy or None."""
     z = np.abs(z)
     if loss is None:
-        return np.ones_like(z)
+        return z**2, np.ones_like(z)
     if loss == "huber":
-        return np.where(z <= HUBER, 1.0, HUBER / np.maximum(z, HUBER))
+        return np.where(z <= HUBER, z**2, HUBER * (2 * z - HUBER)), HUBER / np.maximum(z, HUBER)
     if loss == "cauchy":
-        return 1.0 / (1.0 + (z / CAUCHY) ** 2)
+        return CAUCHY**2 * np.log1p((z / CAUCHY) ** 2), 1.0 / (1.0 + (z / CAUCHY) ** 2)
     raise ValueError(f"unknown loss {loss!r}: use None, 'huber' or 'cauchy'")
-
-
-def robust_rho(z, loss):
-    """Value of the losses, ``z^2`` near zero; see :func:`robust_weights`."""
-    z = np.abs(z)
-    if loss == "huber":
-        return np.where(z <= HUBER, z**2, HUBER * (2 * z - HUBER))
-    return CAUCHY**2 * np.log1p((z / CAUCHY) ** 2) if loss == "cauchy" else z**2
-
-
-def _group_sizes(block, r):
-    """Norm of each group of whitened residuals per root of its count, shape (..., n / d), and the counts."""
-    d = block.size
-    squares = r**2 if d == 1 else np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
-    count = np.broadcast_to(np.asarray(d if block.count is None else block.count, float), squares.shape)
-    return np.sqrt(squares / count), count
 
 
 @lru_cache(maxsize=4096)
@@ -118,29 +90,21 @@ def usual_size(count):
     return float(np.sqrt(chi2_distribution.ppf(0.5, count) / count))
 
 
-def _scale(block, z, count, scale, axes):
-    """Scale of a block's group sizes: given, or ('auto') from their median, per trial."""
-    if scale != "auto":
-        return float(scale)
-    inside = np.broadcast_to(
-        block.whitener != 0 if block.size == 1 else np.any(block.whitener != 0, axis=(-1, -2)), z.shape
-    )
-    sizes, index = np.unique(count, return_inverse=True)
-    expected = np.array([usual_size(float(size)) for size in sizes])[index].reshape(np.shape(count))
-    return np.maximum(np.nanmedian(np.where(inside, z / expected, np.nan), axis=axes, keepdims=True), 1e-9)
-
-
 def _weigh(block, loss, scale, axes):
     """Robust weights (..., n) of a block at its own state and the loss value summed over the trial."""
-    r, _ = whiten(block, jacobian=False)
-    if block.cost is not None:
-        return np.ones_like(r), 2 * np.sum(block.cost, axis=axes)
-    if loss is None:
-        return np.ones_like(r), np.sum(r**2, axis=axes)
-    z, count = _group_sizes(block, r)
-    unit = _scale(block, z, count, scale, axes)
-    weights = np.repeat(robust_weights(z / unit, loss), block.size, axis=-1)
-    return weights, np.sum(count * unit**2 * robust_rho(z / unit, loss), axis=axes)
+    r, d = whiten(block, jacobian=False)[0], block.size
+    if block.cost is not None or loss is None:
+        return np.ones_like(r), np.sum(r**2 if block.cost is None else 2 * block.cost, axis=axes)
+    squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
+    count = np.broadcast_to(np.asarray(d if block.count is None else block.count, float), squares.shape)
+    z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
+    if scale == "auto":
+        inside = block.whitener != 0 if d == 1 else np.any(block.whitener != 0, axis=(-1, -2))
+        sizes, index = np.unique(count, return_inverse=True)
+        usual = np.array([usual_size(float(size)) for size in sizes])[index].reshape(count.shape)
+        scale = np.maximum(np.nanmedian(np.where(inside, z / usual, np.nan), axis=axes, keepdims=True), 1e-9)
+    value, weights = robust(z / scale, loss)
+    return np.repeat(weights, d, axis=-1), np.sum(count * scale**2 * value, axis=axes)
 
 
 def _blocks(evaluate, state):
@@ -149,81 +113,74 @@ def _blocks(evaluate, state):
 
 
 def _linearise(blocks, loss, scale, axes):
-    """Normal equations of whitened, robustly weighted blocks, and the roots of the robust weights."""
+    """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the robust weights."""
     hessian = gradient = cost = 0.0
     roots = []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
-        root = np.sqrt(weights)
+        roots.append(np.sqrt(weights))
         r, J = whiten(block)
-        r, J = root * r, root[..., None] * J
+        r, J = roots[-1] * r, roots[-1][..., None] * J
         transposed = np.swapaxes(J, -1, -2)
         hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
         cost = cost + 0.5 * value
-        roots.append(root)
-    return Linear(hessian, gradient, cost, roots)
+    return hessian, gradient, cost, roots
 
 
 def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
-    total = 0.0
-    for block, root in zip(blocks, roots, strict=True):
-        if block.cost is not None:
-            total = total + np.sum(block.cost, axis=axes)
-            continue
-        r, _ = whiten(block, jacobian=False)
-        total = total + 0.5 * np.sum((root * r) ** 2, axis=axes)
-    return total
+    each = (
+        0.5 * (root * whiten(block, jacobian=False)[0]) ** 2 if block.cost is None else block.cost
+        for block, root in zip(blocks, roots, strict=True)
+    )
+    return sum(np.sum(cost, axis=axes) for cost in each)
 
 
-def _damped(hessian, damping):
-    """``H + damping diag(H)`` with a floor, so that an unobservable unknown stays where it is."""
-    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
-    floor = 1e-14 * np.max(diagonal, axis=-1, keepdims=True) + 1e-300
-    extra = np.asarray(damping)[..., None] * diagonal + floor
-    return hessian + extra[..., None] * np.eye(hessian.shape[-1])
+def eliminate(hessian, gradient, shared, rcond=1e-13):
+    """Schur complement: what each placement says about the shared unknowns once its own are eliminated.
+
+    Parameters
+    ----------
+    hessian, gradient : ndarray, shapes (p, k, k) and (p, k)
+        The first `shared` = c unknowns are common to all placements.
+    rcond : float or None
+        Smaller eigenvalues of the placements' own blocks are no information; None where the blocks are regular.
+
+    Returns
+    -------
+    reduced, right : ndarray, shapes (p, c, c) and (p, c)
+    back : ndarray, shape (p, k - c, c + 1)
+        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a placement's own.
+    """
+    c = shared
+    known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
+    own = hessian[:, c:, c:]
+    back = np.linalg.solve(own, known) if rcond is None else np.linalg.pinv(own, rcond=rcond, hermitian=True) @ known
+    taken = hessian[:, :c, c:] @ back
+    return hessian[:, :c, :c] - taken[..., :c], gradient[:, :c] - taken[..., c], back
 
 
-def dense_step(linear, damping):
-    """Damped step of independent trials, shape (..., k)."""
-    return -np.linalg.solve(_damped(linear.hessian, damping), linear.gradient[..., None])[..., 0]
+def reduced_hessian(hessian, shared):
+    """What each placement says about the shared unknowns once its own are eliminated, shape (p, c, c)."""
+    return eliminate(hessian, np.zeros(hessian.shape[:2]), shared)[0]
 
 
-def schur_step(linear, damping, shared):
-    """Damped step of an arrow-shaped problem: of the shared unknowns (c,) and of each placement's own (p, l)."""
-    H = _damped(linear.hessian, np.full(len(linear.hessian), damping))
-    g, c = linear.gradient, shared
-    back = np.linalg.solve(H[:, c:, c:], np.concatenate([H[:, c:, :c], g[:, c:, None]], axis=-1))
-    reduced = np.sum(H[:, :c, :c] - H[:, :c, c:] @ back[..., :c], axis=0)
-    right = np.sum(g[:, :c] - (H[:, :c, c:] @ back[..., c:])[..., 0], axis=0)
-    common = -np.linalg.solve(reduced, right)
-    return common, -(back[..., c] + back[..., :c] @ common)
-
-
-def _step(linear, damping, shared):
+def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it promises."""
+    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    extra = np.asarray(damping)[..., None] * diagonal
+    extra = extra + 1e-14 * np.max(diagonal, axis=-1, keepdims=True) + 1e-300  # what nobody sees stays where it is
+    damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared is None:
-        step = whole = dense_step(linear, damping)
+        step = whole = -np.linalg.solve(damped, gradient[..., None])[..., 0]
     else:
-        step = schur_step(linear, damping, shared)
-        whole = np.concatenate([np.broadcast_to(step[0], (len(step[1]), shared)), step[1]], axis=-1)
-    length = np.sum(whole * (linear.hessian @ whole[..., None])[..., 0], axis=-1)
-    promised = -np.sum(whole * linear.gradient, axis=-1) - 0.5 * length
+        reduced, right, back = eliminate(damped, gradient, shared, rcond=None)
+        common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
+        step = common, -(back[..., shared] + back[..., :shared] @ common)
+        whole = np.concatenate([np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1)
+    length = np.sum(whole * (hessian @ whole[..., None])[..., 0], axis=-1)
+    promised = -np.sum(whole * gradient, axis=-1) - 0.5 * length
     return (step, length, promised) if shared is None else (step, np.sum(length), np.sum(promised))
-
-
-def _next_damping(damping, accepted, gain):
-    """Less damping where the linear model keeps its promise, more where it overshoots (large residuals)."""
-    worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
-    kept = np.where(gain > 0.8, 0.1 * damping, damping)
-    return np.clip(np.where(accepted & (gain > 0.5), kept, worse), 1e-12, 1e14)
-
-
-def _choose(accepted, new, old):
-    """New states where accepted; a state is an array with leading trial axes or, in arrow problems, a tuple."""
-    if np.ndim(accepted) == 0:
-        return new if accepted else old
-    return np.where(accepted.reshape(accepted.shape + (1,) * (new.ndim - accepted.ndim)), new, old)
 
 
 def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max_iterations=60, tolerance=1e-8):
@@ -251,63 +208,51 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
     """
     axes = -1 if shared is None else (-2, -1)
     blocks = _blocks(evaluate, state)
-    linear = _linearise(blocks, loss, scale, axes)
-    history, converged = [linear.cost], np.zeros(np.shape(linear.cost), bool)
-    damping, iteration = np.full(np.shape(linear.cost), 1e-7), 0
+    hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+    history, converged = [cost], np.zeros(np.shape(cost), bool)
+    damping, iteration = np.full(np.shape(cost), 1e-7), 0
     while iteration < max_iterations and not np.all(converged):
         iteration += 1
-        step, length, promised = _step(linear, damping if shared is None else float(damping), shared)
+        step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
         tried = _blocks(evaluate, trial)
-        before, after = _frozen_cost(blocks, linear.roots, axes), _frozen_cost(tried, linear.roots, axes)
+        before, after = _frozen_cost(blocks, roots, axes), _frozen_cost(tried, roots, axes)
         accepted = after <= before * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * before)
-        gain = np.where(promised > 3e-15 * before, (before - after) / np.maximum(promised, 1e-300), 1.0)
         converged = converged | (small & np.isfinite(after) & (damping < 10.0))
-        state = _choose(accepted, trial, state)
-        blocks = tried if np.all(accepted) else _blocks(evaluate, state)
-        damping = _next_damping(damping, accepted, gain)
-        linear = _linearise(blocks, loss, scale, axes)
-        history.append(linear.cost)
+        if np.all(accepted):
+            state, blocks = trial, tried
+        elif np.any(accepted):
+            state = np.where(accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim)), trial, state)
+            blocks = _blocks(evaluate, state)
+        # less damping where the linear model keeps its promise, more where it overshoots (large residuals)
+        gain = np.where(promised > 3e-15 * before, (before - after) / np.maximum(promised, 1e-300), 1.0)
+        kept = np.where(gain > 0.8, 0.1, 1.0) * damping
+        worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
+        damping = np.clip(np.where(accepted & (gain > 0.5), kept, worse), 1e-12, 1e14)
+        hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+        history.append(cost)
     return state, (bool(converged) if converged.ndim == 0 else converged), iteration, np.array(history)
 
 
-def _whole(blocks, loss, scale, axes):
-    """Whitened residuals, Jacobian and robust weights of all blocks side by side."""
-    parts = [(*whiten(b), _weigh(b, loss, scale, axes)[0]) for b in blocks]
-    return (np.concatenate([p[i] for p in parts], axis=-1 if i != 1 else -2) for i in range(3))
+def minimise_in_rounds(freeze, state, retract, rounds, **options):
+    """Minimise a few times with what depends on the state frozen anew (weights, say).
 
-
-def _inflation(chi2, freedom):
-    """Chi-square per degree of freedom where it is above the 99.9 % limit of the stated noise, otherwise 1."""
-    if freedom <= 0:
-        return np.ones_like(chi2)
-    return np.where(chi2 > chi2_distribution.ppf(0.999, freedom), chi2 / freedom, 1.0)
+    `freeze` makes a problem, ``(state, round) -> evaluate``; `options` are those of :func:`minimise`. Returns the
+    problem that is left to solve, the state there, and the cost histories so far.
+    """
+    earlier = []
+    for number in range(rounds):
+        state, _, _, history = minimise(freeze(state, number), state, retract, **options)
+        earlier.append(history)
+    return freeze(state, rounds), state, earlier
 
 
 def solve(
-    evaluate,
-    start,
-    retract,
-    *,
-    names,
-    method,
-    read,
-    scales=None,
-    words=None,
-    groups=None,
-    freedom=None,
-    shared=None,
-    loss=None,
-    scale=1.0,
-    max_iterations=60,
-    tolerance=1e-8,
-    required=True,
-    n_observations=None,
-    limit=1.0,
-    chi2_rest=0.0,
-    earlier=(),
-):
+    evaluate, start, retract, *, names, method, read, scales=None, words=None, groups=None, freedom=None, shared=None,
+    loss=None, scale=1.0, max_iterations=60, tolerance=1e-8, required=True, n_observations=None, limit=1.0,
+    chi2_rest=0.0, earlier=(),
+):  # fmt: skip
     """Minimise, then report covariances and what was not observed.
 
     Parameters
@@ -319,8 +264,8 @@ def solve(
     method : str
     read : callable
         ``state -> (transform or None, parameters)``.
-    scales : array_like, optional
-        See :func:`lrfcal_lib.fit.least_squares.null_space`; ones by default.
+    scales, limit : array_like and float, optional
+        See :func:`null_space`; ones by default.
     words : callable, optional
         ``direction (k,) -> str``; the names with the largest components by default.
     groups : array_like, shape (n,), optional
@@ -330,8 +275,6 @@ def solve(
     required : bool
         Raise when something stays unobservable (single problems only).
     n_observations : int, optional
-    limit : float
-        See :func:`lrfcal_lib.fit.least_squares.null_space`.
     chi2_rest : float or ndarray
         Chi-square that no unknown can change (compressed away), added for the inflation.
     earlier : sequence of ndarray
@@ -353,42 +296,50 @@ def solve(
         raise ValueError(f"{method}: residuals at the start value are not finite: check the observations and T0")
     about = {"shared": shared, "loss": loss, "scale": scale, "max_iterations": max_iterations, "tolerance": tolerance}
     state, converged, iterations, history = minimise(evaluate, start, retract, **about)
-    r, J, weights = _whole(_blocks(evaluate, state), loss, scale, axes)
-    hessians, scores = by_placement(r, J, weights, groups, shared)
+    parts = [(*whiten(block), _weigh(block, loss, scale, axes)[0]) for block in _blocks(evaluate, state)]
+    r, J, weights = (np.concatenate([p[i] for p in parts], axis=-1 if i != 1 else -2) for i in range(3))
+    hessians, scores = _by_placement(r, J, weights, groups, shared)
     hessian = np.sum(hessians, axis=-3)
-    k = hessian.shape[-1]
-    scales = np.ones(k) if scales is None else scales
-    lost = unobservable_motions(hessian, scales, words or (lambda d: name_words(d, names)), limit)
+    scales = np.ones(hessian.shape[-1]) if scales is None else np.asarray(scales)
+    lost = null_space(hessian, scales, limit)[0] if hessian.ndim == 2 else ()
+    lost = tuple((words or (lambda direction: name_words(direction, names)))(direction) for direction in lost)
     if required and lost:
         raise DegenerateGeometry(f"{method}: the data do not determine " + "; ".join(lost))
     chi2 = np.sum(weights * r**2, axis=axes) + chi2_rest
-    freedom = freedom if freedom is not None else _freedom(r, J, shared)
+    if freedom is None:
+        own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
+        freedom = r.size // chi2.size - own
     inflation = _inflation(chi2, freedom)
-    unit = np.asarray(scales)[:, None] * np.asarray(scales)
-    covariance = pseudo_inverse(hessian * unit) * unit * inflation[..., None, None]
-    covariance = with_infinities(covariance, hessian, scales)
-    clustered, _ = placement_covariance(hessians, scores) if (groups is not None or shared) else (None, None)
     transform, parameters = read(state)
-    iterations, history = _with_earlier(iterations, history, earlier)
-    fitted = {"residuals": r, "jacobian": J, "weights": weights, "chi2": chi2, "inflation": inflation, "state": state}
-    run = {"converged": converged, "iterations": iterations, "cost_history": history, "unobservable": lost}
-    spread = {"covariance": covariance, "covariance_placements": clustered}
-    titles = {"names": tuple(names), "method": method, "n_observations": n_observations or r.shape[-1]}
-    return Solution(transform, parameters, **titles, **run, **fitted, **spread)
+    return Solution(
+        transform, parameters, tuple(names), converged,
+        iterations=iterations + sum(len(costs) - 1 for costs in earlier),
+        cost_history=np.concatenate([*(costs[:-1] for costs in earlier), history]),
+        residuals=r, jacobian=J, weights=weights,
+        covariance=_covariance(hessian, scales) * inflation[..., None, None],
+        covariance_placements=None if groups is None and shared is None else placement_covariance(hessians, scores)[0],
+        unobservable=lost, method=method, n_observations=n_observations or r.shape[-1], chi2=chi2, inflation=inflation,
+        state=state,
+    )  # fmt: skip
 
 
-def _with_earlier(iterations, history, earlier):
-    """Iterations and cost history, with those of earlier rounds before them."""
-    return iterations + sum(len(h) - 1 for h in earlier), np.concatenate([*(h[:-1] for h in earlier), history])
+def _inflation(chi2, freedom):
+    """Chi-square per degree of freedom where it is above the 99.9 % limit of the stated noise, otherwise 1."""
+    if freedom <= 0:
+        return np.ones_like(chi2)
+    return np.where(chi2 > chi2_distribution.ppf(0.999, freedom), chi2 / freedom, 1.0)
 
 
-def _freedom(r, J, shared):
-    if shared is None:
-        return r.shape[-1] - J.shape[-1]
-    return r.size - shared - r.shape[0] * (J.shape[-1] - shared)
-
-
-RANK = 1e-13  # eigenvalues of scaled normal equations below this share of the largest are rounding errors
+def _by_placement(r, J, weights, groups, shared):
+    """Normal equations of the reported unknowns by placement (one group where they are not told apart)."""
+    weighted = np.swapaxes(weights[..., None] * J, -1, -2)
+    if shared is not None:
+        return reduced_hessian(weighted @ J, shared), (weighted @ r[..., None])[:, :shared, 0]
+    groups = np.zeros(r.shape[-1], int) if groups is None else np.asarray(groups)
+    rows = [groups == group for group in np.unique(groups)]
+    hessians = [weighted[..., here] @ J[..., here, :] for here in rows]
+    scores = [(weighted[..., here] @ r[..., here, None])[..., 0] for here in rows]
+    return np.stack(hessians, axis=-3), np.stack(scores, axis=-2)
 
 
 def null_space(hessian, scales, limit=1.0):
@@ -412,33 +363,16 @@ def null_space(hessian, scales, limit=1.0):
     """
     scales = np.asarray(scales, float)
     values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)
-    bad = values < np.maximum(RANK * values[-1], limit**-2)
-    directions = (_simplest_basis(vectors[:, bad]) * scales[:, None]).T
-    peak = np.max(np.abs(directions), axis=1, keepdims=True) if len(directions) else 1.0
-    return directions / peak, np.sqrt(np.maximum(values, 0.0))
-
-
-def _simplest_basis(vectors):
-    """The basis of a null space with most zeros (reduced echelon form, pivots at the largest entries)."""
-    basis = vectors.T.copy()
-    used = []
-    for _ in range(len(basis)):
-        rows = [i for i in range(len(basis)) if i not in used]
-        row, column = np.unravel_index(np.argmax(np.abs(basis[rows])), (len(rows), basis.shape[1]))
-        row = rows[row]
-        used.append(row)
-        basis[row] /= basis[row, column]
-        for other in range(len(basis)):
-            basis[other] -= (other != row) * basis[other, column] * basis[row]
-    basis[np.abs(basis) < 1e-5] = 0.0
-    return basis.T
-
-
-def unobservable_motions(hessian, scales, words, limit):
-    """Unobservable motions of a single problem in words."""
-    if hessian.ndim > 2:
-        return ()
-    return tuple(words(direction) for direction in null_space(hessian, scales, limit)[0])
+    basis = vectors[:, values < np.maximum(RANK * values[-1], limit**-2)].T
+    open_rows = list(range(len(basis)))
+    while open_rows:  # reduced echelon form with pivots at the largest entries: the basis with most zeros
+        row, column = np.unravel_index(np.argmax(np.abs(basis[open_rows])), (len(open_rows), basis.shape[1]))
+        pivot = open_rows.pop(row)
+        basis[pivot] /= basis[pivot, column]
+        others = np.arange(len(basis)) != pivot
+        basis[others] -= basis[others, column, None] * basis[pivot]
+    directions = np.where(np.abs(basis) < 1e-5, 0.0, basis) * scales
+    return directions / np.max(np.abs(directions), axis=1, keepdims=True), np.sqrt(np.maximum(values, 0.0))
 
 
 def pseudo_inverse(hessian):
@@ -448,39 +382,24 @@ def pseudo_inverse(hessian):
     return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 
-def with_infinities(covariance, hessian, scales):
-    """Covariances in which unknowns that take part in an undetermined direction have an infinite variance.
+def _covariance(hessian, scales):
+    """Inverse of normal equations. Unknowns that take part in an undetermined direction have an infinite variance.
 
-    Parameters
-    ----------
-    covariance, hessian : ndarray, shape (..., k, k)
-    scales : array_like, shape (k,)
-
-    Returns
-    -------
-    ndarray, shape (..., k, k)
-        A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to zero.
+    A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to zero.
     """
+    unit = scales[:, None] * scales
+    covariance = pseudo_inverse(hessian * unit) * unit
     if hessian.ndim > 2:
         return covariance
-    lost = null_space(hessian, scales, np.inf)[0]
-    taking_part = np.any(np.abs(lost) > 0.05, axis=0)
-    if not taking_part.any():
-        return covariance
-    covariance = np.where(taking_part[:, None] | taking_part, 0.0, covariance)
-    return covariance + np.diag(np.where(taking_part, np.inf, 0.0))
+    lost = np.any(np.abs(null_space(hessian, scales, np.inf)[0]) > 0.05, axis=0)
+    covariance = np.where(lost[:, None] | lost, 0.0, covariance)
+    return covariance + np.diag(np.where(lost, np.inf, 0.0))
 
 
-def name_words(direction, names):
-    large = [name for name, value in zip(names, direction, strict=True) if abs(value) > 0.05]
-    return " with ".join(large)
-
-
-def reduced_hessian(hessian, shared):
-    """What each placement says about the shared unknowns once its own are eliminated, shape (p, c, c)."""
-    c = shared
-    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
-    return hessian[:, :c, :c] - hessian[:, :c, c:] @ inverse @ hessian[:, c:, :c]
+def name_words(direction, names, share=0.05):
+    """Names (or words) of the unknowns with the largest components of a direction."""
+    large = np.abs(direction) > share * np.max(np.abs(direction))
+    return " with ".join(np.asarray(names)[large])
 
 
 def placement_covariance(hessians, scores):
@@ -500,31 +419,10 @@ def placement_covariance(hessians, scores):
         Change of the estimate when that placement is left out.
     """
     groups = hessians.shape[-3]
-    rest = np.sum(hessians, axis=-3, keepdims=True) - hessians
-    diagonal = np.sqrt(np.maximum(np.diagonal(np.sum(hessians, axis=-3), axis1=-2, axis2=-1), 1e-300))[..., None, :]
-    scaled = rest / (diagonal[..., :, None] * diagonal[..., None, :])
+    total = np.sum(hessians, axis=-3, keepdims=True)
+    diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
+    scaled = (total - hessians) / (diagonal[..., :, None] * diagonal[..., None, :])
     if groups < 3 or np.min(np.linalg.eigvalsh(scaled)[..., 0]) < 1e-12:
         return None, None
     shifts = np.linalg.solve(scaled, (scores / diagonal)[..., None])[..., 0] / diagonal
-    centred = np.swapaxes(shifts, -1, -2) @ shifts
-    return (groups - 1) / groups * centred, shifts
-
-
-def _placement_sums(r, J, weights, groups):
-    """Normal equations of each placement, shapes (..., g, k, k) and (..., g, k)."""
-    groups = np.asarray(groups)
-    hessians, scores = [], []
-    for group in np.unique(groups):
-        rows = groups == group
-        weighted = np.swapaxes(weights[..., rows, None] * J[..., rows, :], -1, -2)
-        hessians.append(weighted @ J[..., rows, :])
-        scores.append((weighted @ r[..., rows, None])[..., 0])
-    return np.stack(hessians, axis=-3), np.stack(scores, axis=-2)
-
-
-def by_placement(r, J, weights, groups, shared):
-    """Normal equations of the reported unknowns by placement (one group where they are not told apart)."""
-    if shared is None:
-        return _placement_sums(r, J, weights, np.zeros(r.shape[-1], int) if groups is None else groups)
-    weighted = np.swapaxes(weights[..., None] * J, -1, -2)
-    return reduced_hessian(weighted @ J, shared), (weighted @ r[..., None])[:, :shared, 0]
+    return (groups - 1) / groups * np.swapaxes(shifts, -1, -2) @ shifts, shifts

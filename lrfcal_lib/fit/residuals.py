@@ -10,12 +10,13 @@ from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
-from lrfcal_lib.model.camera import distort, line_through, undistort
+from lrfcal_lib.model.camera import line_distance, line_through, project, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     axis_of,
     cross,
     gradient_by_pose,
+    hat,
     head_from_axis,
     move_pose,
     moved_noise,
@@ -27,41 +28,32 @@ from lrfcal_lib.model.geometry import (
 )
 
 
-def line_block(pose, points, covariance, lines, line_sigma, model):
-    """Whitened-to-be distances d(e, ab) of projected crossings from their image lines.
+def line_block(pose, obs):
+    """Distances d(e, ab) of projected crossings from their image lines, pixels; equations (16), (19) and (20).
+
+    The sign of the distance is kept, and behind the camera the formula goes on (mirrored), so that a poor start value
+    can still find its way. The whitener holds the crossing's covariance, projected, and the line's.
 
     Parameters
     ----------
     pose : ndarray, shape (..., 3, 4)
         ``T_camera_source``.
-    points : ndarray, shape (..., n, 3)
-        Crossings, source frame, metres.
-    covariance : ndarray, shape (..., n, 3, 3)
-    lines : ndarray, shape (..., n, 3)
-        Undistorted pixel lines with unit normal.
-    line_sigma : ndarray, shape (..., n)
-        Pixels.
-    model : CameraModel
+    obs : CameraObservations
 
     Returns
     -------
     Block
-        Residuals in pixels; the whitener holds the crossing's covariance projected through the pinhole and the line's.
-
-    Notes
-    -----
-    Equations (16), (19) and (20), with the sign of the distance. Behind the camera the formula goes on (mirrored), so
-    that a poor start value can still find its way.
     """
-    rotated = rotate_points(pose, points)
+    lines, model = obs.crossing_lines, obs.model
+    rotated = rotate_points(pose, obs.crossing_points)
     q = rotated + pose[..., None, :, 3]
     a, b = lines[..., 0] * model.fx, lines[..., 1] * model.fy
     x, y, z = q[..., 0], q[..., 1], q[..., 2]
     slope = (a * x + b * y) / z
     residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
     gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
-    shift = moved_noise(pose, gradient, covariance)
-    variance = np.sum(shift * gradient, axis=-1) + np.asarray(line_sigma) ** 2
+    shift = moved_noise(pose, gradient, obs.crossing_covariance)
+    variance = np.sum(shift * gradient, axis=-1) + obs.crossing_line_sigma**2
     jacobian = gradient_by_pose(rotated, gradient)
     corrected = jacobian - noise_correction(rotated, q, gradient, shift, residuals / variance)
     return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
@@ -89,29 +81,16 @@ def edge_residuals_px(obs, transform, model=None):
     ndarray, shape (n,)
         Undistorted pixels; positive outside the board.
     """
-    lines = obs.crossing_lines if model is None else _moved_lines(obs, transform, model)
-    sigma = np.ones(len(obs.crossing_points))
-    return line_block(
-        pose_array(transform), obs.crossing_points, obs.crossing_covariance, lines, sigma, model or obs.model
-    ).residuals
-
-
-def _moved_lines(obs, transform, model):
-    """The image lines of the crossings under other intrinsics."""
-    if len(obs.crossing_points) == 0:
-        return obs.crossing_lines
-    old, lines = obs.model, obs.crossing_lines
-    q = transform.apply(obs.crossing_points)
-    uv = q[:, :2] / q[:, 2:] * [old.fx, old.fy] + [old.cx, old.cy]
-    foot = uv - (np.sum(uv * lines[:, :2], axis=1) + lines[:, 2])[:, None] * lines[:, :2]
-    along = np.stack([-lines[:, 1], lines[:, 0]], axis=1) * 10.0
-    focal, centre = np.array([old.fx, old.fy]), np.array([old.cx, old.cy])
-    ends = [
-        undistort(distort((p - centre) / focal, old.distortion) * focal + centre, model)
-        for p in (foot - along, foot + along)
-    ]
-    found = line_through(*ends)
-    return found * np.sign(np.sum(found[:, :2] * lines[:, :2], axis=1))[:, None]
+    if model is not None and len(obs.crossing_points):
+        lines, to_rays = obs.crossing_lines, np.linalg.inv(obs.model.matrix).T
+        q = transform.apply(obs.crossing_points) @ obs.model.matrix.T
+        uv = q[:, :2] / q[:, 2:]
+        foot, along = uv - line_distance(uv, lines)[:, None] * lines[:, :2], lines[:, [1, 0]] * [10.0, -10.0]
+        rays = (np.column_stack([foot + side * along, np.ones(len(foot))]) @ to_rays for side in (-1, 1))
+        moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
+        moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
+        obs = replace(obs, crossing_lines=moved, model=model)
+    return line_block(pose_array(transform), obs).residuals
 
 
 def plane_residuals_m(obs, transform, board_poses=None):
@@ -132,14 +111,9 @@ def plane_residuals_m(obs, transform, board_poses=None):
     """
     poses = obs.board_poses if board_poses is None else board_poses
     out = np.full(len(obs.plane_points), np.nan)
-    if len(obs.placements) == 0 or len(out) == 0:
-        return out
-    index = np.searchsorted(obs.placements, obs.plane_placement, sorter=np.argsort(obs.placements))
-    index = np.argsort(obs.placements)[np.minimum(index, len(obs.placements) - 1)]
-    known = obs.placements[index] == obs.plane_placement
-    normal, point = poses[index, :3, 2], poses[index, :3, 3]
-    distance = np.sum(normal * (transform.apply(obs.plane_points) - point), axis=1)
-    out[known] = distance[known]
+    row, known = np.nonzero(obs.placements[:, None] == obs.plane_placement)
+    normal, point = poses[row, :3, 2], poses[row, :3, 3]
+    out[known] = np.sum(normal * (transform.apply(obs.plane_points[known]) - point), axis=1)
     return out
 
 
@@ -242,11 +216,6 @@ def flip_sigma(softness, radius, step):
     return sigma, (soft / sigma) ** 2
 
 
-def _mills(z):
-    """``phi(z) / Phi(z)`` without overflow."""
-    return np.exp(-0.5 * z**2 - log_ndtr(z)) / ROOT_2PI
-
-
 def beam_terms(margin, sigma, hit, lapse=0.0):
     """Negative log likelihood of single beams near an edge.
 
@@ -276,9 +245,8 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
     log_p = log_ndtr(z)
-    mills = _mills(z)
-    weight = 1.0
-    cost = -log_p
+    mills = np.exp(-0.5 * z**2 - log_p) / ROOT_2PI  # phi(z) / Phi(z) without overflow
+    weight, cost = 1.0, -log_p
     if lapse:
         cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
         weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
@@ -321,7 +289,6 @@ def interval_terms(inner, outer, sigma):
 
 SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the beam has no range noise across it
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
-EXTRA = ("size",)  # one unknown an edge
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
 USUAL = {"edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}  # and how widely they may differ
@@ -457,12 +424,16 @@ class JointData:
     prior: PlatformPrior | None = None
 
 
-def pad(group, count):
-    """Rows of a group sorted into a rectangle by placement."""
+def pad(group, count, width=1):
+    """Arrays of a group (with `placement`, an index below `count`) sorted into rectangles (count, n, ...).
+
+    Rows of a placement keep their order; zeros stand behind them, and `used` marks what is no padding. n is `width` at
+    least.
+    """
     place = group["placement"]
     order = np.argsort(place, kind="stable")
     number = np.bincount(place, minlength=count)
-    width = max(1, int(number.max(initial=0)))
+    width = int(number.max(initial=width))
     slot = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
     out = {}
     for key, value in group.items():
@@ -640,23 +611,12 @@ def view_chain(state, data):
     return camera, head, A, A @ np.swapaxes(back, -1, -2), board, y, on_head, by_parts
 
 
-def log_rotation(R):
-    """Rotation vectors of stacks of matrices."""
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
-
-
-def _hat(v):
-    out = np.zeros(v.shape + (3,))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return out - np.swapaxes(out, -1, -2)
-
-
 def inverse_left_jacobian(w):
     """How a small turn of a rotation changes its rotation vector, shape (..., 3) -> (..., 3, 3)."""
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     safe = np.maximum(angle, 1e-4)
     bend = np.where(angle > 1e-4, 1 / safe**2 - 1 / (2 * safe * np.tan(safe / 2)), 1 / 12)
-    W = _hat(w)
+    W = hat(w)
     return np.eye(3) - 0.5 * W + bend * (W @ W)
 
 
@@ -665,7 +625,7 @@ def view_block(state, data, unknowns):
     camera, head, A, B, board, y, on_head, by_parts = view_chain(state, data)
     R, t = B @ board[..., :3], (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
     pose = data.view["pose"]
-    w = log_rotation(R @ np.swapaxes(pose[..., :3, :3], -1, -2))
+    w = Rotation.from_matrix(R @ np.swapaxes(pose[..., :3, :3], -1, -2)).as_rotvec()
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
     left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
 
@@ -673,10 +633,10 @@ def view_block(state, data, unknowns):
         return np.concatenate([left @ turn, shift], axis=-2)
 
     moved = on_head[..., None, None]
-    by_head = np.concatenate([rows(-A, A @ _hat(y - head[..., 3])), rows(zero, -A)], axis=-1)
-    turn = rows(-A[..., :1], (A @ _hat(y))[..., :1]) * moved
+    by_head = np.concatenate([rows(-A, A @ hat(y - head[..., 3])), rows(zero, -A)], axis=-1)
+    turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
     by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
-    own = np.concatenate([rows(eye, -_hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
+    own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
     cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
     np.put_along_axis(cameras, data.view["camera"][..., None, None, None], own[..., None, :], axis=-2)
     cameras = cameras.reshape(cameras.shape[:3] + (-1,))
@@ -811,9 +771,6 @@ def move_state(state, step, unknowns):
     )
 
 
-CHART = [1, 2, 4, 5]  # of [w, v]
-
-
 def chart_parameters(head):
     """The axis as angles out of and within the scan plane, and minus y, z of its foot, shape (4,)."""
     axis = axis_of(pose_transform(head))
@@ -845,7 +802,7 @@ def prior_terms(head, prior):
 def move_head(head, step):
     """Move a head pose array in the 4-dof chart."""
     delta = np.zeros(step.shape[:-1] + (6,))
-    delta[..., CHART] = step
+    delta[..., AXIS_COLUMNS] = step
     return move_pose(head, delta)
 
 

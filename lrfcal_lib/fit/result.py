@@ -1,4 +1,4 @@
-"""What every solver hands back, names of unknowns, and the checks that every solver begins with."""
+"""What every solver hands back, and the names of unknowns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import DegenerateGeometry
 
 AXIS_NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "offset_in_scan_plane", "offset_across_scan_plane")
 AXIS_WORDS = (
@@ -120,10 +119,8 @@ class Solution:
         """
         if self.covariance_placements is None:
             return self.covariance
-        ratio = np.ones_like(self.sigma)
         known = (self.sigma > 0) & np.isfinite(self.sigma)
-        np.divide(self.sigma_placements, self.sigma, out=ratio, where=known)
-        grow = np.fmax(ratio, 1.0)
+        grow = np.fmax(np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known), 1.0)
         return grow[..., :, None] * self.covariance * grow[..., None, :]
 
     @property
@@ -132,34 +129,5 @@ class Solution:
         return np.sqrt(np.diagonal(self.trusted, axis1=-2, axis2=-1))
 
     def __repr__(self):
-        state = "converged" if np.all(self.converged) else "NOT converged"
-        return (
-            f"Solution({self.method}: {state} after {self.iterations} iterations, {self.n_observations} observations)"
-        )
-
-
-FIELDS = {
-    "crossing": ("crossing_points", "crossing_covariance", "crossing_lines", "crossing_line_sigma"),
-    "plane": ("plane_points", "plane_covariance", "board_poses", "board_covariance"),
-    "scene": ("scene_points", "scene_covariance", "scene_pixels", "scene_sigma_px"),
-}
-
-
-def check_finite(obs, kind):
-    """Refuse observations of a kind ('crossing', 'plane' or 'scene') that hold a NaN or an infinity."""
-    for name in FIELDS[kind]:
-        values = np.asarray(getattr(obs, name), float)
-        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            raise ValueError(
-                f"{name} of camera '{obs.camera}' is not finite in row {row}: {values[row].ravel()[:3]}: leave them out"
-            )
-
-
-def check_count(found, least, what, camera):
-    """Refuse too few observations, with words for what they leave open."""
-    if found < least:
-        raise DegenerateGeometry(
-            f"camera '{camera}': {found} {what}, at least {least} needed: the rest of the pose stays unobservable"
-        )
+        state = f"{'converged' if np.all(self.converged) else 'NOT converged'} after {self.iterations} iterations"
+        return f"Solution({self.method}: {state}, {self.n_observations} observations)"

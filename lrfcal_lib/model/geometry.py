@@ -458,12 +458,6 @@ def moved_noise(pose, gradient, covariance):
     return ((gradient @ pose[..., :3])[..., None, :] @ covariance)[..., 0, :] @ np.swapaxes(pose[..., :3], -1, -2)
 
 
-def propagated_variance(pose, gradient, covariance):
-    """Variance that a point's covariance (source frame) gives to scalars with the given gradient, shape (..., n)."""
-    row = gradient @ pose[..., :3]
-    return np.sum((row[..., None, :] @ covariance)[..., 0, :] * row, axis=-1)
-
-
 def axis_words(direction):
     """A direction in words: the name of an axis within 8 degrees, otherwise its components."""
     direction = np.asarray(direction, float) / np.linalg.norm(direction)

@@ -9,29 +9,62 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.geometry import DegenerateGeometry
+
+ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covariance is not told
+
+
+def check_finite(record, whose="", missing=()):
+    """Refuse a record with a NaN or an infinity in an array (those named in `missing` may have them)."""
+    for name, value in vars(record).items():
+        if name not in missing and isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            bad = ~np.isfinite(value)
+            if bad.any():
+                row = np.argwhere(bad)[0, 0]
+                raise ValueError(
+                    f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row {row} "
+                    f"({value[row].ravel()[:3]}): leave such observations out"
+                )
+
+
+class _Groups:
+    """Arrays in groups of equal length; the first word of a field's name tells its group."""
+
+    def group(self, name):
+        """Fields of one group of observations: dict of arrays without the group's prefix."""
+        return {f.name[len(name) + 1 :]: getattr(self, f.name) for f in fields(self) if f.name.startswith(name + "_")}
+
+    def keep(self, **masks):
+        """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
+        changed = {}
+        for name, mask in masks.items():
+            changed |= {f"{name}_{key}": value[mask] for key, value in self.group(name).items()}
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True)
-class CameraObservations:
+class CameraObservations(_Groups):
     """Paired observations of the board by the LRF and one camera, stacked over all placements.
 
     Points are in the *source* frame, the frame the camera is fixed to as seen from the LRF: ``platform`` for a camera
     on the base, ``lrf`` (at the pitch of the image) for a camera on the head. What a method estimates is
-    ``T_camera_source``.
+    ``T_camera_source``. What is not given is empty or has a default; many trials at once have a leading axis.
 
     Attributes
     ----------
+    model : CameraModel
     camera, source : str
         Name of the camera, and ``'platform'`` or ``'lrf'``.
-    model : CameraModel
     crossing_points : ndarray, shape (n, 3)
         Where a scan line crosses an edge of the board (E and F of equation (17)), metres.
     crossing_covariance : ndarray, shape (n, 3, 3)
+        A centimetre every way by default, as of the other points.
     crossing_lines : ndarray, shape (n, 3)
         The image line of that edge (ab and ac), undistorted pixels, unit normal pointing out of the board.
     crossing_line_sigma : ndarray, shape (n,)
-        Standard deviation of the image line at the crossing, pixels.
+        Standard deviation of the image line at the crossing, pixels; 0.5 by default.
     crossing_placement : ndarray of int, shape (n,)
+        Every row has a placement of its own by default, as of the other groups.
     crossing_edge : ndarray of str, shape (n,)
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
@@ -41,63 +74,114 @@ class CameraObservations:
     crossing_noise : ndarray, shape (n, 3, 3)
         The covariance without the beam spacing.
     crossing_radius : ndarray, shape (n,)
-        Of the beam's spot there, metres.
+        Of the beam's spot there, metres; 5 mm by default.
     crossing_background : ndarray, shape (n,)
         What the background adds to the log odds at which a reading flips from the board to it (see
         :mod:`lrfcal_lib.fit.residuals`).
-    plane_points : ndarray, shape (m, 3)
+    plane_points, plane_covariance : ndarray, shapes (m, 3) and (m, 3, 3)
         Points on the face of the board, metres.
-    plane_covariance : ndarray, shape (m, 3, 3)
     plane_placement : ndarray of int, shape (m,)
     placements : ndarray of int, shape (p,)
         Placements of which the camera knows the board's pose.
     board_poses : ndarray, shape (p, 4, 4)
         ``T_camera_board``.
     board_covariance : ndarray, shape (p, 6, 6)
-        Of ``[w, v]`` of the poses (see :mod:`lrfcal_lib`).
+        Of ``[w, v]`` of the poses (see :mod:`lrfcal_lib`); zeros (exact) by default.
     pattern_points : ndarray, shape (k, 3)
         Corners of the printed pattern in the board frame, metres; k = 0 without a pattern.
     pattern_pixels : ndarray, shape (p, k, 2)
         Their recorded pixels, NaN where not seen.
     pattern_sigma_px : float
         Standard deviation of one coordinate of a pattern corner.
-    scene_points : ndarray, shape (q, 3)
+    scene_points, scene_covariance : ndarray, shapes (q, 3) and (q, 3, 3)
         Points that LRF and camera can both name (outline corners: where fitted edges meet), metres.
-    scene_covariance : ndarray, shape (q, 3, 3)
     scene_pixels : ndarray, shape (q, 2)
         Undistorted pixels of the same points.
     scene_sigma_px : ndarray, shape (q,)
     scene_placement : ndarray of int, shape (q,)
+
+    Raises
+    ------
+    ValueError
+        When an observation is not finite.
+
+    Examples
+    --------
+    Six points on edges of a board, and the lines of these edges in the image of a camera 10 cm to the right:
+
+    >>> import numpy as np
+    >>> from lrfcal_lib.model.camera import CameraModel, line_through
+    >>> from lrfcal_lib.model.observations import CameraObservations
+    >>> from lrfcal_lib.solvers import solve_camera
+    >>> model = CameraModel(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> ahead = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # R of T_camera_lrf: x right, z where the LRF's y is
+    >>> points = np.array([[-1, 3, 0], [-0.6, 2, 0], [-0.1, 3, 0], [0.2, 2, 0], [0.7, 3, 0], [0.5, 2, 0.0]])
+    >>> seen = points @ ahead.T - [0.1, 0, 0]
+    >>> pixels = seen[:, :2] / seen[:, 2:] * 500.0 + [320.0, 240.0]
+    >>> turn = np.radians([80, 100, 35, 145, 60, 120])  # of the edges in the image
+    >>> lines = line_through(pixels, pixels + np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    >>> obs = CameraObservations(model, crossing_points=points, crossing_lines=lines)
+    >>> np.allclose(solve_camera(obs, "line").transform.translation, [-0.1, 0, 0])
+    True
     """
 
-    camera: str
-    source: str
     model: CameraModel
-    crossing_points: np.ndarray
-    crossing_covariance: np.ndarray
-    crossing_lines: np.ndarray
-    crossing_line_sigma: np.ndarray
-    crossing_placement: np.ndarray
-    crossing_edge: np.ndarray
-    crossing_across: np.ndarray
-    crossing_half_step: np.ndarray
-    crossing_noise: np.ndarray
-    crossing_radius: np.ndarray
-    crossing_background: np.ndarray
-    plane_points: np.ndarray
-    plane_covariance: np.ndarray
-    plane_placement: np.ndarray
-    placements: np.ndarray
-    board_poses: np.ndarray
-    board_covariance: np.ndarray
-    pattern_points: np.ndarray
-    pattern_pixels: np.ndarray
-    pattern_sigma_px: float
-    scene_points: np.ndarray
-    scene_covariance: np.ndarray
-    scene_pixels: np.ndarray
-    scene_sigma_px: np.ndarray
-    scene_placement: np.ndarray
+    camera: str = "camera"
+    source: str = "lrf"
+    crossing_points: np.ndarray | None = None
+    crossing_covariance: np.ndarray | None = None
+    crossing_lines: np.ndarray | None = None
+    crossing_line_sigma: np.ndarray | None = None
+    crossing_placement: np.ndarray | None = None
+    crossing_edge: np.ndarray | None = None
+    crossing_across: np.ndarray | None = None
+    crossing_half_step: np.ndarray | None = None
+    crossing_noise: np.ndarray | None = None
+    crossing_radius: np.ndarray | None = None
+    crossing_background: np.ndarray | None = None
+    plane_points: np.ndarray | None = None
+    plane_covariance: np.ndarray | None = None
+    plane_placement: np.ndarray | None = None
+    placements: np.ndarray | None = None
+    board_poses: np.ndarray | None = None
+    board_covariance: np.ndarray | None = None
+    pattern_points: np.ndarray | None = None
+    pattern_pixels: np.ndarray | None = None
+    pattern_sigma_px: float = 0.2
+    scene_points: np.ndarray | None = None
+    scene_covariance: np.ndarray | None = None
+    scene_pixels: np.ndarray | None = None
+    scene_sigma_px: np.ndarray | None = None
+    scene_placement: np.ndarray | None = None
+
+    def __post_init__(self):
+        points = (self.crossing_points, self.plane_points, self.scene_points, self.pattern_points)
+        n, m, q, k = (0 if rows is None else rows.shape[-2] for rows in points)
+        p = 0 if self.board_poses is None else self.board_poses.shape[-3]
+        defaults = {
+            "crossing_lines": np.zeros((0, 3)),
+            "crossing_line_sigma": np.full(n, 0.5),
+            "crossing_edge": np.full(n, ""),
+            "crossing_across": np.zeros(n, bool),
+            "crossing_half_step": np.zeros((n, 3)),
+            "crossing_noise": np.zeros((n, 3, 3)),
+            "crossing_radius": np.full(n, 0.005),
+            "crossing_background": np.zeros(n),
+            "placements": np.arange(p),
+            "board_poses": np.zeros((0, 4, 4)),
+            "board_covariance": np.zeros((p, 6, 6)),
+            "pattern_points": np.zeros((0, 3)),
+            "pattern_pixels": np.full((p, k, 2), np.nan),
+            "scene_pixels": np.zeros((0, 2)),
+            "scene_sigma_px": np.full(q, 0.5),
+        }
+        for group, count in (("crossing", n), ("plane", m), ("scene", q)):
+            defaults[f"{group}_points"] = np.zeros((0, 3))
+            defaults[f"{group}_covariance"] = np.tile(ROUGH_NOISE, (count, 1, 1))
+            defaults[f"{group}_placement"] = np.arange(count)
+        for name in (name for name in defaults if getattr(self, name) is None):
+            object.__setattr__(self, name, defaults[name])
+        check_finite(self, f" of camera '{self.camera}'", missing=("pattern_pixels",))
 
     @property
     def all_placements(self):
@@ -105,46 +189,41 @@ class CameraObservations:
         parts = (self.crossing_placement, self.plane_placement, self.placements, self.scene_placement)
         return np.unique(np.concatenate(parts))
 
+    def posed_faces(self):
+        """Placements with a board pose and points on the board, sorted."""
+        return np.intersect1d(self.placements, self.plane_placement)
+
+    def require(self, kind, least):
+        """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for what they leave open."""
+        found, what = {
+            "crossing": (self.crossing_placement, "crossings of scan lines with edges"),
+            "plane": (self.posed_faces(), "placements with a board pose and points on the board"),
+            "scene": (self.scene_placement, "scene points"),
+        }[kind]
+        if len(found) < least:
+            raise DegenerateGeometry(
+                f"camera '{self.camera}': {len(found)} {what}, at least {least} needed: "
+                "the rest of the pose stays unobservable"
+            )
+
     def along(self):
         """Without the edges found across the scan lines: what the paper works on."""
-        keep = ~self.crossing_across
-        names = [f.name for f in fields(self) if f.name.startswith("crossing_")]
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        return self.keep(crossing=~self.crossing_across)
 
     def select(self, placements):
-        """The observations of some placements only (for leave-one-out and random halves).
-
-        Parameters
-        ----------
-        placements : iterable of int
-
-        Returns
-        -------
-        CameraObservations
-        """
-        wanted = np.asarray(list(placements))
-        groups = {
-            "crossing_": np.isin(self.crossing_placement, wanted),
-            "plane_": np.isin(self.plane_placement, wanted),
-            "scene_": np.isin(self.scene_placement, wanted),
-        }
-        changed = {
-            f.name: getattr(self, f.name)[keep]
-            for f in fields(self)
-            for prefix, keep in groups.items()
-            if f.name.startswith(prefix)
-        }
-        keep = np.isin(self.placements, wanted)
-        for name in ("placements", "board_poses", "board_covariance", "pattern_pixels"):
-            changed[name] = getattr(self, name)[keep]
-        return replace(self, **changed)
+        """The observations of some placements (numbers) only."""
+        wanted = list(placements)
+        groups = ("crossing", "plane", "scene")
+        out = self.keep(**{group: np.isin(getattr(self, f"{group}_placement"), wanted) for group in groups})
+        known, boards = np.isin(self.placements, wanted), ("board_poses", "board_covariance", "pattern_pixels")
+        return replace(out, placements=self.placements[known], **{name: getattr(self, name)[known] for name in boards})
 
 
 GROUPS = ("face", "beam", "view")
 
 
 @dataclass(frozen=True)
-class JointObservations:
+class JointObservations(_Groups):
     """Ranges on boards, beams about their edges and board poses in images, of all placements.
 
     Every group has an array `<group>_placement` of indices into `placements`. Any group may be empty.
@@ -230,11 +309,7 @@ class JointObservations:
             object.__setattr__(self, "view_lens", np.zeros((len(self.view_camera), 6, 9)))
         if self.lens_covariance is None:
             object.__setattr__(self, "lens_covariance", np.zeros((len(self.cameras), 9, 9)))
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
-                bad = int((~np.isfinite(value)).sum())
-                raise ValueError(f"{field.name} holds {bad} values that are not finite: leave such observations out")
+        check_finite(self)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")
             if len(place) and not 0 <= place.min() <= place.max() < len(self.placements):
@@ -246,29 +321,8 @@ class JointObservations:
         """Sides of the board, see :meth:`lrfcal_lib.model.board.Board.lines`."""
         return outline_lines(self.corners)
 
-    def group(self, name):
-        """Fields of one group of observations: dict of arrays without the group's prefix."""
-        return {f.name[len(name) + 1 :]: getattr(self, f.name) for f in fields(self) if f.name.startswith(name + "_")}
-
-    def keep(self, **masks):
-        """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
-        changed = {}
-        for name, mask in masks.items():
-            changed |= {f"{name}_{key}": value[mask] for key, value in self.group(name).items()}
-        return replace(self, **changed)
-
     def select(self, placements):
-        """The observations of some placements only (for leave-one-out and random halves).
-
-        Parameters
-        ----------
-        placements : iterable of int
-            Numbers of placements.
-
-        Returns
-        -------
-        JointObservations
-        """
+        """The observations of some placements (numbers) only."""
         kept = np.flatnonzero(np.isin(self.placements, np.asarray(list(placements))))
         new = np.full(len(self.placements), -1)
         new[kept] = np.arange(len(kept))

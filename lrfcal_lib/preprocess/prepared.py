@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.preprocess import board_in_scan, edges_in_scan, survey
-from lrfcal_lib.preprocess.survey import Outline
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, edge_points, sweep_edges
+from lrfcal_lib.preprocess.survey import Outline, views_of
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import SessionError
 
-VARIANTS = ("last_beam", "half_step")
 LEAST_SWEEP = np.deg2rad(1.0)  # a placement whose pitch spans less is a single shot
 
 
@@ -99,57 +99,29 @@ class Prepared:
 
 @cached
 def prepare_scans(session):
-    """The board in every sweep of a session, and its edge points in both variants.
-
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    Prepared
-        Without cameras.
-    """
+    """The board in every sweep of a session, and its edge points in both variants; a Prepared without cameras."""
     scans, problems = {}, {}
     edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
     for placement in session.board_placements:
         try:
-            scans[placement] = board_in_scan.find_board(session.sweep(placement), session.board, session.T_head_lrf)
+            scan = scans[placement] = find_board(session.sweep(placement), session.board, session.T_head_lrf)
             for variant in VARIANTS:
-                edges[variant][placement] = edges_in_scan.edge_points(scans[placement], variant)
-                if np.ptp(scans[placement].sweep.pitch) > LEAST_SWEEP:
-                    swept[variant][placement] = edges_in_scan.sweep_edges(scans[placement], variant)
-        except (board_in_scan.BoardNotFound, SessionError) as error:
+                edges[variant][placement] = edge_points(scan, variant)
+                if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
+                    swept[variant][placement] = sweep_edges(scan, variant)
+        except (BoardNotFound, SessionError) as error:
             problems[placement] = str(error)
     return Prepared(session, session.board, scans, edges, swept, problems=problems)
 
 
 def prepare_images(prepared):
-    """The board in every image of a session, the cameras' intrinsics, and the board's outline.
-
-    Parameters
-    ----------
-    prepared : Prepared
-        With scans.
-
-    Returns
-    -------
-    Prepared
-    """
-    seen = survey.views_of(prepared.session, one_per_placement=True)
-    views = {camera: _main_views(found) for camera, found in seen.views.items()}
+    """The same with the board in every image of the session, the cameras' intrinsics, and the board's outline."""
+    seen, best = views_of(prepared.session, one_per_placement=True), {}
+    for camera, views in seen.views.items():
+        # the first of those with a pose and most edges; an image that belongs to no placement is left out
+        views = sorted(views, key=lambda view: (view.T_camera_board is None, -len(view.edges)))
+        first = {view.placement: view for view in reversed(views) if view.placement >= 0}
+        best[camera] = dict(sorted(first.items()))
     problems = prepared.problems | ({"outline": f"faces of the board only: {seen.unseen}"} if seen.unseen else {})
     found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
-    return replace(prepared, models=seen.models, views=views, **found)
-
-
-def _main_views(views):
-    """The view of every placement with a pose and most edges; images that belong to no placement are left out."""
-    best = {}
-    for view in views:
-        if view.placement < 0:
-            continue
-        rank = (view.T_camera_board is not None, len(view.edges))
-        if view.placement not in best or rank > best[view.placement][0]:
-            best[view.placement] = (rank, view)
-    return {placement: view for placement, (_, view) in sorted(best.items())}
+    return replace(prepared, models=seen.models, views=best, **found)

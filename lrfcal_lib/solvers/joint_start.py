@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -11,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.residuals import JointState
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points, pose_array
+from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
@@ -72,12 +72,10 @@ def thin(rows, count):
 def _camera_from_planes(obs, camera, views, points):
     """A camera's pose from its views of boards and points on these (a set for each view, in the camera's own frame)."""
     numbers = np.arange(len(views))
-    return start_from_planes(SimpleNamespace(
-        camera=obs.cameras[camera], placements=numbers, plane_points=np.concatenate(points),
-        plane_placement=np.repeat(numbers, [len(p) for p in points]),
-        plane_covariance=np.broadcast_to(1e-4 * np.eye(3), (sum(map(len, points)), 3, 3)),
-        board_poses=obs.view_pose[views], board_covariance=obs.view_covariance[views],
-    ))  # fmt: skip
+    key = np.repeat(numbers, [len(p) for p in points])
+    planes = {"plane_points": np.concatenate(points), "plane_placement": key}
+    boards = {"board_poses": obs.view_pose[views], "board_covariance": obs.view_covariance[views]}
+    return start_from_planes(CameraObservations(None, obs.cameras[camera], **planes, **boards))
 
 
 def _camera_at_image_pitch(obs, camera):

@@ -1,27 +1,17 @@
-"""Cameras from lines (eqs. 16-21), by likelihood, after Wasielewski and Strauss, after Bauermann; odd placements."""
+"""Residuals of cameras from lines (eqs. 16-21), by likelihood, after Wasielewski and Strauss, after Bauermann."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import cv2
 import numpy as np
-from scipy.stats import chi2
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.least_squares import Block, minimise, solve
-from lrfcal_lib.fit.residuals import (
-    edge_residuals_px,
-    edge_shift,
-    interval_terms,
-    line_block,
-    plane_residuals_m,
-    read_pose,
-    sight_block,
-    sight_normals,
-)
-from lrfcal_lib.fit.result import check_count, check_finite
+from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
+from lrfcal_lib.fit.residuals import edge_shift, interval_terms, line_block, read_pose, sight_block, sight_normals
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
+    DegenerateGeometry,
     apply_pose,
     gradient_by_pose,
     motion_words,
@@ -29,189 +19,88 @@ from lrfcal_lib.model.geometry import (
     moved_noise,
     noise_correction,
     pose_array,
-    pose_parameters,
     pose_transform,
-    propagated_variance,
     rotate_points,
 )
-from lrfcal_lib.solvers.planes import solve_zhang_pless, starting_transform
+from lrfcal_lib.solvers.planes import shifted, start_rotations
 
 
-def solve_lines(obs, T0=None, *, loss=None, scale=1.0, weighted=True, max_iterations=60, required=True):
-    """The pose of a camera from board edges (the method of the paper).
+def distance_block(pose, obs):
+    """Distances of crossings from the planes of sight (Wasielewski and Strauss), metres, with the noise of both.
+
+    Weighted by it, the method is the same as with :func:`lrfcal_lib.fit.residuals.line_block` to first order: the two
+    residuals differ by a factor (depth / focal length) that the weights take out.
+    """
+    normals, length = sight_normals(obs.crossing_lines, obs.model)
+    plain = sight_block(pose, obs.crossing_points, normals, 1.0)
+    rotated = rotate_points(pose, obs.crossing_points)
+    q = rotated + pose[..., None, :, 3]
+    shift = moved_noise(pose, normals, obs.crossing_covariance)
+    line = (obs.crossing_line_sigma / length) ** 2 * q[..., 2]
+    variance = np.sum(shift * normals, axis=-1) + line * q[..., 2]
+    factor = plain.residuals / variance
+    deeper = gradient_by_pose(rotated, np.broadcast_to([0.0, 0.0, 1.0], q.shape))
+    change = noise_correction(rotated, q, normals, shift, factor, pinhole=False) + (factor * line)[..., None] * deeper
+    return Block(plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=plain.jacobian - change)
+
+
+def point_block(pose, obs):
+    """Reprojection errors of named points (Bauermann), pixels; a loss judges u and v of a point together."""
+    rotated = rotate_points(pose, obs.scene_points)
+    q, model, covariance = rotated + pose[..., None, :, 3], obs.model, obs.scene_covariance
+    by_point = pinhole_jacobian(q, model)
+    projected = q[..., :2] / q[..., 2:] * [model.fx, model.fy] + [model.cx, model.cy]
+    errors = projected - obs.scene_pixels
+    turned = by_point @ pose[..., None, :, :3]
+    noise = turned @ covariance @ np.swapaxes(turned, -1, -2) + obs.scene_sigma_px[..., None, None] ** 2 * np.eye(2)
+    force = np.linalg.solve(noise, errors[..., None])
+    shift = (covariance @ np.swapaxes(turned, -1, -2) @ force)[..., 0] @ np.swapaxes(pose[..., :3], -1, -2)
+    one, gradients = np.ones(errors.shape[:-1]), (by_point[..., 0, :], by_point[..., 1, :])
+    rows = np.stack([gradient_by_pose(rotated, g) for g in gradients], axis=-2)
+    change = np.stack([noise_correction(rotated, q, g, shift, one) for g in gradients], axis=-2)
+    shape = errors.shape[:-2] + (-1,)
+    rows, corrected = (x.reshape(shape + (6,)) for x in (rows, rows - change))
+    return Block(errors.reshape(shape), rows, np.linalg.inv(np.linalg.cholesky(noise)), corrected=corrected)
+
+
+def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
+    """The pose of a camera by least squares, from a residual that depends on nothing else.
 
     Parameters
     ----------
+    residual : callable
+        ``residual(pose, obs) -> Block``.
     obs : CameraObservations
-        Its crossings are used.
-    T0 : RigidTransform, optional
-        Start value of ``T_camera_source``; found by :func:`lrfcal_lib.solvers.planes.starting_transform` when left out.
-    loss : {None, 'huber', 'cauchy'}
-        Robust loss for single crossings, with `scale` (standard deviations, or 'auto').
-    scale : float or 'auto'
+    pose : ndarray, shape (..., 3, 4)
+        Start value.
+    method, uses : str
+        Name of the method, and the kind of observations that `residual` has rows of.
     weighted : bool
-        False: every pixel distance counts the same, as the paper has it.
-    max_iterations : int
+        False: every residual counts the same, the mean of their propagated variances.
     required : bool
-        False: report unobservable motions instead of raising.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than six crossings, or when they leave a motion open.
-    ValueError
-        When an observation is not finite.
-
-    Notes
-    -----
-    Equation (21) is read as the sum of the *squared* distances. The covariance knows the edges' own noise;
-    `covariance_placements` also covers what all crossings of one placement have in common.
+    **options
+        ``loss``, ``scale`` and ``max_iterations`` of :func:`lrfcal_lib.fit.least_squares.minimise`.
     """
-    check_finite(obs, "crossing")
-    check_count(len(obs.crossing_points), 6, "crossings of scan lines with edges", obs.camera)
-    T0 = starting_transform(obs) if T0 is None else T0
-    data = (obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
 
     def evaluate(pose):
-        return line_block(pose, *data)
+        return residual(pose, obs)
 
-    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
-    about = {"camera": obs.camera, "groups": obs.crossing_placement, "method": "line"}
-    return solve_pose(evaluate, T0, weighted=weighted, **about, **options)
-
-
-def solve_pose(evaluate, T0, *, camera, groups, method, weighted=True, required=True, **options):
-    """Solve for the pose of one camera: what the methods on edges and corners have in common.
-
-    Parameters
-    ----------
-    evaluate : callable
-        ``evaluate(pose array) -> Block``.
-    T0 : RigidTransform
-    camera, method : str
-        For messages and the report.
-    groups : ndarray of int
-        Placement of every residual.
-    weighted : bool
-        False: every residual counts the same.
-    required : bool
-    **options
-        ``loss``, ``scale`` and ``max_iterations`` of the least squares core.
-
-    Returns
-    -------
-    Solution
-    """
-    pose, earlier = pose_array(T0), []
-    if not weighted:
-        evaluate, pose, earlier = equal_weights(evaluate, pose, **options)
-    about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, camera)}
-    return solve(evaluate, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
-
-
-def solve_paper_lines(obs, T0=None, **options):
-    """The paper's own procedure: only crossings of scan lines, and every pixel counts the same.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-        Made with the ``last_beam`` rule.
-    T0 : RigidTransform, optional
-    **options
-        Of :func:`solve_lines`.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry, ValueError
-        As :func:`solve_lines`.
-    """
-    return solve_lines(obs.along(), T0, weighted=False, **options)
-
-
-def solve_lines_batch(
-    points, covariance, lines, line_sigma, model, T0, *, groups=None, loss=None, scale=1.0, max_iterations=60
-):
-    """:func:`solve_lines` for many trials at once (Monte-Carlo).
-
-    Parameters
-    ----------
-    points, covariance, lines, line_sigma : ndarray, shapes (b, n, 3), (b, n, 3, 3), (b, n, 3), (b, n)
-        Any of them may lack the leading axis, or have it of length 1, when it is the same in all trials.
-    model : CameraModel
-    T0 : RigidTransform
-        One start value, or a stack of b.
-    groups : ndarray of int, shape (n,), optional
-        Placement of each crossing.
-    loss, scale, max_iterations
-        See :func:`solve_lines`.
-
-    Returns
-    -------
-    Solution
-        With stacked transforms and leading axes b. Nothing is raised for degenerate trials: they do not converge.
-    """
-    batch = max(
-        (a.shape[0] for a, d in ((points, 3), (lines, 3), (covariance, 4), (line_sigma, 2)) if np.ndim(a) == d),
-        default=1,
-    )
-    start = np.broadcast_to(pose_array(T0), (batch, 3, 4))
-    return solve(
-        lambda pose: line_block(pose, points, covariance, lines, line_sigma, model),
-        start,
-        move_pose,
-        names=POSE_NAMES,
-        method="line",
-        read=read_pose,
-        groups=groups,
-        loss=loss,
-        scale=scale,
-        max_iterations=max_iterations,
-    )
-
-
-def equal_weights(evaluate, pose, **options):
-    """Plain least squares: one weight for all residuals, from the mean of their propagated variances.
-
-    Parameters
-    ----------
-    evaluate : callable
-        ``pose -> Block`` with weights of its own.
-    pose : ndarray, shape (3, 4)
-        Start value.
-    **options
-        Of :func:`lrfcal_lib.fit.least_squares.minimise`.
-
-    Returns
-    -------
-    evaluate : callable
-        ``pose -> Block`` with the common weight.
-    pose : ndarray, shape (3, 4)
-        The solution.
-    earlier : list of ndarray
-        Cost histories.
-    """
-
-    def plain(weight):
-        def block(p):
-            raw = evaluate(p)
-            return Block(raw.residuals, raw.jacobian, np.full_like(raw.residuals, weight))
-
-        return block
-
-    earlier = []
-    for _ in range(2):
+    def equal_weights(pose, _):
         weight = np.mean(evaluate(pose).whitener ** -2.0) ** -0.5
-        pose, _, _, history = minimise(plain(weight), pose, move_pose, **options)
-        earlier.append(history)
-    return plain(np.mean(evaluate(pose).whitener ** -2.0) ** -0.5), pose, earlier
+
+        def plain(pose):
+            block = evaluate(pose)
+            return Block(block.residuals, block.jacobian, np.full_like(block.residuals, weight))
+
+        return plain
+
+    problem, earlier = evaluate, []
+    if not weighted:
+        problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+    placement = getattr(obs, f"{uses}_placement")
+    groups = np.repeat(placement, evaluate(pose).residuals.shape[-1] // len(placement))
+    about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, obs.camera)}
+    return solve(problem, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
 
 
 def cost_readings(obs, transform, direction, steps):
@@ -239,23 +128,6 @@ def cost_readings(obs, transform, direction, steps):
     ValueError
         When no placement has crossings on two edges.
     """
-    pairs = _edge_pairs(obs)
-    poses = move_pose(pose_array(transform), np.multiply.outer(np.asarray(steps, float), np.asarray(direction, float)))
-    sigma = np.ones(len(obs.crossing_points))
-    d2 = (
-        line_block(poses, obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, sigma, obs.model).residuals
-        ** 2
-    )
-    first, second = (np.stack([d2[:, rows[i]].mean(axis=1) for rows in pairs], axis=1) for i in range(2))
-    return {
-        "sum of squares": np.sum(first + second, axis=1),
-        "squared sum": np.sum((np.sqrt(first) + np.sqrt(second)) ** 2, axis=1),
-        "squared product": np.sum(first * second, axis=1),
-    }
-
-
-def _edge_pairs(obs):
-    """Row masks of the first two edges of every placement that has two."""
     pairs = []
     for placement in np.unique(obs.crossing_placement):
         here = obs.crossing_placement == placement
@@ -264,179 +136,103 @@ def _edge_pairs(obs):
             pairs.append([here & (obs.crossing_edge == name) for name in names])
     if not pairs:
         raise ValueError(f"no placement of camera '{obs.camera}' has crossings on two edges: equation (21) needs pairs")
-    return pairs
+    poses = move_pose(pose_array(transform), np.multiply.outer(np.asarray(steps, float), np.asarray(direction, float)))
+    squares = line_block(poses, obs).residuals ** 2
+    first, second = (np.stack([squares[:, rows[i]].mean(axis=1) for rows in pairs], axis=1) for i in range(2))
+    return {
+        "sum of squares": np.sum(first + second, axis=1),
+        "squared sum": np.sum((np.sqrt(first) + np.sqrt(second)) ** 2, axis=1),
+        "squared product": np.sum(first * second, axis=1),
+    }
 
 
-NAMES = (*POSE_NAMES, "log_odds")
 SOFTNESS = 0.2  # spot radii, start value
-SOFTEST = 2.0
 LEAST_STEP = 0.1  # of a beam step: with a harder flip all places between two beams are alike, and none is the middle
 LEAST_INFORMATION = 0.02  # of that of a uniform distribution over the interval; keeps steps finite where it is flat
 MOST_ODDS = 6.0  # from there on the edge sits at the rim of the spot
-ROUNDS = 5
+ROUNDS = 4
 
 
-class _Intervals:
-    """Data of the crossings, any of them with leading trial axes, and what of them is frozen at a pose."""
-
-    def __init__(self, points, half_step, noise, radius, background, lines, line_sigma, model):
-        self.points, self.half_step, self.noise = points, half_step, noise
-        self.radius, self.background, self.line_sigma = radius, background, line_sigma
-        self.normals, self.lengths = sight_normals(lines, model)
-
-    def freeze(self, pose):
-        """Half widths of the intervals across the planes of sight and variances without the softness, metres."""
-        z = np.abs(apply_pose(pose, self.points)[..., 2])
-        half = np.abs(np.sum(self.normals * rotate_points(pose, self.half_step), axis=-1))
-        half = np.maximum(half, 0.02 * np.linalg.norm(self.half_step, axis=-1))
-        variance = propagated_variance(pose, self.normals, self.noise) + (self.line_sigma * z / self.lengths) ** 2
-        return half, variance
-
-    def margins(self, state):
-        """Where readings flip less the distance of the half-step points from the planes of sight, and its Jacobian."""
-        pose = state[..., :4]
-        rotated = rotate_points(pose, self.points)
-        outside = np.sum(self.normals * (rotated + pose[..., None, :, 3]), axis=-1)
-        shift, slope = edge_shift(state[..., 0, 4, None], self.radius, self.background)
-        by_pose = -gradient_by_pose(rotated, np.broadcast_to(self.normals, rotated.shape))
-        slope = np.broadcast_to(slope, outside.shape)
-        return shift - outside, np.concatenate([by_pose, slope[..., None]], axis=-1)
-
-    def sigma(self, softness, half, variance):
-        """Standard deviation of where readings flip, metres."""
-        soft = np.maximum(softness[..., None] * self.radius, 2 * LEAST_STEP * half)
-        return np.sqrt(soft**2 + variance)
+def interval_margins(state, obs, sight):
+    """By how much readings flip outside the planes of sight (unit normals `sight`), and the Jacobian, (..., n, 7)."""
+    rotated = rotate_points(state[..., :4], obs.crossing_points)
+    outside = np.sum(sight * (rotated + state[..., None, :, 3]), axis=-1)
+    shift, slope = edge_shift(state[..., 0, 4, None], obs.crossing_radius, obs.crossing_background)
+    by_pose = -gradient_by_pose(rotated, np.broadcast_to(sight, rotated.shape))
+    slope = np.broadcast_to(slope, outside.shape)
+    return shift - outside, np.concatenate([by_pose, slope[..., None]], axis=-1)
 
 
-def _block(intervals, state, half, sigma):
-    margin, jacobian = intervals.margins(state)
+def interval_block(state, obs, sight, half, sigma):
+    """Likelihood that readings flip between two neighbouring beams, `half` (metres) to either side of each crossing.
+
+    The state is a pose with one more column, the sensor's log odds (see :mod:`lrfcal_lib.fit.residuals`). The distance
+    of a crossing from the plane through the camera's centre and the image line stands for that of the beam from the
+    edge: the same to first order where the camera is near the LRF.
+    """
+    margin, jacobian = interval_margins(state, obs, sight)
     cost, score, information, _ = interval_terms(margin + half, margin - half, sigma)
     root = np.sqrt(np.maximum(information, LEAST_INFORMATION / (half**2 / 3 + sigma**2)))
     return Block(score / root, root[..., None] * jacobian, np.ones_like(root), cost=cost)
 
 
-def _move(state, step):
-    pose = move_pose(state[..., :4], step)
+def move_biased(state, step):
+    """Retraction of a pose with log odds in a fifth column."""
     own = state[..., 4:].copy()
     own[..., 0, 0] = np.clip(own[..., 0, 0] + step[..., 6], -MOST_ODDS, MOST_ODDS)
-    return np.concatenate([pose, own], axis=-1)
+    return np.concatenate([move_pose(state[..., :4], step), own], axis=-1)
 
 
-def _read(state):
-    return pose_transform(state[..., :4]), np.concatenate([pose_parameters(state[..., :4]), state[..., :1, 4]], axis=-1)
+def freeze_intervals(state, obs, sight, lengths, softness):
+    """Half widths of the intervals across the planes of sight and standard deviations of where readings flip, metres.
+
+    Where `softness` (in spot radii) is a grid, that which makes the intervals most likely.
+    """
+    pose = state[..., :4]
+    z = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
+    half = np.abs(np.sum(sight * rotate_points(pose, obs.crossing_half_step), axis=-1))
+    half = np.maximum(half, 0.02 * np.linalg.norm(obs.crossing_half_step, axis=-1))
+    variance = np.sum(moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
+    variance = variance + (obs.crossing_line_sigma * z / lengths) ** 2
+    margin, cost, softness = interval_margins(state, obs, sight)[0], [], np.atleast_1d(softness)
+
+    def sigma(softness):
+        return np.sqrt(np.maximum(softness * obs.crossing_radius, 2 * LEAST_STEP * half) ** 2 + variance)
+
+    for value in softness if len(softness) > 1 else ():
+        cost.append(np.sum(interval_terms(margin + half, margin - half, sigma(value))[0], axis=-1))
+    best = softness[np.argmin(np.stack(cost), axis=0)] if cost else softness[0]
+    return half, sigma(np.asarray(best)[..., None])
 
 
-def _fit_softness(intervals, state, half, variance):
-    """The softness that makes the intervals most likely at a state, in spot radii; the state holds its logarithm."""
-    grid = np.geomspace(0.02, SOFTEST, 25)
-    margin, _ = intervals.margins(state)
-    shape = margin.shape[:-1]
-    cost = []
-    for softness in grid:
-        sigma = intervals.sigma(np.full(shape, softness), half, variance)
-        cost.append(np.sum(interval_terms(margin + half, margin - half, sigma)[0], axis=-1))
-    out = state.copy()
-    out[..., 1, 4] = np.log(grid[np.argmin(np.stack(cost), axis=0)])
-    return out
-
-
-def _rounds(intervals, start, log_odds):
-    """Renew what is frozen a few times; the last function to minimise and the state there."""
-    own = np.zeros(start.shape[:-1] + (1,))
-    own[..., 0, 0], own[..., 1, 0] = log_odds, np.log(SOFTNESS)
-    state, earlier = np.concatenate([start, own], axis=-1), []
-    for k in range(ROUNDS):
-        half, variance = intervals.freeze(state[..., :4])
-        state = _fit_softness(intervals, state, half, variance) if k else state
-        sigma = intervals.sigma(np.exp(state[..., 1, 4]), half, variance)
-
-        def evaluate(s, half=half, sigma=sigma):
-            return _block(intervals, s, half, sigma)
-
-        if k < ROUNDS - 1:
-            state, _, _, history = minimise(evaluate, state, _move, max_iterations=30)
-            earlier.append(history)
-    return evaluate, state, earlier
-
-
-def solve_line_ml(obs, T0=None, *, log_odds=0.0, max_iterations=60, required=True):
+def estimate_likely_pose(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
     """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges lie.
 
-    Parameters
-    ----------
-    obs : CameraObservations
-        Made with the ``half_step`` rule; its crossings are used.
-    T0 : RigidTransform, optional
-        Start value of ``T_camera_source`` for :func:`lrfcal_lib.solvers.lines.solve_lines`, whose result is the start.
-    log_odds : float
-        Start value (see :mod:`lrfcal_lib.fit.residuals`).
-    max_iterations : int
-    required : bool
-        False: report unobservable motions instead of raising.
-
-    Returns
-    -------
-    Solution
-        `parameters` ends with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips
-        is estimated too and held while the covariance is computed.
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than seven crossings, or when they leave a motion (or the edge bias) open.
-    ValueError
-        When an observation is not finite.
-
-    Notes
-    -----
-    The distance of a crossing from the plane through the camera's centre and the image line stands for that of the
-    beam from the edge: the same to first order where the camera is near the LRF.
+    `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is
+    estimated too, and held while the covariance is computed. Start value is the estimate from lines.
     """
-    check_finite(obs, "crossing")
-    check_count(len(obs.crossing_points), 7, "crossings of scan lines with edges", obs.camera)
-    start = pose_array(solve_lines(obs, T0, required=False).transform)
-    own = (obs.crossing_half_step, obs.crossing_noise, obs.crossing_radius, obs.crossing_background)
-    intervals = _Intervals(obs.crossing_points, *own, obs.crossing_lines, obs.crossing_line_sigma, obs.model)
-    evaluate, state, earlier = _rounds(intervals, start, log_odds)
-    about = {"names": NAMES, "method": "line_ml", "read": _read, "words": lambda d: _words(d, obs.camera)}
-    scales = np.r_[np.ones(6), 10.0]
-    options = {"groups": obs.crossing_placement, "earlier": earlier, "required": required, "scales": scales}
-    return solve(evaluate, state, _move, max_iterations=max_iterations, **about, **options)
+    pose = estimate_pose(line_block, obs, pose, method=method, uses=uses, required=False).state
+    sight, lengths = sight_normals(obs.crossing_lines, obs.model)
 
+    def freeze(state, number):
+        softness = np.geomspace(0.02, 2.0, 25) if number else SOFTNESS
+        half, sigma = freeze_intervals(state, obs, sight, lengths, softness)
+        return lambda state: residual(state, obs, sight, half, sigma)
 
-def _words(direction, camera):
-    """A motion in words; the edge bias where it is (most of) what is open."""
-    if abs(direction[6]) > 0.5:
-        return "the sensor's edge bias"
-    return motion_words(direction[:6], camera)
+    def read(state):
+        transform, parameters = read_pose(state[..., :4])
+        return transform, np.concatenate([parameters, state[..., :1, 4]], axis=-1)
 
+    def words(direction):
+        return "the sensor's edge bias" if abs(direction[6]) > 0.5 else motion_words(direction[:6], obs.camera)
 
-def solve_line_ml_batch(
-    points, covariance, half_step, noise, radius, background, lines, line_sigma, model, T0, *, groups=None
-):
-    """:func:`solve_line_ml` for many trials at once (Monte-Carlo).
-
-    Parameters
-    ----------
-    points, covariance, lines, line_sigma
-        As for :func:`lrfcal_lib.solvers.lines.solve_lines_batch`.
-    half_step, noise, radius, background : ndarray, shapes (b, n, 3), (b, n, 3, 3), (b, n), (b, n)
-        As in CameraObservations.
-    model : CameraModel
-    T0 : RigidTransform
-        One start value, or a stack of b.
-    groups : ndarray of int, shape (n,), optional
-
-    Returns
-    -------
-    Solution
-        With leading axes b. Nothing is raised for degenerate trials: they do not converge.
-    """
-    start = solve_lines_batch(points, covariance, lines, line_sigma, model, T0, groups=groups).state
-    intervals = _Intervals(points, half_step, noise, radius, background, lines, line_sigma, model)
-    evaluate, state, earlier = _rounds(intervals, start, 0.0)
-    about = {"names": NAMES, "method": "line_ml", "read": _read}
-    return solve(evaluate, state, _move, groups=groups, earlier=earlier, **about)
+    state = np.concatenate([pose, np.zeros(pose.shape[:-1] + (1,))], axis=-1)
+    problem, state, earlier = minimise_in_rounds(freeze, state, move_biased, ROUNDS, max_iterations=30)
+    return solve(
+        problem, state, move_biased, names=(*POSE_NAMES, "log_odds"), method=method, read=read, words=words,
+        scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, required=required, earlier=earlier,
+        max_iterations=max_iterations,
+    )  # fmt: skip
 
 
 def edge_bias(solution, radius=1.0, background=0.0):
@@ -445,7 +241,7 @@ def edge_bias(solution, radius=1.0, background=0.0):
     Parameters
     ----------
     solution : Solution
-        Of :func:`solve_line_ml`.
+        Of the method 'line_ml'.
     radius : float
         Of the spot; 1 gives spot radii.
     background : float
@@ -459,253 +255,35 @@ def edge_bias(solution, radius=1.0, background=0.0):
     return shift, np.abs(slope) * solution.sigma[..., 6]
 
 
-def softness(solution):
-    """Standard deviation of where a reading flips, in spot radii (a floor of 0.15 beam steps applies beside it)."""
-    return np.exp(solution.state[..., 1, 4])
+def start_from_lines(obs):
+    """Many rotations at once, each with its best translation, refined on planes of sight; robust vote."""
+    obs.require("crossing", 6)
+    normals, points, rotations = sight_normals(obs.crossing_lines, obs.model)[0], obs.crossing_points, start_rotations()
+    right = -np.sum(normals * (points @ np.swapaxes(rotations, -1, -2)), axis=-1)
+    found = shifted(rotations, normals, right)
+    for loss in (None, "cauchy"):
+        options = {"loss": loss, "scale": "auto", "max_iterations": 40}
+        found = minimise(lambda pose: sight_block(pose, points, normals, 0.005), found, move_pose, **options)[0]
+    z = apply_pose(found, points)[..., 2]
+    keep = (z > 0).mean(axis=1) > 0.8
+    if not keep.any():
+        raise DegenerateGeometry(
+            f"camera '{obs.camera}': no pose puts the {len(points)} crossings in front of the camera"
+        )
+    found, z = found[keep], z[keep]
+    distance = np.abs(sight_block(found, points, normals, 1.0).residuals) / np.abs(z)
+    count = max(6, int(0.75 * len(points)))
+    return pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])
 
 
-def solve_wasielewski_strauss(obs, T0=None, *, loss=None, scale=1.0, weighted=False, max_iterations=60, required=True):
-    """The pose of a camera from distances, in space, between crossings and planes of sight.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-        Its crossings are used.
-    T0 : RigidTransform, optional
-        Start value of ``T_camera_source``; see :func:`lrfcal_lib.solvers.planes.starting_transform`.
-    loss : {None, 'huber', 'cauchy'}
-        Robust loss for single crossings, with `scale` (standard deviations, or 'auto').
-    scale : float or 'auto'
-    weighted : bool
-        False, as published: every distance counts the same. True: by the propagated noise; the method is then the same
-        as :func:`lrfcal_lib.solvers.lines.solve_lines` to first order, because the two residuals differ by a factor
-        (depth / focal length) that the weights take out.
-    max_iterations : int
-    required : bool
-        False: report unobservable motions instead of raising.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than six crossings, or when they leave a motion open.
-    ValueError
-        When an observation is not finite.
-    """
-    check_finite(obs, "crossing")
-    check_count(len(obs.crossing_points), 6, "crossings of scan lines with edges", obs.camera)
-    T0 = starting_transform(obs) if T0 is None else T0
-    normals, length = sight_normals(obs.crossing_lines, obs.model)
-
-    def evaluate(pose):
-        return distance_block(pose, obs, normals, length)
-
-    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
-    about = {"camera": obs.camera, "groups": obs.crossing_placement, "method": "wasielewski_strauss"}
-    return solve_pose(evaluate, T0, weighted=weighted, **about, **options)
-
-
-def distance_block(pose, obs, normals, length):
-    """Distances from the planes of sight, metres, with the noise of point and line.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (3, 4)
-    obs : CameraObservations
-    normals, length : ndarray, shapes (n, 3) and (n,)
-        From :func:`lrfcal_lib.fit.residuals.sight_normals`.
-
-    Returns
-    -------
-    Block
-    """
-    plain = sight_block(pose, obs.crossing_points, normals, 1.0)
-    rotated = rotate_points(pose, obs.crossing_points)
-    q = rotated + pose[:, 3]
-    shift = moved_noise(pose, normals, obs.crossing_covariance)
-    line = (obs.crossing_line_sigma / length) ** 2 * q[:, 2]
-    variance = np.sum(shift * normals, axis=-1) + line * q[:, 2]
-    factor = plain.residuals / variance
-    deeper = gradient_by_pose(rotated, np.broadcast_to([0.0, 0.0, 1.0], q.shape))
-    change = noise_correction(rotated, q, normals, shift, factor, pinhole=False) + (factor * line)[:, None] * deeper
-    return Block(plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=plain.jacobian - change)
-
-
-def point_block(pose, points, covariance, pixels, sigma_px, model):
-    """Reprojection errors of points with covariance.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    points : ndarray, shape (..., q, 3)
-        Source frame, metres.
-    covariance : ndarray, shape (..., q, 3, 3)
-    pixels : ndarray, shape (..., q, 2)
-        Undistorted pixels.
-    sigma_px : ndarray, shape (..., q)
-    model : CameraModel
-
-    Returns
-    -------
-    Block
-        2 q residuals in pixels; a loss judges u and v of a point together.
-    """
-    rotated = rotate_points(pose, points)
-    q = rotated + pose[..., None, :, 3]
-    by_point = pinhole_jacobian(q, model)
-    projected = q[..., :2] / q[..., 2:] * [model.fx, model.fy] + [model.cx, model.cy]
-    errors = projected - pixels
-    rows = np.stack([gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
-    turned = by_point @ pose[..., None, :, :3]
-    noise = turned @ covariance @ np.swapaxes(turned, -1, -2) + np.asarray(sigma_px)[..., None, None] ** 2 * np.eye(2)
-    whitener = np.linalg.inv(np.linalg.cholesky(noise))
-    force = np.linalg.solve(noise, errors[..., None])
-    shift = (covariance @ np.swapaxes(turned, -1, -2) @ force)[..., 0] @ np.swapaxes(pose[..., :3], -1, -2)
-    one = np.ones(errors.shape[:-1])
-    change = [noise_correction(rotated, q, by_point[..., i, :], shift, one) for i in range(2)]
-    shape = errors.shape[:-2]
-    rows, corrected = (x.reshape(shape + (-1, 6)) for x in (rows, rows - np.stack(change, axis=-2)))
-    return Block(errors.reshape(shape + (-1,)), rows, whitener, corrected=corrected)
-
-
-def solve_bauermann(obs, T0=None, *, loss=None, scale=1.0, max_iterations=60, required=True):
-    """The pose of a camera from scene points named in both sensors.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-        Its scene points are used.
-    T0 : RigidTransform, optional
-        Start value of ``T_camera_source``; perspective n points when left out (planes and lines where that fails).
-    loss : {None, 'huber', 'cauchy'}
-        Robust loss for single points, with `scale` (standard deviations, or 'auto').
-    scale : float or 'auto'
-    max_iterations : int
-    required : bool
-        False: report unobservable motions instead of raising.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than three points, or when they lie on one line.
-    ValueError
-        When an observation is not finite.
-    """
-    check_finite(obs, "scene")
-    check_count(len(obs.scene_points), 3, "scene points", obs.camera)
-    T0 = starting_transform(obs, kinds=("scene", "planes", "lines")) if T0 is None else T0
-    data = (obs.scene_points, obs.scene_covariance, obs.scene_pixels, obs.scene_sigma_px, obs.model)
-    options = {"loss": loss, "scale": scale, "max_iterations": max_iterations, "required": required}
-    about = {"camera": obs.camera, "groups": np.repeat(obs.scene_placement, 2), "method": "bauermann"}
-    return solve_pose(lambda pose: point_block(pose, *data), T0, **about, **options)
-
-
-@dataclass(frozen=True)
-class PlacementReport:
-    """How well each placement agrees with a robust estimate.
-
-    Attributes
-    ----------
-    placements : ndarray of int, shape (p,)
-    rms : ndarray, shape (p,)
-        Root mean square residual of the placement: metres from the plane, or pixels from the lines.
-    limit : ndarray, shape (p,)
-        What is still accepted.
-    outlying : tuple of int
-        Placements above their limit.
-    inliers : tuple of int
-    kind : str
-        'planes' or 'lines'.
-    """
-
-    placements: np.ndarray
-    rms: np.ndarray
-    limit: np.ndarray
-    outlying: tuple[int, ...]
-    inliers: tuple[int, ...]
-    kind: str
-
-
-def find_outlying_placements(obs, kind="planes", T0=None, *, probability=0.999, rounds=10):
-    """Find placements that disagree with the others, without being told how many there are.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-    kind : {'planes', 'lines'}
-        What is compared: point-plane distances or edge distances in the image.
-    T0 : RigidTransform, optional
-        Start value; a robust search over subsets of the placements (or many start rotations) when left out.
-    probability : float
-        A good placement is accepted with this probability, were the errors normal.
-    rounds : int
-        Rounds of estimating from the accepted placements and judging all again.
-
-    Returns
-    -------
-    PlacementReport
-
-    Raises
-    ------
-    ValueError
-        For another `kind`.
-    DegenerateGeometry
-        When the observations do not determine the pose.
-
-    Notes
-    -----
-    Residuals are compared with their own level, not with the stated noise: the median over the accepted placements of
-    the mean square, divided by its expectation, sets the scale. A placement counts as many independent numbers as it
-    has crossings, or two with planes (the distance and the slope of the scan: neighbouring points err together).
-    """
-    if kind not in ("planes", "lines"):
-        raise ValueError(f"unknown kind {kind!r}: use 'planes' or 'lines'")
-    T = (
-        T0
-        if T0 is not None
-        else starting_transform(obs, kinds=("planes",) if kind == "planes" else ("planes", "lines"))
-    )
-    T = _solve_kind(obs, kind, T, loss="cauchy")
-    placements, mean, freedom = _placement_squares(obs, kind, T)
-    keep = _accepted(mean, freedom, np.ones(len(mean), bool), probability)[0]
-    for _ in range(rounds):
-        T = _solve_kind(obs.select(placements[keep]), kind, T)
-        mean = _placement_squares(obs, kind, T)[1]
-        found, limit = _accepted(mean, freedom, keep, probability)
-        if np.array_equal(found, keep):
-            break
-        keep = found
-    outlying, inliers = (tuple(int(x) for x in placements[flag]) for flag in (~keep, keep))
-    return PlacementReport(placements, np.sqrt(mean), np.sqrt(limit), outlying, inliers, kind)
-
-
-def _solve_kind(obs, kind, T0, loss=None):
-    if kind == "planes":
-        return solve_zhang_pless(obs, T0, loss=loss, scale="auto", weighted=False).transform
-    return solve_lines(obs, T0, loss=loss, scale="auto", weighted=False).transform
-
-
-def _placement_squares(obs, kind, transform):
-    """Mean square residual of each placement, and the independent numbers it stands for."""
-    planes = kind == "planes"
-    residuals = plane_residuals_m(obs, transform) if planes else edge_residuals_px(obs, transform)
-    groups = obs.plane_placement if planes else obs.crossing_placement
-    known = np.isfinite(residuals)
-    placements, index = np.unique(groups[known], return_inverse=True)
-    count = np.bincount(index)
-    mean = np.bincount(index, residuals[known] ** 2) / count
-    return placements, mean, np.full(len(mean), 2.0) if planes else count.astype(float)
-
-
-def _accepted(mean, freedom, keep, probability):
-    """Placements below the limit that the accepted ones set."""
-    level = np.median((mean * freedom / chi2.median(freedom))[keep])
-    limit = level * chi2.ppf(probability, freedom) / freedom
-    return mean <= limit, limit
+def start_from_scene(obs):
+    """Perspective n points (SQPnP within RANSAC) from points that LRF and camera both name."""
+    obs.require("scene", 4)
+    arguments = (np.ascontiguousarray(obs.scene_points), np.ascontiguousarray(obs.scene_pixels), obs.model.matrix, None)
+    options = {"flags": cv2.SOLVEPNP_SQPNP, "reprojectionError": 20.0, "iterationsCount": 500}
+    found, rotvec, translation, _ = cv2.solvePnPRansac(*arguments, **options)
+    if not found:
+        raise DegenerateGeometry(
+            f"camera '{obs.camera}': no pose agrees with four of the {len(obs.scene_points)} scene points"
+        )
+    return RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import Block, solve
-from lrfcal_lib.fit.residuals import CHART, SIGMA_FLOOR, chart_parameters, move_head, prior_terms
+from lrfcal_lib.fit.residuals import AXIS_COLUMNS as CHART
+from lrfcal_lib.fit.residuals import SIGMA_FLOOR, chart_parameters, move_head, prior_terms
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,

@@ -1,0 +1,49 @@
+"""What a researcher writes to add a method: a residual and a row; the comparison judges it beside the others."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_case
+
+from lrfcal_lib.calibrate.pipeline import calibrate_cameras
+from lrfcal_lib.evaluate.tables import method_comparison
+from lrfcal_lib.fit.least_squares import Block
+from lrfcal_lib.solvers import METHODS, Method
+
+
+def angles_to_sight(pose, obs):
+    """Sines of the angles between crossings and the planes of sight through their image lines: blind to depth."""
+    sight = obs.crossing_lines @ obs.model.matrix
+    sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+    turned = obs.crossing_points @ pose[:, :3].T
+    q = turned + pose[:, 3]
+    depth = np.linalg.norm(q, axis=-1, keepdims=True)
+    residuals = np.sum(sight * q / depth, axis=-1)
+    by_point = sight / depth - residuals[:, None] * q / depth**2
+    jacobian = np.concatenate([np.cross(turned, by_point), by_point], axis=-1)  # by [w, v], see lrfcal_lib
+    return Block(residuals, jacobian, np.full(len(residuals), 1e3))  # noise of a milliradian
+
+
+def test_a_residual_and_a_row_are_a_method(monkeypatch):
+    row = Method(variant="half_step", uses="crossing", fewest=6, label="angles to sight", residual=angles_to_sight)
+    monkeypatch.setitem(METHODS, "angles", row)
+    rig, obs = camera_case(1, noise=1.0)
+    solutions, problems = calibrate_cameras({("left", variant): obs for variant in ("half_step", "last_beam")})
+    table = method_comparison({("left", "half_step"): obs, ("left", "last_beam"): obs}, solutions).set_index("method")
+    assert list(table.index) == list(METHODS) and problems == {}
+    assert table.loc["angles", "left_out_edge_rms_px"] < 1.5 * table.loc["line", "left_out_edge_rms_px"]
+    error = solutions["left", "angles"].transform * rig.T_camera_lrf.inv()
+    assert error.rotation.magnitude() < 0.02 and np.linalg.norm(error.translation) < 0.03
+
+
+def test_its_jacobian_is_the_numeric_one():
+    rig, obs = camera_case(1, noise=1.0)
+
+    def residuals(delta):
+        turn = Rotation.from_rotvec(delta[:3]) * rig.T_camera_lrf.rotation
+        moved = RigidTransform.from_components(rig.T_camera_lrf.translation + delta[3:], turn)
+        return angles_to_sight(moved.as_matrix()[:3], obs).residuals
+
+    J = angles_to_sight(rig.T_camera_lrf.as_matrix()[:3], obs).jacobian
+    for k, step in enumerate(1e-6 * np.eye(6)):
+        assert J[:, k] == pytest.approx((residuals(step) - residuals(-step)) / 2e-6, abs=1e-8)
