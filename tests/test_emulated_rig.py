@@ -45,6 +45,12 @@ def world(setup, placements):
     return EmulatedWorld(setup, Clock(), placements=placements)
 
 
+@pytest.fixture
+def small(setup, placements):
+    """A world whose images are small."""
+    return EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
+
+
 def until(condition, what):
     end = time.monotonic() + DEADLINE
     while not condition():
@@ -94,12 +100,13 @@ def test_places(world, setup, placements):
     assert 0.1 < close.translation[2] < 1.0 and not world.place.stand
     world.put(None)
     assert world.truth()["place"] == ["placement", None] and set(world.truth()["boards"]) == {1, 2, 3, 4}
-    with pytest.raises(ValueError, match="no placement 9; there are 1, 2, 3, 4, and none"):
-        world.put(9)
-    with pytest.raises(ValueError, match="no view 99 of camera 'left'"):
-        world.hold_close("left", 99)
-    with pytest.raises(ValueError, match="no view 0 of camera 'middle'"):
-        world.hold_close("middle", 0)
+    for call, message in (
+        (lambda: world.put(9), "no placement 9; there are 1, 2, 3, 4, and none"),
+        (lambda: world.hold_close("left", 99), "no view 99 of camera 'left'"),
+        (lambda: world.hold_close("middle", 0), "no view 0 of camera 'middle'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_images_of_another_width_show_the_same(setup):
@@ -138,43 +145,47 @@ def test_one_image_and_wrong_names(rig):
 
 def test_no_image_while_the_head_moves(rig):
     """A new one afterwards, which shows the new pitch."""
-    cameras, head = rig.camera_server, rig.world.head
+    cameras, head, clock = rig.camera_server, rig.world.head, rig.clock
     until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
     before = cameras.image("left", timeout=DEADLINE)[0]
-    head.move(rig.clock.now(), head.measured(rig.clock.now()) + 0.2, 0.2)
+    head.move(clock.now(), head.measured(clock.now()) + 0.2, 0.2)
     assert cameras.image("left", timeout=0.3) == (None, None)
     after = cameras.image("left", timeout=DEADLINE)[0]
     assert after[2] == pytest.approx(before[2] + 0.2, abs=0.01) and head.settled(rig.clock.now())
 
 
-def test_an_image_begun_before_a_move_is_not_sent(setup, placements):
-    """The drawing process is replaced by one that ends when it is told."""
-    world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
-    server, asked = CameraServer(world, world.setup), []
+@pytest.fixture
+def drawing(small):
+    """Makes camera servers whose drawing process is replaced by one that ends when it is told: pitch and result."""
+    servers = []
 
-    def submit(function, index, place, pitch, *_):
-        asked.append((pitch, Future()))
-        return asked[-1][1]
+    def drawing(**options):
+        server, asked = CameraServer(small, small.setup, **options), []
+        server._pool.submit = lambda function, index, place, pitch, *_: asked.append((pitch, Future())) or asked[-1][1]
+        servers.append(server)
+        return server, asked
 
-    server._pool.submit = submit
+    yield drawing
+    for server in servers:
+        server.close()
+
+
+def test_an_image_begun_before_a_move_is_not_sent(small, drawing):
+    server, asked = drawing()
     until(lambda: server.image("left", timeout=0.05) == (None, None) and asked, "the wish for an image")
-    world.head.go(world.clock.now(), 0.05, 2.0)
+    small.head.go(small.clock.now(), 0.05, 2.0)
     asked[0][1].set_result(b"old")
     until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1, "the wish for a new one")
     asked[-1][1].set_result(b"new")
     assert server.image("left", timeout=DEADLINE)[1] == b"new"
-    server.close()
 
 
-def test_an_image_is_drawn_only_where_the_head_rests_long_enough(setup, placements):
-    world = EmulatedWorld(replace(setup, rig=scaled(setup.rig, 64)), Clock(), placements=placements)
-    for rest_s, drawn in ((1e6, False), (0.0, True)):
-        server, asked = CameraServer(world, world.setup, rest_s=rest_s), []
-        server._pool.submit = lambda *args, asked=asked: asked.append(args) or Future()
-        world.head.go(world.clock.now(), 0.01 if drawn else -0.01, 2.0)
-        until(lambda: world.head.settled(world.clock.now()), "rest")
-        assert server.image("left", timeout=0.3) == (None, None) and bool(asked) == drawn
-        server.close()
+@pytest.mark.parametrize(("rest_s", "drawn"), [(1e6, False), (0.0, True)])
+def test_an_image_is_drawn_only_where_the_head_rests_long_enough(small, drawing, rest_s, drawn):
+    server, asked = drawing(rest_s=rest_s)
+    small.head.go(small.clock.now(), 0.01, 2.0)
+    until(lambda: small.head.settled(small.clock.now()), "rest")
+    assert server.image("left", timeout=0.3) == (None, None) and bool(asked) == drawn
 
 
 def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
@@ -188,18 +199,9 @@ def test_the_end_of_the_drawing_process_is_told(setup, placements, caplog):
     assert "the process that draws the images ended" in caplog.text
 
 
-def test_what_was_not_started_can_be_closed(tmp_path):
-    EmulatedRig("sim_quick", folder=tmp_path / "rig").close()
-    assert list((tmp_path / "rig").iterdir()) == []
-
-
-def test_a_rig_file_lets_cameras_be_silent_while_the_head_moves(rig):
-    assert all(camera["silence_s"] >= 60 for camera in rig.rig_file()["devices"]["cameras"].values())
-
-
 def test_control_socket(rig):
     assert ask(rig.control, "place 2") == {} and rig.world.truth()["place"] == ["placement", 2]
-    assert ask(rig.control, {"command": "place", "arguments": ["none"]}) == {}
+    assert ask(rig.control, {"command": "place", "arguments": ["none"]}) == {} == ask(rig.control, "place")
     assert ask(rig.control, "close right 1") == {} and rig.world.place.key == ("close", "right", 1)
     assert ask(rig.control, "fault head mute 2") == {"armed": ["mute"]}
     assert ask(rig.control, "clear") == {} and not rig.faults["head"].armed
@@ -211,14 +213,11 @@ def test_control_socket(rig):
 
 @pytest.mark.parametrize(
     ("line", "match"),
-    [("dance", "no command 'dance'"), ("place", "no placement|none"), ("place x", "invalid literal"),
+    [("dance", "no command 'dance'"), ("place 9", "no placement 9"), ("place x", "invalid literal"),
      ("fault wheel drop", "no device 'wheel'"), ("fault lrf stall", "no fault 'stall'"), ("{", "Expecting property"),
      ("close left", "missing"), ('{"arguments": []}', "command")],
 )  # fmt: skip
 def test_control_refuses(rig, line, match):
-    if line == "place":  # no number is no board
-        assert ask(rig.control, line) == {}
-        return
     with pytest.raises(ValueError, match=match):
         ask(rig.control, line)
 
@@ -252,27 +251,22 @@ def test_rig_file_states_what_a_session_states(rig, setup, tmp_path):
     assert stated["plan"]["placements"][1]["pitch_deg"][0] > stated["plan"]["placements"][1]["pitch_deg"][1]
     low, high, step = stated["plan"]["pitch_deg"]
     assert all(low <= min(p["pitch_deg"][:2]) and max(p["pitch_deg"][:2]) <= high for p in stated["plan"]["placements"])
-    assert step == 0.25
+    assert step == 0.25 and all(camera["silence_s"] >= 60 for camera in stated["devices"]["cameras"].values())
 
 
 def test_own_placements_and_unknown_setups(setup, tmp_path):
     mine = [Placement(7, placements_of(setup)[0].T_platform_board, (-0.1, 0.1), (0.0,))]
-    with EmulatedRig(setup, placements=mine, cameras=False, folder=tmp_path / "rig") as rig:
+    with EmulatedRig(setup, placements=mine, cameras=False, folder=tmp_path / "rig", time_scale=4) as rig:
         rig.world.put(7)
         assert rig.rig_file()["rig"]["cameras"] == {} and (tmp_path / "rig" / "lrf").is_symlink()
+        assert "4 times as fast: for stop-and-go, not for continuous sweeps" in summary(rig)
+    EmulatedRig(setup, folder=tmp_path / "rig").close()  # what was not started can be closed
     assert list((tmp_path / "rig").iterdir()) == []
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         EmulatedRig("x")
     for scale in ("0", "16"):
         with pytest.raises(ValueError, match=f"time_scale is {scale}.0"):
             main(["sim_quick", "--no-cameras", "--time-scale", scale])
-
-
-def test_a_rig_that_is_sped_up_says_what_it_is_for(setup):
-    with EmulatedRig(setup, cameras=False, time_scale=4) as rig:
-        assert "4 times as fast: for stop-and-go, not for continuous sweeps" in summary(rig)
-    with EmulatedRig(setup, cameras=False) as rig:
-        assert "times as fast" not in summary(rig)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -282,10 +276,8 @@ def test_the_command_line_cleans_up(tmp_path, number):
     call = [sys.executable, "-c", code, "--no-cameras", "--rig-file", str(file), "--folder", str(folder)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
     until(lambda: file.exists() or run.poll() is not None, "the rig file")
-    for _ in range(7):
-        line = run.stdout.readline()
-        if "boards" in line:
-            break
+    said = "".join(iter(run.stdout.readline, f"  rig file {file}   python -m lrfcal_lib record --help\n"))
+    assert "one command a line" in said and "times as fast" not in said
     devices = json.loads(file.read_text())["devices"]
     port = serial.Serial(devices["lrf"]["port"], 9600, timeout=DEADLINE)
     port.write(bytes.fromhex("02 00 01 00 3A 1E 12"))

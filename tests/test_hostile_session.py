@@ -14,7 +14,7 @@ import pytest
 
 from lrfcal_lib.evaluate.export import file_hashes
 from lrfcal_lib.evaluate.tables import read_truth
-from lrfcal_lib.preprocess.pattern_in_image import estimate_intrinsics, first_pose
+from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder, finish

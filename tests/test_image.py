@@ -14,21 +14,34 @@ from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle
 from lrfcal_lib.model.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import board_in_image, edges_in_image, intrinsics, pattern_in_image, survey
 from lrfcal_lib.preprocess.board_in_image import (
+    BoardView,
     find_polygon,
     mirrored_pose,
     order_scores,
-    pattern_orders,
     pose_with_edges,
+    view_board,
 )
-from lrfcal_lib.preprocess.edges_in_image import ImageEdge, correlation_factor, picked_edge, refine_edge
+from lrfcal_lib.preprocess.edges_in_image import (
+    SYSTEMATIC_PX,
+    ImageEdge,
+    correlation_factor,
+    picked_edge,
+    refine_edge,
+)
+from lrfcal_lib.preprocess.intrinsics import (
+    adjust,
+    board_pose,
+    estimate_intrinsics,
+    estimate_relief,
+    first_pose,
+    stereo_transform,
+)
 from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
-    estimate_relief,
+    PatternNotFound,
     grid_noise,
-    mirror_pattern,
+    pattern_orders,
     spread_views,
-    stereo_transform,
-    turn_pattern,
 )
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
@@ -57,6 +70,15 @@ class Pick:
     file: Path
     edge: str
     ends: np.ndarray
+
+
+class Shape(Record):
+    """A record that is its own image."""
+
+    def __init__(self, record):
+        super().__init__(record.camera, record.file, record.placement)
+
+    shape = (480, 640, 3)
 
 
 @lru_cache(maxsize=4)
@@ -130,6 +152,20 @@ def pixels_of(poses, sigma=0.0, seed=0, model=MODEL, points=None):
     return exact + np.random.default_rng(seed).normal(0, 1, exact.shape) * sigma
 
 
+def find_pattern(picture, pattern=PATTERN):
+    return PatternFinder(pattern)(picture)
+
+
+def turn_pattern(pixels):
+    """The same corners with the pattern turned by 180 deg."""
+    return pixels[::-1]
+
+
+def seen(picture, board=SHEET, picks=(), record=Record("left", Path("a.png"), 3, 0.1)):
+    """The view of a single image."""
+    return survey.survey([record], lambda r: picture, board, {"left": MODEL}, picks).views["left"][0]
+
+
 def true_line(name, pose, board=SHEET):
     return board_line_in_image(board.lines()[board.edges.index(name)], pose, MODEL)
 
@@ -151,7 +187,7 @@ def small_turn(a, b):
 @pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (0.6, 0.05), (-1.2, 0.05)])
 def test_corners_are_found_at_subpixel_level(roll, limit):
     pose = pose_of(roll)
-    found = pattern_in_image.find_pattern(render(pose), PATTERN)
+    found = find_pattern(render(pose), PATTERN)
     exact = project(pose.apply(PATTERN.points()), MODEL)
     error = min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found)))
     assert error < limit
@@ -164,7 +200,7 @@ def test_white_squares_on_a_dark_board_are_found():
         exact = project(pose.apply(PATTERN.points()), MODEL)
         assert min(np.sqrt(np.mean((p - exact) ** 2)) for p in (found, turn_pattern(found))) < 0.1
     # a finder that has seen the negative still finds the positive
-    np.testing.assert_array_equal(finder(render(pose)), pattern_in_image.find_pattern(render(pose), PATTERN))
+    np.testing.assert_array_equal(finder(render(pose)), find_pattern(render(pose), PATTERN))
 
 
 def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
@@ -193,7 +229,7 @@ def test_views_that_differ_most_come_first():
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():
-    found = pattern_in_image.find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
+    found = find_pattern(render(pose_of())[:, ::-1].copy(), PATTERN).reshape(4, 6, 2)
     x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
 
@@ -201,30 +237,26 @@ def test_corners_run_clockwise_also_in_a_mirrored_image():
 def test_grey_images_give_the_same_corners():
     picture = render(pose_of())
     np.testing.assert_allclose(
-        pattern_in_image.find_pattern(picture[..., 0], PATTERN),
-        pattern_in_image.find_pattern(picture, PATTERN),
+        find_pattern(picture[..., 0], PATTERN),
+        find_pattern(picture, PATTERN),
         atol=0.01,
     )
 
 
 def test_the_second_detector_helps_where_the_first_fails(monkeypatch):
-    from lrfcal_lib.preprocess import pattern_in_image as pattern
-
     picture = render(pose_of())
-    exact = pattern_in_image.find_pattern(picture, PATTERN)
-    monkeypatch.setattr(pattern, "_sectors", lambda *a: None)
-    classic = pattern_in_image.find_pattern(picture, PATTERN)
-    monkeypatch.undo()
-    monkeypatch.setattr(pattern, "_classic", lambda *a: None)
-    sectors = pattern_in_image.find_pattern(picture, PATTERN)
-    for other in (classic, sectors):
+    exact = find_pattern(picture)
+    for detector in ("sectors", "classic"):
+        with monkeypatch.context() as patch:
+            patch.setattr(pattern_in_image, detector, lambda *a: None)
+            other = find_pattern(picture)
         assert min(np.abs(p - exact).max() for p in (other, turn_pattern(other))) < 0.3
 
 
 @pytest.mark.parametrize("shape", [(480, 640, 3), (1, 1), (1, 5000), (8, 8)])  # OpenCV refuses narrow ones
 def test_no_pattern(shape):
-    with pytest.raises(survey.PatternNotFound, match="6 x 4 inner corners"):
-        pattern_in_image.find_pattern(np.full(shape, 90, np.uint8), PATTERN)
+    with pytest.raises(PatternNotFound, match="6 x 4 inner corners"):
+        find_pattern(np.full(shape, 90, np.uint8), PATTERN)
 
 
 def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
@@ -242,11 +274,11 @@ def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
 @pytest.mark.parametrize("beyond", [-5, 3, 20])
 def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
     pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
-    whole = pattern_in_image.find_pattern(picture, pattern)
+    whole = find_pattern(picture, pattern)
     part = np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond])
     try:
-        found = pattern_in_image.find_pattern(part, pattern)
-    except survey.PatternNotFound:
+        found = find_pattern(part, pattern)
+    except PatternNotFound:
         assert beyond < 18  # where all squares are seen it is found
     else:
         assert min(np.abs(p - whole).max() for p in (found, turn_pattern(found))) < 0.3
@@ -255,33 +287,28 @@ def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
 @pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3, 1), np.uint8), np.zeros((0, 0), np.uint8)])
 def test_what_is_no_image(bad):
     with pytest.raises(ValueError, match="must be uint8"):
-        pattern_in_image.find_pattern(bad, PATTERN)
+        find_pattern(bad, PATTERN)
 
 
 # --- adjustment ----------------------------------------------------------------------------------------------------
 
 
 def test_adjustment_jacobian_is_the_numeric_one():
-    poses = view_poses(2)
-    mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])
-    lens = np.stack([MODEL.parameters, MODEL.parameters * 1.05])
-    points = PATTERN.points()
+    mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])[:, :3]
+    poses, points = np.stack([p.as_matrix()[:3] for p in view_poses(2)]), PATTERN.points()
     basis = np.linalg.svd(np.column_stack([np.ones(24), points[:, :2]]))[0][:, 3:]
-    state = intrinsics._State(lens, mounts, np.stack([p.as_matrix() for p in poses]), np.linspace(-1e-3, 2e-3, 21))
-    pixels = np.zeros((2, 2, 24, 2))
-    _, *blocks = intrinsics._residuals(state, pixels, points, basis)
-    analytic = intrinsics._jacobian(state, *blocks, basis).reshape(pixels.size, -1)
-    for i in range(analytic.shape[1]):
+    state = np.stack([MODEL.parameters, MODEL.parameters * 1.05]), mounts, poses, np.linspace(-1e-3, 2e-3, 21)
+    pixels, jacobian = intrinsics.predict(state, points, basis)
+    analytic = jacobian.reshape(pixels.size, -1)
+    for i, step in enumerate(np.eye(analytic.shape[1])):
         h = 1e-6 * max(1.0, np.abs(analytic[:, i]).max() ** -1)
-        step = np.zeros(analytic.shape[1])
-        step[i] = h
-        up, down = (intrinsics._residuals(intrinsics._moved(state, s), pixels, points, basis)[0] for s in (step, -step))
-        np.testing.assert_allclose((down - up).ravel() / (2 * h), analytic[:, i], rtol=2e-5, atol=2e-4)
+        up, down = (intrinsics.predict(intrinsics.moved(state, s * step), points, basis)[0] for s in (h, -h))
+        np.testing.assert_allclose((up - down).ravel() / (2 * h), analytic[:, i], rtol=2e-5, atol=2e-4)
 
 
 def test_intrinsics_without_noise_are_exact():
     poses = view_poses(8)
-    result = survey.estimate_intrinsics(pixels_of(poses), PATTERN, (640, 480))
+    result = estimate_intrinsics(pixels_of(poses), PATTERN, (640, 480))
     np.testing.assert_allclose(result.model.parameters, MODEL.parameters, atol=2e-5)
     assert (result.model.width, result.model.height) == (640, 480)
     assert result.model.rms_px < 1e-5
@@ -293,7 +320,7 @@ def test_intrinsics_covariance_tells_the_error():
     poses = view_poses(8, seed=2)
     errors = []
     for seed in range(30):
-        model = survey.estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, (640, 480)).model
+        model = estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, (640, 480)).model
         sigma = np.sqrt(np.diag(model.covariance))[:8]
         errors.append((model.parameters - MODEL.parameters)[:8] / sigma)
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
@@ -302,9 +329,9 @@ def test_intrinsics_covariance_tells_the_error():
 def test_third_radial_term_stays_out_unless_the_images_need_it():
     rng = np.random.default_rng(4)
     poses = [pose_of(0, rng.uniform(-0.4, 0.4, 2), (*rng.uniform(-0.3, 0.3, 2), 0.8)) for _ in range(10)]
-    assert survey.estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, (640, 480)).model.distortion[4] == 0
+    assert estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, (640, 480)).model.distortion[4] == 0
     bent = MODEL.with_parameters([*MODEL.parameters[:8], 1.5])
-    model = survey.estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, (640, 480)).model
+    model = estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, (640, 480)).model
     assert model.distortion[4] == pytest.approx(1.5, abs=4 * np.sqrt(model.covariance[8, 8]))
 
 
@@ -315,7 +342,7 @@ def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
     waves -= plane @ np.linalg.lstsq(plane, waves, rcond=None)[0]
     poses = view_poses(12, seed=5)
     bumpy = pixels_of(poses, 0.02, points=points + waves[:, None] * [0, 0, 1])
-    result = survey.estimate_intrinsics(bumpy, PATTERN, (640, 480), relief=True)
+    result = estimate_intrinsics(bumpy, PATTERN, (640, 480), relief=True)
     np.testing.assert_allclose(result.relief, waves, atol=2e-4)
     assert abs(result.model.fx - MODEL.fx) < 4 * np.sqrt(result.model.covariance[0, 0])
     np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, waves, atol=2e-4)
@@ -325,7 +352,7 @@ def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
 def test_glaring_corners_are_left_out():
     pixels = pixels_of(view_poses(8), 0.1)
     pixels[3, 7] += [4.0, -3.0]
-    result = survey.estimate_intrinsics(pixels, PATTERN, (640, 480))
+    result = estimate_intrinsics(pixels, PATTERN, (640, 480))
     assert np.isnan(result.residuals[0, 3, 7]).all()
     assert np.isnan(result.residuals[..., 0]).sum() <= 2
     assert result.rms_px < 0.2
@@ -333,12 +360,14 @@ def test_glaring_corners_are_left_out():
 
 def test_too_few_or_parallel_views():
     with pytest.raises(ValueError, match="at least three views of the pattern, got 2"):
-        survey.estimate_intrinsics(pixels_of(view_poses(2)), PATTERN, (640, 480))
+        estimate_intrinsics(pixels_of(view_poses(2)), PATTERN, (640, 480))
     parallel = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i in range(4)]
     with pytest.raises(ValueError, match="parallel to itself.*focal length"):
-        survey.estimate_intrinsics(pixels_of(parallel, 0.01), PATTERN, (640, 480))
+        estimate_intrinsics(pixels_of(parallel, 0.01), PATTERN, (640, 480))
     with pytest.raises(ValueError, match="8 image coordinates cannot determine 15 unknowns"):
-        intrinsics.adjust(pixels_of([pose_of()])[None, :, :4], Chessboard(2, 2, 0.05), [MODEL], [pose_of()])
+        adjust(
+            pixels_of([pose_of()])[None, :, :4], PATTERN.points()[:4], [MODEL], RigidTransform.concatenate([pose_of()])
+        )
 
 
 # --- pose ----------------------------------------------------------------------------------------------------------
@@ -346,11 +375,11 @@ def test_too_few_or_parallel_views():
 
 def test_pose_without_noise_is_exact_and_its_covariance_tells_the_error():
     pose = pose_of(0.3)
-    got, _ = survey.board_pose(pixels_of([pose])[0], PATTERN, MODEL)
-    np.testing.assert_allclose(got.as_matrix(), pose.as_matrix(), atol=1e-8)
+    got = board_pose(pixels_of([pose])[0], PATTERN, MODEL)
+    np.testing.assert_allclose(got[0].as_matrix(), pose.as_matrix(), atol=1e-8)
     chi2 = []
     for seed in range(60):
-        got, covariance = survey.board_pose(pixels_of([pose], 0.3, seed)[0], PATTERN, MODEL)
+        got, covariance, _ = board_pose(pixels_of([pose], 0.3, seed)[0], PATTERN, MODEL)
         error = small_turn(got, pose)
         chi2.append(error @ np.linalg.solve(covariance, error))
     assert 0.6 < np.mean(chi2) / 6 < 1.4
@@ -363,7 +392,7 @@ def test_errors_that_agree_between_neighbours_widen_the_covariance():
     for _ in range(40):
         coarse = cv2.resize(rng.normal(0, 0.3, (3, 3, 2)), (6, 4), interpolation=cv2.INTER_CUBIC)
         noise = coarse.reshape(-1, 2) + rng.normal(0, 0.05, (24, 2))
-        got, covariance = survey.board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)
+        got, covariance, _ = board_pose(pixels_of([pose])[0] + noise, PATTERN, MODEL)
         error = small_turn(got, pose)
         chi2.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(chi2) < 5
@@ -372,10 +401,10 @@ def test_errors_that_agree_between_neighbours_widen_the_covariance():
 def test_pose_needs_corners():
     pixels = pixels_of([pose_of()])[0]
     with pytest.raises(ValueError, match="four or more of the pattern's 24 corners"):
-        survey.board_pose(pixels[:10], PATTERN, MODEL)
+        board_pose(pixels[:10], PATTERN, MODEL)
     pixels[3:] = np.nan
     with pytest.raises(ValueError, match="four or more"):
-        survey.board_pose(pixels, PATTERN, MODEL)
+        board_pose(pixels, PATTERN, MODEL)
 
 
 # --- edges ---------------------------------------------------------------------------------------------------------
@@ -384,7 +413,7 @@ def test_pose_needs_corners():
 @pytest.mark.parametrize("roll", [0.0, 0.7, np.pi / 2, np.pi, -2.5])
 def test_edges_of_a_known_board_at_any_roll(roll):
     pose = pose_of(roll)
-    view = survey.view_board(render(pose), SHEET, MODEL, camera="left", file="a.png", placement=3, pitch=0.1)
+    view = seen(render(pose))
     assert (view.reason, view.rejected, view.placement, view.pitch) == ("", (), 3, 0.1)
     assert [e.name for e in view.edges] == list(SHEET.edges)
     assert max(edge_errors(view, pose).values()) < 0.05
@@ -395,21 +424,30 @@ def test_edges_of_a_known_board_at_any_roll(roll):
 
 def test_edges_before_clutter():
     pose = pose_of(0.1)
-    view = survey.view_board(render(pose, background=clutter()), SHEET, MODEL)
+    view = seen(render(pose, background=clutter()))
     assert len(view.edges) == 4
     assert max(edge_errors(view, pose).values()) < 0.3
 
 
 @pytest.mark.parametrize("background", [170.0, None])
 def test_the_order_of_corners_follows_the_outline(background):
+    points = PATTERN.points()
     for i, pose in enumerate(view_poses(4, seed=6)):
         picture = render(pose, background=clutter(i) if background is None else background)
         exact = pixels_of([pose])[0]
-        mirrored = mirror_pattern(exact, PATTERN)
-        for start in (exact, turn_pattern(exact), mirrored, turn_pattern(mirrored)):
-            orders = pattern_orders(start, SHEET, SHEET.lines())
-            best = np.argmax(order_scores(picture, SHEET, MODEL, orders))
-            np.testing.assert_array_equal(orders[best], exact)
+        for start in pattern_orders(PATTERN):
+            orders = exact[start][pattern_orders(PATTERN)]
+            poses = RigidTransform.concatenate([first_pose(points, pixels, MODEL) for pixels in orders])
+            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, orders, poses))], exact)
+
+
+@pytest.mark.parametrize("pattern", [PATTERN, Chessboard(5, 5, 0.05, (0.1, 0.2))])
+def test_every_order_of_the_corners_is_a_turn_of_the_board(pattern):
+    points, orders = pattern.points(), pattern_orders(pattern)
+    assert len(np.unique(orders, axis=0)) == len(orders) == (8 if pattern.rows == pattern.columns else 4)
+    for k, order in enumerate(orders):
+        turn, miss = Rotation.align_vectors(points[order] - points.mean(axis=0), points - points.mean(axis=0))
+        assert miss < 1e-7 and turn.as_matrix()[2, 2] == pytest.approx(1 if k < len(orders) / 2 else -1)
 
 
 FAR = pose_of(0.3, (0.14, -0.1), (0.1, 0.0, 3.0))
@@ -427,19 +465,23 @@ def noisy_edges(pose, seed, sigma=0.1):
     return out
 
 
+def far_view(pixels, edges=()):
+    pose, covariance, _ = board_pose(pixels, PATTERN, MODEL)
+    return BoardView(pixels=pixels, T_camera_board=pose, covariance=covariance, edges=tuple(edges))
+
+
 def test_corners_and_edges_together_are_better_and_know_how_much():
     chi2, alone, both = [], [], []
     for seed in range(60):
-        pixels = pixels_of([FAR], 0.1, seed)[0]
-        start = survey.board_pose(pixels, PATTERN, MODEL)
-        pose, covariance = pose_with_edges(*start, pixels, noisy_edges(FAR, 100 + seed), SHEET, MODEL)
+        view = far_view(pixels_of([FAR], 0.1, seed)[0], noisy_edges(FAR, 100 + seed))
+        pose, covariance = pose_with_edges(view, SHEET, MODEL)
         error = small_turn(pose, FAR)
         chi2.append(error @ np.linalg.solve(covariance, error) / 6)
-        alone.append(np.abs(small_turn(start[0], FAR)))
+        alone.append(np.abs(small_turn(view.T_camera_board, FAR)))
         both.append(np.abs(error))
         assert (
-            np.all(np.diag(covariance) < np.diag(start[1]) * (1 + 1e-9))
-            or (start[0].rotation * pose.rotation.inv()).magnitude() > 0.05
+            np.all(np.diag(covariance) < np.diag(view.covariance) * (1 + 1e-9))
+            or (view.T_camera_board.rotation * pose.rotation.inv()).magnitude() > 0.05
         )
     assert 0.5 < np.mean(chi2) < 1.5
     assert np.all(np.median(both, axis=0) < np.median(alone, axis=0))
@@ -450,22 +492,20 @@ def test_edges_tell_a_pose_from_its_mirror_in_depth():
     wrong = mirrored_pose(FAR, PATTERN)
     assert (wrong.rotation * FAR.rotation.inv()).magnitude() > 0.2
     np.testing.assert_allclose(mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12)
-    covariance = np.diag([1e-4] * 3 + [1e-6] * 3)
-    pose, _ = pose_with_edges(wrong, covariance, pixels, noisy_edges(FAR, 2), SHEET, MODEL)
+    view = BoardView(pixels=pixels, T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
+    pose, _ = pose_with_edges(replace(view, edges=noisy_edges(FAR, 2)), SHEET, MODEL)
     assert (pose.rotation * FAR.rotation.inv()).magnitude() < 0.05
 
 
 def test_an_edge_that_contradicts_the_corners_is_left_out():
-    pixels = pixels_of([FAR], 0.05, 1)[0]
-    start = survey.board_pose(pixels, PATTERN, MODEL)
-    edges = noisy_edges(FAR, 3, 0.05)
-    good, _ = pose_with_edges(*start, pixels, edges[:3], SHEET, MODEL)
+    view, edges = far_view(pixels_of([FAR], 0.05, 1)[0]), noisy_edges(FAR, 3, 0.05)
+    good, _ = pose_with_edges(replace(view, edges=edges[:3]), SHEET, MODEL)
     moved = replace(edges[3], line=edges[3].line + [0, 0, 9.0])
-    same, _ = pose_with_edges(*start, pixels, [*edges[:3], moved], SHEET, MODEL)
+    same, _ = pose_with_edges(replace(view, edges=[*edges[:3], moved]), SHEET, MODEL)
     np.testing.assert_allclose(same.as_matrix(), good.as_matrix(), atol=1e-9)
-    only, covariance = pose_with_edges(*start, pixels, [moved], SHEET, MODEL)
-    assert only is start[0] and covariance is start[1]
-    assert pose_with_edges(*start, pixels, [], SHEET, MODEL) == start
+    for useless in ([moved], []):
+        pose, covariance = pose_with_edges(replace(view, edges=useless), SHEET, MODEL)
+        assert pose is view.T_camera_board and covariance is view.covariance
 
 
 def test_a_board_frame_whose_z_points_out_is_recognised_by_its_outline():
@@ -473,10 +513,10 @@ def test_a_board_frame_whose_z_points_out_is_recognised_by_its_outline():
     upside = CORNERS * [1, -1] + [0, 3 * PATTERN.square]
     board = replace(SHEET, corners=upside[::-1].copy(), edges=("bottom", "right", "top", "left"))
     pose = pose_of()
-    view = survey.view_board(render(pose), board, MODEL)
+    view = seen(render(pose), board)
     assert len(view.edges) == 4
     assert view.T_camera_board.rotation.as_matrix()[2, 2] < 0
-    np.testing.assert_allclose(view.pixels, mirror_pattern(pixels_of([pose])[0], PATTERN), atol=0.3)
+    np.testing.assert_allclose(view.pixels, pixels_of([pose])[0][pattern_orders(PATTERN)[2]], atol=0.3)
 
 
 def test_line_covariance_tells_the_error_over_noise():
@@ -499,8 +539,6 @@ def test_line_covariance_tells_the_error_over_noise():
 
 
 def systematic(edge):
-    from lrfcal_lib.preprocess.edges_in_image import SYSTEMATIC_PX
-
     length = np.linalg.norm(edge.ends[1] - edge.ends[0])
     return np.diag([SYSTEMATIC_PX**2, 12 * SYSTEMATIC_PX**2 / length**2])
 
@@ -534,7 +572,7 @@ def test_correlated_residuals_count_less():
 
 def test_edges_outside_the_image_are_listed_with_the_reason():
     pose = pose_of(at=(0.0, 0.17, 0.8))
-    view = survey.view_board(render(pose), SHEET, MODEL)
+    view = seen(render(pose))
     assert view.reason == ""
     assert dict(view.rejected).keys() == {"bottom"}
     assert "cut by the image border" in dict(view.rejected)["bottom"]
@@ -542,15 +580,15 @@ def test_edges_outside_the_image_are_listed_with_the_reason():
 
 def test_an_edge_that_nothing_shows_is_listed_with_the_reason():
     pose = pose_of()
-    view = survey.view_board(render(pose, background=105.0), SHEET, MODEL)
+    view = seen(render(pose, background=105.0))
     assert {reason.split(":")[0] for _, reason in view.rejected} == {"no clear edge"}
     assert len(view.rejected) == 4
 
 
 def test_image_of_another_size_or_without_pattern():
-    view = survey.view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
+    view = view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
     assert "120 x 100" in view.reason and "640 x 480" in view.reason
-    view = survey.view_board(np.full((480, 640, 3), 80, np.uint8), SHEET, MODEL)
+    view = seen(np.full((480, 640, 3), 80, np.uint8))
     assert "inner corners" in view.reason
     assert (view.edges, view.T_camera_board) == ((), None)
 
@@ -563,7 +601,7 @@ def test_picks_override_the_detector():
         Pick("left", Path("b.png"), "right", corners[:2]),
         Pick("right", Path("a.png"), "left", corners[:2]),
     ]
-    view = survey.view_board(render(pose), SHEET, MODEL, picks=picks, camera="left", file="a.png")
+    view = seen(render(pose), picks=picks)
     assert [e.name for e in view.edges if e.picked] == ["top"]
     top = view.edge("top")
     np.testing.assert_allclose(top.ends, undistort(picks[0].ends, MODEL), atol=1e-9)
@@ -571,9 +609,7 @@ def test_picks_override_the_detector():
     assert line_distance(pinhole(pose.apply([0.12, 0.095, 0.0]), MODEL), top.line) < 0
     assert view.edge("left").picked is False and view.edge("nowhere") is None
     with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
-        survey.view_board(
-            render(pose), SHEET, MODEL, picks=[replace(picks[0], edge="hypotenuse")], camera="left", file="a.png"
-        )
+        seen(render(pose), picks=[replace(picks[0], edge="hypotenuse")])
 
 
 def test_a_picked_edge_needs_two_points():
@@ -587,25 +623,6 @@ def test_edge_of_a_hopeless_prediction():
 
 
 # --- the outline that nobody measured ------------------------------------------------------------------------------
-
-
-def test_one_view_finds_the_edges_of_an_unknown_board():
-    pose = pose_of(0.1)
-    view = survey.view_board(render(pose), UNKNOWN, MODEL)
-    turned = view.T_camera_board.rotation.as_matrix()[0, 0] < 0
-    names = dict(zip(SHEET.edges, ("bottom", "left", "top", "right") if turned else SHEET.edges, strict=True))
-    assert len(view.edges) == 4
-    for edge in view.edges:
-        assert np.abs(line_distance(edge.ends, true_line(names[edge.name], pose))).max() < 0.1
-    assert view.votes.shape == (4, len(edges_in_image.wide_distances(PATTERN)))
-
-
-def test_a_board_without_a_visible_edge_lists_all_four():
-    view = survey.view_board(render(pose_of(), background=105.0), UNKNOWN, MODEL)
-    assert {reason for _, reason in view.rejected} <= {"no clear edge outside the pattern"} | set(
-        dict(view.rejected).values()
-    )
-    assert view.reason == ""
 
 
 @pytest.fixture(scope="module")
@@ -718,14 +735,26 @@ def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
     assert all(v.reason == "" for v in shown)
 
 
-def test_intrinsics_use_a_spread_of_the_images():
-    pixels = list(pixels_of(view_poses(40)))
-    group = [Record("left", Path("a"), i, purpose="intrinsics" if i < 20 else "board") for i in range(40)]
-    chosen = survey._for_intrinsics(["no board", *pixels[1:]], group)
-    assert len(chosen) == survey.VIEWS_FOR_INTRINSICS
-    mine = {id(p) for p in pixels[1:20]}
-    assert mine <= {id(p) for p in chosen}
-    assert len(survey._for_intrinsics(pixels, [replace(r, purpose="board") for r in group])) == 40
+def test_intrinsics_use_a_spread_of_the_images(monkeypatch):
+    pixels, used = pixels_of(view_poses(40)), []
+
+    def finder(record):
+        if record.placement == 0:
+            raise PatternNotFound("no board")
+        return pixels[record.placement]
+
+    def estimate(corners, *_):
+        used.append([int(np.flatnonzero((pixels == own).all(axis=(1, 2)))[0]) for own in corners])
+        raise ValueError("enough")
+
+    monkeypatch.setattr(survey, "PatternFinder", lambda pattern: finder)
+    monkeypatch.setattr(survey, "estimate_intrinsics", estimate)
+    for own in (20, 0):
+        records = [Record("left", Path("a"), i, purpose="intrinsics" if i < own else "board") for i in range(40)]
+        with pytest.raises(ValueError, match="camera 'left': enough"):
+            survey.survey(records, Shape, SHEET, {"left": None})
+    assert len(used[0]) == survey.VIEWS_FOR_INTRINSICS and set(range(1, 20)) <= set(used[0])
+    assert used[1] == list(range(1, 40))
 
 
 def test_picks_reach_their_image_in_a_survey(session):
@@ -812,7 +841,7 @@ def triangle_pose(roll=0.4, tilt=(0.3, -0.35), at=(0.02, 0.0, 0.9)):
 def test_a_plain_triangle_is_found_and_a_guess_tells_its_corners(roll):
     pose = triangle_pose(roll)
     guess = RigidTransform.from_components(pose.translation, Rotation.from_rotvec([0.1, -0.1, 0.1]) * pose.rotation)
-    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, guess=guess)
+    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, guess=guess)
     assert view.reason == "" and len(view.edges) == 3
     assert max(edge_errors(view, pose, TRIANGLE).values()) < 0.05
     corners = corners_of_lines(np.stack([e.line for e in view.edges]))
@@ -826,7 +855,7 @@ def test_a_plain_triangle_is_found_and_a_guess_tells_its_corners(roll):
 
 def test_other_poses_of_a_triangle_are_reported():
     pose = triangle_pose()
-    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
+    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
     everything = [view.T_camera_board, *view.alternatives]
     assert len(everything) >= 3
     assert min((p.rotation * pose.rotation.inv()).magnitude() for p in everything) < 0.01
@@ -839,7 +868,7 @@ def test_other_poses_of_a_triangle_are_reported():
 def test_a_picked_edge_tells_which_side_is_which():
     pose = triangle_pose()
     ends = project(pose.apply(np.column_stack([TRIANGLE.corners[[1, 2]], [0, 0]])), MODEL)
-    view = survey.view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks=[Pick("", Path("a"), "bc", ends)], file="a")
+    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": ends})
     assert view.edge("bc").picked
     assert max(edge_errors(view, pose, TRIANGLE).values()) < 0.1
 
@@ -847,8 +876,8 @@ def test_a_picked_edge_tells_which_side_is_which():
 def test_a_triangle_picked_whole_needs_no_detector():
     pose = triangle_pose()
     corners = project(pose.apply(np.column_stack([TRIANGLE.corners, np.zeros(3)])), MODEL)
-    picks = [Pick("", Path("a"), n, corners[[i, (i + 1) % 3]]) for i, n in enumerate(TRIANGLE.edges)]
-    view = survey.view_board(np.zeros((480, 640, 3), np.uint8), TRIANGLE, MODEL, picks=picks, file="a", guess=pose)
+    picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
+    view = view_board(np.zeros((480, 640, 3), np.uint8), TRIANGLE, MODEL, picks=picks, guess=pose)
     assert view.reason == "" and all(e.picked for e in view.edges)
     np.testing.assert_allclose(view.T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
@@ -856,7 +885,7 @@ def test_a_triangle_picked_whole_needs_no_detector():
 def test_a_plain_quadrilateral_is_over_determined():
     board = Board("slab", ("a", "b", "c", "d"), np.array([[0, 0], [0.4, 0], [0.35, 0.3], [0, 0.25]]))
     pose = triangle_pose(at=(0.0, 0.0, 1.0))
-    view = survey.view_board(render(pose, board), board, MODEL)
+    view = view_board(render(pose, board), board, MODEL)
     assert view.reason == ""
     assert (view.T_camera_board.rotation * pose.rotation.inv()).magnitude() < 0.02
     assert max(edge_errors(view, pose, board).values()) < 0.05
@@ -864,15 +893,15 @@ def test_a_plain_quadrilateral_is_over_determined():
 
 def test_triangles_that_cannot_be_used():
     blank = np.full((480, 640, 3), 200, np.uint8)
-    assert "no dark region with 3 straight edges" in survey.view_board(blank, TRIANGLE, MODEL).reason
+    assert "no dark region with 3 straight edges" in view_board(blank, TRIANGLE, MODEL).reason
     cut = render(triangle_pose(at=(0.42, 0.0, 0.9)), TRIANGLE)
-    assert "cut by the image border" in survey.view_board(cut, TRIANGLE, MODEL).reason
+    assert "cut by the image border" in view_board(cut, TRIANGLE, MODEL).reason
     disc = cv2.circle(blank.copy(), (300, 200), 80, (20, 20, 20), -1)
     with pytest.raises(board_in_image.OutlineNotFound, match="no dark region"):
         find_polygon(disc, 3)
     square = Board("square", ("a", "b", "c", "d"), np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
     flat = cv2.fillPoly(blank.copy(), [np.array([[100, 100], [500, 140], [400, 200], [120, 300]])], (20, 20, 20))
-    assert "explains the outline" in survey.view_board(flat, square, MODEL).reason
+    assert "explains the outline" in view_board(flat, square, MODEL).reason
 
 
 def test_plain_boards_in_a_survey():
@@ -976,10 +1005,8 @@ def test_opencv_stereo_pairs(real_data):
     numbers = [i for i in range(1, 15) if i != 10]
     corners, models = [], []
     for camera, rms in (("left", 0.4087), ("right", 0.4586)):
-        pixels = [
-            pattern_in_image.find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers
-        ]
-        result = survey.estimate_intrinsics(pixels, pattern, (640, 480))
+        pixels = [find_pattern(cv2.imread(str(folder / f"{camera}{i:02d}.jpg")), pattern) for i in numbers]
+        result = estimate_intrinsics(pixels, pattern, (640, 480))
         assert result.rms_px < rms
         corners.append(dict(zip(numbers, pixels, strict=True)))
         models.append(result.model)

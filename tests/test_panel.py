@@ -33,31 +33,54 @@ WAIT_S = 20  # guards against hanging
 VIEW = np.radians([40.0, 140.0])
 
 
-def fake(monkeypatch, folder, **plan):
-    """A rig file in a folder and the fake rig that opens for it."""
-    data = rig_data(**plan)
-    path = folder / "rig.json"
-    path.write_text(json.dumps(data))
-    rig = make_rig(data)
-    rig.head.emergency_stop = rig.head.stop
-    rig.head.pitch = lambda: (rig.head.at, True)
-    monkeypatch.setattr(collector, "Rig", opened(rig))
-    return path, rig
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """Makes a rig file, to whose plan keywords go, and the fake rig that opens for it."""
+
+    def fake(board=None, **plan):
+        data, path = rig_data(**plan), tmp_path / "rig.json"
+        data["board"]["corners_m"][1] = board or data["board"]["corners_m"][1]
+        path.write_text(json.dumps(data))
+        rig = make_rig(data)
+        rig.head.emergency_stop = rig.head.stop
+        rig.head.pitch = lambda: (rig.head.at, True)
+        monkeypatch.setattr(collector, "Rig", opened(rig))
+        return path
+
+    return fake
 
 
 @pytest.fixture
-def connected(monkeypatch, tmp_path):
-    """A collector with a fake rig, without advice, which a fake rig cannot feed."""
-    path, _ = fake(monkeypatch, tmp_path)
-    with Collector(advice=False) as made:
-        made.connect(path, tmp_path / "s")
-        yield made
+def connect(fake, tmp_path):
+    """Makes collectors that are connected to a fake rig; without advice, which a fake rig cannot feed."""
+    made = []
+
+    def connect(advice=False, **plan):
+        for one in made:
+            one.close()
+        made.append(Collector(advice=advice))
+        made[-1].connect(fake(**plan), tmp_path / "s")
+        return made[-1]
+
+    yield connect
+    made[-1].close()
+
+
+@pytest.fixture
+def connected(connect):
+    return connect()
 
 
 def in_background(call):
     thread = threading.Thread(target=call, daemon=True)
     thread.start()
     return thread
+
+
+def lose(camera):
+    """Let a camera be lost; its way of giving images, to be given back."""
+    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    return newest
 
 
 # -------------------------------------------------------------------------------------------------- recording
@@ -68,7 +91,7 @@ def test_placements_are_recorded_one_by_one(connected, tmp_path):
     assert connected.task().title == "Placement 1 of 3" and connected.task().guidance.startswith("put the board")
     lights = connected.capture(lambda share, text: shares.append(share))
     assert connected.finished == (1,) and connected.task().title == "Placement 2 of 3"
-    assert [light.name for light in lights][0] == "scan" and connected.lights[1] == lights
+    assert lights[0].name == "scan" and connected.lights[1] == lights
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
     assert sorted(np.degrees(list(connected.view.rows)).round()) == list(range(-4, 5))
     assert connected.view.frames["left"].image.shape == (SIZE[1], SIZE[0], 3)
@@ -77,37 +100,36 @@ def test_placements_are_recorded_one_by_one(connected, tmp_path):
     assert "unfinished" not in json.loads((tmp_path / "s" / "session.json").read_text())
 
 
-def test_a_session_goes_on_and_may_be_longer_than_planned(monkeypatch, tmp_path):
+def test_a_session_goes_on_and_may_be_longer_than_planned(connect, tmp_path):
     for number in (1, 2, 3):
-        path, _ = fake(monkeypatch, tmp_path, count=2)
-        with Collector(advice=False) as made:
-            made.connect(path, tmp_path / "s")
-            assert made.finished == tuple(range(1, number))
-            made.capture()
+        made = connect(count=2)
+        assert made.finished == tuple(range(1, number))
+        made.capture()
+    made.close()
     assert open_session(tmp_path / "s").placements == (1, 2, 3)
 
 
-def test_a_list_of_placements_has_an_end(monkeypatch, tmp_path):
-    path, _ = fake(monkeypatch, tmp_path, placements=[{"number": 4, "board": False}])
-    with Collector() as made:
-        made.connect(path, tmp_path / "s")
-        assert made.task().guidance.startswith("take the board away")
+def test_a_list_of_placements_has_an_end(connect):
+    made = connect(placements=[{"number": 4, "board": False}])
+    assert made.task().guidance.startswith("take the board away")
+    made.capture()
+    assert made.task() is None
+    with pytest.raises(RecordingError, match="plan of this rig is done"):
         made.capture()
-        assert made.task() is None
-        with pytest.raises(RecordingError, match="plan of this rig is done"):
-            made.capture()
 
 
-def test_views_held_close_come_first(monkeypatch, tmp_path):
-    path, _ = fake(monkeypatch, tmp_path, intrinsics_images=2)
-    with Collector() as made:
-        made.connect(path, tmp_path / "s")
-        assert made.task().close == ("left", 0) and "hold the board close" in made.task().guidance
-        (light,) = made.capture()  # noise shows no board: the view is still to be taken
-        assert light.state == "bad" and made.task().close == ("left", 0)
+def test_views_held_close_come_first(connect):
+    made = connect(intrinsics_images=2)
+    assert made.task().close == ("left", 0) and "hold the board close" in made.task().guidance
+    (light,) = made.capture()  # noise shows no board: the view is still to be taken
+    assert light.state == "bad" and made.task().close == ("left", 0)
 
 
 def test_the_last_placement_can_be_recorded_again(connected):
+    with pytest.raises(RecordingError, match="at least three placements"):
+        connected.calibrate()
+    with pytest.raises(RecordingError, match="no placement to record again"):
+        connected.again()
     connected.capture()
     connected.capture()
     assert connected.again() == 2 and connected.finished == (1,) and 2 not in connected.lights
@@ -153,38 +175,31 @@ def test_closing_stops_the_head_whatever_happened(connected):
     stops = head.stops
     connected.close()
     assert head.stops > stops and not connected.connected and connected.finished == ()
-    connected.close()
 
 
-def test_the_head_goes_where_it_is_sent(connected):
-    assert connected.move_to(0.05) == pytest.approx(0.05)
-    assert connected.look().pitch == pytest.approx(0.05) and connected.view.measured
-
-
-def test_advice_is_asked_from_the_third_placement_on(monkeypatch, tmp_path):
+def test_advice_is_asked_from_the_third_placement_on(connect, monkeypatch):
     asked = []
     monkeypatch.setattr(collector, "advise", lambda session: asked.append(len(session.placements)) or "put it there")
-    path, _ = fake(monkeypatch, tmp_path, count=9)
-    with Collector() as made:
-        made.connect(path, tmp_path / "s")
-        lights = [made.capture() for _ in range(4)]
-        assert made.task().guidance == "put it there"
-    assert asked == [3, 4]
+    made = connect(advice=True, count=9)
+    lights = [made.capture() for _ in range(4)]
+    assert made.task().guidance == "put it there" and asked == [3, 4]
     assert [found[-1].name for found in lights] == ["camera left"] * 2 + ["information"] * 2
 
 
 # ----------------------------------------------------------------------------------------------- the live view
 
 
-def test_a_look_shows_scan_and_images(connected):
+def test_a_look_shows_scan_images_and_where_the_head_is(connected):
+    assert connected.move_to(0.05) == pytest.approx(0.05)
     view = connected.look()
     assert view.ranges.shape == view.bearings.shape and list(view.frames) == ["left"] and view.trouble == ""
+    assert view.pitch == pytest.approx(0.05) and view.measured
 
 
 def test_a_lost_camera_is_said_and_comes_back(connected):
     camera = connected.rig.cameras["left"]
     connected.look()
-    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    newest = lose(camera)
     assert "camera left is lost: its plug" in connected.look().trouble and "left" not in connected.view.frames
     with pytest.raises(LineLost, match="its plug"):
         connected.capture()
@@ -203,7 +218,7 @@ def test_a_lost_line_is_looked_for(connected):
 # --------------------------------------------------------------------------------------------------- bad input
 
 
-def test_nothing_works_without_a_rig(tmp_path):
+def test_nothing_works_without_a_rig():
     made = Collector()
     for call in (made.capture, made.again, made.calibrate, lambda: made.move_to(0.0)):
         with pytest.raises(DeviceError, match="press connect"):
@@ -213,45 +228,27 @@ def test_nothing_works_without_a_rig(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "rig, said",
-    [("practise", "emulated are practice, sim_quick, sim_lms221"), ("missing.json", "No such file.*emulate")],
+    "rig, error, said",
+    [
+        ("practise", RigFileError, "emulated are practice, sim_quick, sim_lms221"),
+        ("missing.json", RigFileError, "No such file.*emulate"),
+        ("rig.json", PortError, "head: .*fake_head"),
+    ],
 )
-def test_a_rig_that_is_not_there(rig, said, tmp_path):
-    with pytest.raises(RigFileError, match=said):
-        Collector().connect(rig, tmp_path / "s")
-    assert not (tmp_path / "s").exists()
-
-
-def test_a_port_that_is_not_there(tmp_path):
-    data = rig_data(cameras=())
-    data["devices"]["head"]["port"] = str(tmp_path / "ttyUSB7")
-    (tmp_path / "rig.json").write_text(json.dumps(data))
+def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.json").write_text(json.dumps(rig_data(cameras=())))
     made = Collector()
-    with pytest.raises(PortError, match="head: .*ttyUSB7"):
-        made.connect(tmp_path / "rig.json", tmp_path / "s")
+    with pytest.raises(error, match=said):
+        made.connect(rig, tmp_path / "s")
     assert not made.connected and not (tmp_path / "s").exists()
 
 
-def test_a_session_of_another_rig(connected, monkeypatch, tmp_path):
+def test_a_session_of_another_rig(connected, fake, tmp_path):
     connected.capture()
-    connected.close()
-    path, _ = fake(monkeypatch, tmp_path)
-    data = json.loads(path.read_text())
-    data["board"]["corners_m"][1] = [0.5, 0]
-    path.write_text(json.dumps(data))
-    other = make_rig(data)
-    other.head.emergency_stop = other.head.stop
-    monkeypatch.setattr(collector, "Rig", opened(other))
     with pytest.raises(SessionError, match="board.corners_m"):
-        connected.connect(path, tmp_path / "s")
+        connected.connect(fake(board=[0.5, 0]), tmp_path / "s")
     assert not connected.connected
-
-
-def test_nothing_to_calibrate_or_to_repeat(connected):
-    with pytest.raises(RecordingError, match="at least three placements"):
-        connected.calibrate()
-    with pytest.raises(RecordingError, match="no placement to record again"):
-        connected.again()
 
 
 def test_data_without_a_board_give_no_calibration(connected):
@@ -307,16 +304,13 @@ def test_images_become_files_no_wider_than_asked():
 # ------------------------------------------------------------------------------------------------------- words
 
 
-def test_lights_say_their_state_in_signs_and_words():
+def test_lights_and_errors_say_their_state_in_signs_and_words():
     found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
     said = lights_html("Quality", found)
     for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
         assert sign in said
     assert "→ next" in lights_html("", [Light("information", "warn", "put it there")])
     assert "as soon as a placement is recorded" in lights_html("Quality", ())
-
-
-def test_errors_are_said_or_not():
     assert error_html("failed", "") == ""
     assert "check the plug" in error_html("connecting failed", "check the plug") and "✕" in error_html("a", "b")
 
@@ -345,9 +339,8 @@ def test_advice_where_nothing_is_determined_yet(monkeypatch):
 
 
 @pytest.fixture
-def panel(monkeypatch, tmp_path):
-    path, _ = fake(monkeypatch, tmp_path)
-    with Panel(path, tmp_path / "s", advice=False) as made:
+def panel(fake, tmp_path):
+    with Panel(fake(), tmp_path / "s", advice=False) as made:
         yield made
 
 
@@ -406,7 +399,7 @@ def test_errors_appear_in_the_panel(panel, tmp_path):
 def test_a_lost_camera_is_said_in_the_panel_until_it_is_back(panel):
     panel.connect()
     camera, parts = panel.collector.rig.cameras["left"], panel.parts
-    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    newest = lose(camera)
     wait_until(lambda: "camera left is lost: its plug" in parts.error.value)
     camera.newest = newest
     wait_until(lambda: parts.error.value == "")
@@ -430,9 +423,14 @@ def test_drivers_report_into_the_panel(panel):
 
 def test_stop_ends_what_a_button_began(panel):
     panel.connect()
-    begun = threading.Event()
-    note = panel.collector._note
-    panel.collector._note = lambda *event: (note(*event), begun.set(), panel.collector.stopped.wait(WAIT_S))
+    begun, lrf = threading.Event(), panel.collector.rig.lrf
+
+    def wait():
+        if threading.current_thread().name != "panel view":
+            begun.set()
+            panel.collector.stopped.wait(WAIT_S)
+
+    lrf.wait = wait
     panel.parts.capture.click()
     assert begun.wait(WAIT_S)
     panel.parts.stop.click()

@@ -22,7 +22,7 @@ from lrfcal_lib.acquire import record
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan, edge_rise
 from lrfcal_lib.acquire.record import Recording, RecordingError, Terminal, main, record_session
 from lrfcal_lib.drivers import port
-from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError
+from lrfcal_lib.drivers.port import NoReply, PortError
 from lrfcal_lib.drivers.rig import Moved, Scanned
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
@@ -52,13 +52,22 @@ def contents(path, number, session=None):
     return telegrams, images
 
 
-def expected(rig, placement):
+def expected(rig, number):
     """What :func:`contents` must be."""
+    placement = next(p for p in rig.stated.plan.to_do() if p.number == number)
     ways = np.degrees(placement.pitch)
     telegrams = [(telegram(np.radians(p)), pytest.approx(p, abs=1e-6)) for p in ways]
     images = [(c, pytest.approx(p, abs=1e-9), "board", picture(p, c).tobytes())
               for p in placement.image_pitch for c in rig.cameras]  # fmt: skip
     return telegrams, images
+
+
+def complete(rig, path):
+    """Go on to the end of the plan; all of it must then be there, as the devices gave it."""
+    write(rig, path, resume=True).finish()
+    assert validate(path) == [] and "unfinished" not in (path / "session.json").read_text()
+    for placement in rig.stated.plan.to_do():
+        assert contents(path, placement.number) == expected(rig, placement.number)
 
 
 def listed(*firsts, cameras=("left",)):
@@ -67,78 +76,82 @@ def listed(*firsts, cameras=("left",)):
     return rig_data(cameras, placements=plans)
 
 
+def rows(path, name):
+    """Cells of a table of a session."""
+    return [row.split(",") for row in (path / name).read_text().splitlines()]
+
+
+@pytest.fixture
+def path(tmp_path):
+    """Of the session to be recorded."""
+    return tmp_path / "s"
+
+
+@pytest.fixture
+def rig():
+    """With three placements."""
+    return make_rig(listed(-4, 0, 4))
+
+
 # --------------------------------------------------------------------------------------------------- what is written
 
 
 @pytest.mark.parametrize("cameras", [("left", "right"), ()])
-def test_a_session_holds_what_the_devices_gave(tmp_path, cameras):
-    rig = make_rig(listed(-4, 0, 4, cameras=cameras))
-    recording = write(rig, tmp_path / "s")
-    recording.finish()
-    assert validate(tmp_path / "s") == []
-    session = open_session(tmp_path / "s")
-    assert session.placements == (1, 2, 3) and "unfinished" not in (tmp_path / "s" / "session.json").read_text()
-    for placement in rig.stated.plan.to_do():
-        assert contents(tmp_path / "s", placement.number) == expected(rig, placement)
-    assert session.reference["pitch"] == "told by the head" and "stop-and-go" in session.reference["recording"]
+def test_a_session_holds_what_the_devices_gave(path, cameras):
+    complete(make_rig(listed(-4, 0, 4, cameras=cameras)), path)
+    session = open_session(path)
+    assert session.placements == (1, 2, 3) and "stop-and-go" in session.reference["recording"]
     assert session.telegram_report()["outcomes"] == {"scan": 9, "other": 1, "wrong CRC": 0, "truncated": 0}
 
 
 @pytest.mark.parametrize("feedback", [True, False])
-def test_the_platform_log_tells_commanded_and_measured_pitch(tmp_path, feedback):
-    write(make_rig(listed(-4), feedback=feedback), tmp_path / "s")
-    header, *rows = (tmp_path / "s" / "platform.csv").read_text().splitlines()
-    assert header == "t_s,commanded_deg,measured_deg"
-    rows = [row.split(",") for row in rows]
-    assert [float(r[1]) for r in rows] == pytest.approx([-4, -3, -2])
-    assert [r[2] for r in rows] == ([r[1] for r in rows] if feedback else ["", "", ""])
-    assert open_session(tmp_path / "s").reference["pitch"].startswith("told" if feedback else "dead reckoning")
+def test_the_platform_log_tells_commanded_and_measured_pitch(path, feedback):
+    write(make_rig(listed(-4), feedback=feedback), path)
+    header, *told = rows(path, "platform.csv")
+    assert header == ["t_s", "commanded_deg", "measured_deg"]
+    assert [float(r[1]) for r in told] == pytest.approx([-4, -3, -2])
+    assert [r[2] for r in told] == ([r[1] for r in told] if feedback else ["", "", ""])
+    assert open_session(path).reference["pitch"].startswith("told by the head" if feedback else "dead reckoning")
 
 
-def test_a_continuous_sweep_is_written_with_its_track(tmp_path):
+def test_a_continuous_sweep_is_written_with_its_track(path):
     rig = make_rig(rig_data(mode="continuous", pitch_deg=[-4, 8, 1], count=1))
-    write(rig, tmp_path / "s").finish()
-    sweep = open_session(tmp_path / "s").sweep(1)
+    write(rig, path).finish()
+    sweep = open_session(path).sweep(1)
     assert len(sweep.pitch) > 5 and np.all(np.diff(sweep.pitch) >= 0) and np.ptp(np.degrees(sweep.pitch)) > 10
-    rows = [row.split(",") for row in (tmp_path / "s" / "platform.csv").read_text().splitlines()[1:]]
-    assert all(float(row[1]) == 8 for row in rows[2:]) and len(rows) == 2 + len(rig.head.track)
+    told = rows(path, "platform.csv")[1:]
+    assert all(float(row[1]) == 8 for row in told[2:]) and len(told) == 2 + len(rig.head.track)
 
 
-def test_a_scene_has_images_of_a_scene(tmp_path):
-    data = rig_data(placements=[{"number": 1}, {"number": 2, "board": False}])
-    write(make_rig(data), tmp_path / "s")
-    assert open_session(tmp_path / "s").scene_placements == (2,)
+def test_a_scene_has_images_of_a_scene(path):
+    write(make_rig(rig_data(placements=[{"number": 1}, {"number": 2, "board": False}])), path)
+    assert open_session(path).scene_placements == (2,)
 
 
-def test_every_event_is_on_the_disk_when_it_is_seen(tmp_path):
-    recording = Recording(make_rig(listed(-4)), tmp_path / "s")
-    telegrams = tmp_path / "s" / "lrf" / "telegrams.bin"
+def test_every_event_is_on_the_disk_when_it_is_seen(path, rig):
+    recording = Recording(rig, path)
     for event in recording.run(recording.to_do()[0]):
         if isinstance(event, Scanned):
-            assert telegrams.read_bytes().endswith(event.readings[0].telegrams[0])
+            assert (path / "lrf" / "telegrams.bin").read_bytes().endswith(event.readings[0].telegrams[0])
         elif isinstance(event, Moved):
-            last = (tmp_path / "s" / "platform.csv").read_text().splitlines()[-1]
-            assert float(last.split(",")[0]) == pytest.approx(event.time_s)
+            assert float(rows(path, "platform.csv")[-1][0]) == pytest.approx(event.time_s)
 
 
-def test_interlaced_telegrams_share_their_pitch(tmp_path):
-    rig = make_rig(listed(-4, cameras=()))
-    recording = Recording(rig, tmp_path / "s")
-    reading = rig.lrf.request()
-    event = Scanned(1, (replace(reading, telegrams=reading.telegrams * 4),), np.array([0.1]))
+def test_interlaced_telegrams_share_their_pitch(path, rig):
+    recording, reading = Recording(rig, path), rig.lrf.request()
     recording.writer.begin_placement(1)
-    recording._write(event)
-    rows = (tmp_path / "s" / "lrf" / "index.csv").read_text().splitlines()[2:]
-    assert len(rows) == 4 and len({row.split(",")[4] for row in rows}) == 1
+    recording.write(Scanned(1, (replace(reading, telegrams=reading.telegrams * 4),), np.array([0.1])))
+    found = rows(path, "lrf/index.csv")[2:]
+    assert len(found) == 4 and len({row[4] for row in found}) == 1
 
 
 # ---------------------------------------------------------------------------------------- interrupted and gone on
 
 
-def broken_off(rig, path, events, number=0):
+def broken_off(rig, path, events):
     """Begin a placement and leave it after some events."""
     recording = Recording(rig, path, resume=True)
-    running = recording.run(recording.to_do()[number])
+    running = recording.run(recording.to_do()[0])
     for _ in range(events):
         next(running)
     running.close()
@@ -146,124 +159,93 @@ def broken_off(rig, path, events, number=0):
 
 
 @pytest.mark.parametrize("events", range(1, 8))
-def test_the_placement_that_was_running_is_no_part_of_the_session(tmp_path, events):
-    rig = make_rig(listed(-4, 0, 4))
-    write(rig, tmp_path / "s", count=1)
-    broken_off(rig, tmp_path / "s", events)
+def test_the_placement_that_was_running_is_no_part_of_the_session(path, rig, events):
+    write(rig, path, count=1)
+    broken_off(rig, path, events)
     assert rig.head.stops == 1
-    session = open_session(tmp_path / "s")
+    session = open_session(path)
     assert session.placements == (1,) and {r.placement for r in session.image_records} == {1}
     assert any("placement 2: its recording was not finished" in text for text in session.problems)
-    assert contents(tmp_path / "s", 1) == expected(rig, rig.stated.plan.to_do()[0])
-    write(rig, tmp_path / "s", resume=True).finish()
-    assert validate(tmp_path / "s") == []
-    for placement in rig.stated.plan.to_do():
-        assert contents(tmp_path / "s", placement.number) == expected(rig, placement)
+    assert contents(path, 1) == expected(rig, 1)
+    complete(rig, path)
 
 
-def test_dropped_telegrams_and_images_stay_on_the_disk(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    broken_off(rig, tmp_path / "s", 6)
-    before = (tmp_path / "s" / "lrf" / "telegrams.bin").read_bytes()
-    shots = sorted((tmp_path / "s" / "images" / "left").iterdir())
-    assert len(shots) == 1
-    write(rig, tmp_path / "s", resume=True).finish()
-    assert (tmp_path / "s" / "lrf" / "telegrams.bin").read_bytes().startswith(before)
-    assert shots[0].exists() and ",dropped\n" in (tmp_path / "s" / "images.csv").read_text()
-    assert len(sorted((tmp_path / "s" / "images" / "left").iterdir())) == 3
-    assert len(contents(tmp_path / "s", 1)[1]) == 1
+def test_dropped_telegrams_and_images_stay_on_the_disk(path, rig):
+    broken_off(rig, path, 6)
+    before, (shot,) = (path / "lrf" / "telegrams.bin").read_bytes(), (path / "images" / "left").iterdir()
+    complete(rig, path)
+    assert (path / "lrf" / "telegrams.bin").read_bytes().startswith(before)
+    assert shot.exists() and ",dropped\n" in (path / "images.csv").read_text()
+    assert len(list((path / "images" / "left").iterdir())) == 4
 
 
-def test_a_placement_can_be_recorded_again(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    recording = write(rig, tmp_path / "s")
-    recording.drop(1)
-    assert recording.finished == (2,) and [p.number for p in recording.to_do()] == [1]
-    list(recording.run(recording.to_do()[0]))
-    recording.finish()
-    assert validate(tmp_path / "s") == []
-    assert contents(tmp_path / "s", 1) == expected(rig, rig.stated.plan.to_do()[0])
-
-
-def test_a_panel_may_begin_again_after_a_fault(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    recording = broken_off(rig, tmp_path / "s", 4)
+def test_placements_can_be_recorded_again_and_a_finished_session_goes_on(path, rig):
+    recording = broken_off(rig, path, 4)  # as a panel after a fault, with the same recording
     list(recording.run(recording.to_do()[0]))
     assert recording.finished == (1,)
-
-
-def test_a_finished_session_can_be_extended(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    write(rig, tmp_path / "s", count=1).finish()
-    write(rig, tmp_path / "s", resume=True).finish()
-    assert open_session(tmp_path / "s").placements == (1, 2)
+    list(recording.run(recording.to_do()[0]))
+    recording.drop(1)
+    assert recording.finished == (2,) and [p.number for p in recording.to_do()] == [1, 3]
+    recording.finish()
+    complete(rig, path)
 
 
 @pytest.mark.parametrize("file", ["images.csv", "platform.csv", "lrf/index.csv"])
-def test_a_row_that_was_cut_off_does_no_harm(tmp_path, file):
-    rig = make_rig(listed(-4, 0))
-    write(rig, tmp_path / "s", count=1)
-    broken_off(rig, tmp_path / "s", 6)
-    os.truncate(tmp_path / "s" / file, (tmp_path / "s" / file).stat().st_size - 3)
-    assert contents(tmp_path / "s", 1) == expected(rig, rig.stated.plan.to_do()[0])
-    write(rig, tmp_path / "s", resume=True).finish()
-    assert validate(tmp_path / "s") == []
-    for placement in rig.stated.plan.to_do():
-        assert contents(tmp_path / "s", placement.number) == expected(rig, placement)
+def test_a_row_that_was_cut_off_does_no_harm(path, rig, file):
+    write(rig, path, count=1)
+    broken_off(rig, path, 6)
+    os.truncate(path / file, (path / file).stat().st_size - 3)
+    assert contents(path, 1) == expected(rig, 1)
+    complete(rig, path)
 
 
-def test_only_the_same_rig_goes_on(tmp_path):
-    write(make_rig(listed(-4, 0)), tmp_path / "s", count=1)
-    other = listed(-4, 0)
-    other["rig"]["lrf"]["sigma_range_m"] = 0.02
-    with pytest.raises(SessionError, match=r"rig\.lrf\.sigma_range_m is 0\.01, not 0\.02, unlike the rig now"):
-        Recording(make_rig(other), tmp_path / "s", resume=True)
-    with pytest.raises(SessionError, match="board.corners_m"):
-        other = listed(-4, 0)
-        other["board"]["corners_m"][1][0] = 0.5
-        Recording(make_rig(other), tmp_path / "s", resume=True)
+@pytest.mark.parametrize(("way", "value", "message"), [
+    (("rig", "lrf", "sigma_range_m"), 0.02, r"rig\.lrf\.sigma_range_m is 0\.01, not 0\.02, unlike the rig now"),
+    (("board", "corners_m", 1), [0.5, 0], "board.corners_m"),
+])  # fmt: skip
+def test_only_the_same_rig_goes_on(path, rig, way, value, message):
+    write(rig, path, count=1)
+    other, (part, key, at) = listed(-4, 0, 4), way
+    other[part][key][at] = value
+    with pytest.raises(SessionError, match=message):
+        Recording(make_rig(other), path, resume=True)
 
 
-def test_a_session_is_never_written_over(tmp_path):
-    write(make_rig(listed(-4)), tmp_path / "s")
-    with pytest.raises(SessionError, match="exists already; record with --resume"):
-        Recording(make_rig(listed(-4)), tmp_path / "s")
-    (tmp_path / "t").mkdir()
-    (tmp_path / "t" / "notes.txt").write_text("mine")
+def test_a_session_is_never_written_over(path, rig):
+    path.mkdir()
+    (path / "notes.txt").write_text("mine")
     with pytest.raises(SessionError, match="exists already; choose another name"):
-        Recording(make_rig(listed(-4)), tmp_path / "t", resume=True)
+        Recording(rig, path, resume=True)
+    (path / "notes.txt").unlink()
+    write(rig, path)
+    with pytest.raises(SessionError, match="exists already; record with --resume"):
+        Recording(rig, path)
 
 
-@pytest.fixture
-def recorder(tmp_path):
-    stated = make_rig(listed(-4)).stated
-    return SessionRecorder(tmp_path / "r", stated.board, stated.lrf, stated.cameras.values())
+def test_placements_are_begun_and_finished_one_by_one(path, rig):
+    recorder = SessionRecorder(path, rig.stated.board, rig.stated.lrf, rig.stated.cameras.values())
 
+    def refused(message, call, *arguments):
+        with pytest.raises(SessionError, match=message):
+            call(*arguments)
 
-def test_placements_are_begun_and_finished_one_by_one(recorder):
-    with pytest.raises(SessionError, match="placement 1 was not begun"):
-        recorder.add_telegrams(1, [telegram(0.0)], 0.0)
-    with pytest.raises(SessionError, match="no placement is being recorded"):
-        recorder.finish_placement()
+    refused("placement 1 was not begun", recorder.add_telegrams, 1, [telegram(0.0)], 0.0)
+    refused("no placement is being recorded", recorder.finish_placement)
     recorder.begin_placement(1)
-    with pytest.raises(SessionError, match="placement 1 is being recorded"):
-        recorder.begin_placement(2)
+    refused("placement 1 is being recorded", recorder.begin_placement, 2)
     recorder.add_telegrams(1, [telegram(0.0)], 0.0)
     recorder.finish_placement()
-    with pytest.raises(SessionError, match="placement 1 cannot be begun; recorded: 1"):
-        recorder.begin_placement(1)
-    with pytest.raises(SessionError, match="no placement 4 to drop; recorded: 1"):
-        recorder.drop_placement(4)
+    refused("placement 1 cannot be begun; recorded: 1", recorder.begin_placement, 1)
+    refused("no placement 4 to drop; recorded: 1", recorder.drop_placement, 4)
     recorder.begin_placement(2)
     recorder.finish()
-    assert open_session(recorder.path).placements == (1,)
+    assert open_session(path).placements == (1,)
 
 
-def test_a_recording_that_was_left_is_finished_from_outside(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    write(rig, tmp_path / "s", count=1)
-    finish(tmp_path / "s")
-    assert open_session(tmp_path / "s").placements == (1,)
+def test_a_recording_that_was_left_is_finished_from_outside(path, rig):
+    write(rig, path, count=1)
+    finish(path)
+    assert open_session(path).placements == (1,) and validate(path) == []
 
 
 # ------------------------------------------------------------------------------------------------ killed, disk full
@@ -301,10 +283,9 @@ def record_and_die(data, path, told, writes):
         os.write(told, bytes([placement.number]))
 
 
-def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(tmp_path):
+def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(path):
     data = listed(*np.linspace(-50, 40, 120).round(1).tolist(), cameras=("left", "right"))
-    rng, rig, path, known, lost = np.random.default_rng(5), make_rig(data), tmp_path / "s", set(), 0
-    plan = {placement.number: placement for placement in rig.stated.plan.to_do()}
+    rng, rig, known, lost = np.random.default_rng(5), make_rig(data), set(), 0
     for _ in range(20):
         read_end, write_end = os.pipe()
         children = [in_child(record_and_die, data, path, write_end, int(n)) for n in rng.integers(60, size=2)]
@@ -313,68 +294,60 @@ def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(tmp_path):
             known |= set(stream.read())
         ends = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
         assert ends == {-signal.SIGKILL}, "one ended before it was killed"
-        if not known:
-            continue
-        session = open_session(path)
-        finished = set(session.placements)
-        assert known <= finished and len(finished - known) <= 2  # one each was finished and not told
-        lost += len(json.loads((path / "session.json").read_text())["unfinished"])
-        known = finished
-        for number in finished:
-            assert contents(path, number, session) == expected(rig, plan[number])
-    assert 5 < len(known) < len(plan) and lost > 3
+        if known:
+            session = open_session(path)
+            finished = set(session.placements)
+            assert known <= finished and len(finished - known) <= 2  # one each was finished and not told
+            lost += len(json.loads((path / "session.json").read_text())["unfinished"])
+            known = finished
+            for number in finished:
+                assert contents(path, number, session) == expected(rig, number)
+    assert 5 < len(known) < len(rig.stated.plan.to_do()) and lost > 3
     recording = write(rig, path, resume=True, count=max(known) + 1)
     recording.finish()
     assert validate(path) == [] and len(recording.finished) == max(known) + 1
 
 
-class Full:
+@contextlib.contextmanager
+def full_disk(monkeypatch, free):
     """A disk that is full from the n-th write on."""
+    fsync, left = os.fsync, iter(range(free))
 
-    def __init__(self, monkeypatch, free):
-        self.free, self.fsync = free, os.fsync
-        monkeypatch.setattr(os, "fsync", self)
-
-    def __call__(self, handle):
-        self.free -= 1
-        if self.free < 0:
+    def full(handle):
+        if next(left, None) is None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self.fsync(handle)
+        fsync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        yield
 
 
 @pytest.mark.parametrize("free", range(0, 26, 3))
-def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(tmp_path, monkeypatch, free):
-    rig = make_rig(listed(-4, 0, 4))
-    write(rig, tmp_path / "s", count=1)
-    recording = Recording(rig, tmp_path / "s", resume=True)
-    with monkeypatch.context() as patch:
-        Full(patch, free)
+def test_a_full_disk_stops_the_head_and_keeps_what_is_finished(path, rig, monkeypatch, free):
+    write(rig, path, count=1)
+    recording = Recording(rig, path, resume=True)
+    with full_disk(monkeypatch, free):
         with pytest.raises(RecordingError, match="No space left.*free some space; placements 1.*--resume goes on"):
             while True:
                 list(recording.run(recording.to_do()[0]))
     recording.close()
     assert rig.head.stops == 1 or free in (0, 15)  # between two placements the head rests
-    assert contents(tmp_path / "s", 1) == expected(rig, rig.stated.plan.to_do()[0])
-    again = write(rig, tmp_path / "s", resume=True)
-    again.finish()
-    assert validate(tmp_path / "s") == [] and again.finished == (1, 2, 3)
-    for placement in rig.stated.plan.to_do():
-        assert contents(tmp_path / "s", placement.number) == expected(rig, placement)
+    assert contents(path, 1) == expected(rig, 1)
+    complete(rig, path)
 
 
-def test_a_disk_that_is_full_at_once(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        Full(patch, 0)
-        with pytest.raises(RecordingError, match="free some space; then record again"):
-            Recording(make_rig(), tmp_path / "s")
-    write(make_rig(), tmp_path / "s", resume=True).finish()
+def test_a_disk_that_is_full_at_once(path, rig, monkeypatch):
+    with full_disk(monkeypatch, 0), pytest.raises(RecordingError, match="free some space; then record again"):
+        Recording(rig, path)
+    complete(rig, path)
     with pytest.raises(RecordingError, match=r"cannot be written \(Not a directory\): check the disk"):
-        Recording(make_rig(), tmp_path / "s" / "session.json" / "t")
+        Recording(rig, path / "session.json" / "t")
 
 
-def test_a_write_that_fails_half_way_leaves_no_half_row(tmp_path):
+def test_a_write_that_fails_half_way_leaves_no_half_row(path):
     """A real limit of the file size: the kernel takes a part of a telegram and refuses the rest."""
-    rig, path = make_rig(listed(-4, 0, 4, cameras=())), tmp_path / "s"
+    rig = make_rig(listed(-4, 0, 4, cameras=()))
     write(rig, path, count=1)
     limit = (path / "lrf" / "telegrams.bin").stat().st_size + 300
 
@@ -388,10 +361,8 @@ def test_a_write_that_fails_half_way_leaves_no_half_row(tmp_path):
 
     child = in_child(until_full)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
-    assert (path / "lrf" / "telegrams.bin").stat().st_size < limit
-    assert contents(path, 1) == expected(rig, rig.stated.plan.to_do()[0])
-    write(rig, path, resume=True).finish()
-    assert validate(path) == []
+    assert (path / "lrf" / "telegrams.bin").stat().st_size < limit and contents(path, 1) == expected(rig, 1)
+    complete(rig, path)
 
 
 # ------------------------------------------------------------------------------------------------- at the terminal
@@ -400,248 +371,211 @@ def test_a_write_that_fails_half_way_leaves_no_half_row(tmp_path):
 class Screen(io.StringIO):
     """stdout that is a terminal, or not."""
 
-    def __init__(self, live=False):
-        super().__init__()
-        self.live = live
+    live = False
 
     def isatty(self):
         return self.live
 
 
-def answers(*texts):
-    """Stands in for `input`; notes what was asked."""
-    todo, asked = list(texts), []
+class Answers(list):
+    """Stands in for `input`; notes what was asked, and raises what is an error."""
 
-    def ask(text):
-        asked.append(text)
-        if not todo:
-            raise EOFError
-        answer = todo.pop(0)
+    def __init__(self, *texts):
+        super().__init__(texts)
+        self.asked = []
+
+    def __call__(self, text):
+        self.asked.append(text)
+        answer = self.pop(0) if self else EOFError()
         if isinstance(answer, BaseException):
             raise answer
         return answer
 
-    ask.asked = asked
-    return ask
+
+def recorded(rig, path, *texts, screen=None):
+    """Record at a terminal; what was asked."""
+    answers = Answers(*texts)
+    record_session(rig, path, terminal=Terminal(screen or Screen(), answers))
+    return answers.asked
 
 
 @pytest.mark.parametrize("live", [False, True])
-def test_the_display_is_plain_text(tmp_path, live, monkeypatch):
+def test_the_display_is_plain_text_and_shows_lights(path, rig, live, monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
-    screen, ask = Screen(live), answers("", "", "")
-    record_session(make_rig(listed(-4, 0, 4)), tmp_path / "s", terminal=Terminal(screen, ask))
+    screen = Screen()
+    screen.live = live
+    asked = recorded(rig, path, "", "", "", screen=screen)
     text = screen.getvalue()
     assert "\x1b" not in text and "\a" not in text and ("\r" in text) == live
     assert "placement 2 (2 of 3): board, pitch 0.00 to 2.00 deg" in text and "3 scans, 1 images" in text
     assert all(len(part) < 60 for part in text.split("\r")[1:-1] if "\n" not in part)
-    assert len(ask.asked) == 3 and "put the board, then press Enter (q: end here)" in ask.asked[0]
+    assert len(asked) == 3 and "put the board, then press Enter (q: end here)" in asked[0]
+    assert "BAD   scan: no board" in text and "BAD   camera left: 0 of 1" in text
 
 
-def test_the_last_placement_can_be_asked_for_again(tmp_path):
-    ask = answers("", "what?", "R", "", "q")
-    recording = record_session(make_rig(listed(-4, 0)), tmp_path / "s", terminal=Terminal(Screen(), ask))
-    assert recording.finished == (1,) and "dropped" in (tmp_path / "s" / "images.csv").read_text()
-    assert "r: placement 1 again" in ask.asked[1] and "again" not in ask.asked[0]
-    assert open_session(tmp_path / "s").placements == (1,)
+def test_the_last_placement_can_be_asked_for_again(path, rig):
+    asked = recorded(rig, path, "", "what?", "R", "", "q")
+    assert "dropped" in (path / "images.csv").read_text()
+    assert "r: placement 1 again" in asked[1] and "again" not in asked[0]
+    assert open_session(path).placements == (1,)
 
 
-def test_without_anybody_to_move_the_board(tmp_path):
+def test_without_anybody_to_move_the_board(path, rig):
     with pytest.raises(RecordingError, match="nobody is there to move the board"):
-        record_session(make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(Screen(), answers()))
+        recorded(rig, path)
 
 
-def test_an_emulated_board_moves_by_itself(tmp_path, monkeypatch):
-    rig, moved = make_rig(listed(-4, 0)), []
+def test_an_emulated_board_moves_by_itself(path, rig, monkeypatch):
+    moved = []
     monkeypatch.setattr(rig, "move_board", lambda number: moved.append(number) or True)
-    record_session(rig, tmp_path / "s", terminal=Terminal(Screen(), answers()))
-    assert moved == [1, 2]
+    assert recorded(rig, path) == [] and moved == [1, 2, 3]
 
 
-def test_lights_and_advice_are_shown(tmp_path):
-    screen = Screen()
-    record_session(
-        make_rig(listed(-4)), tmp_path / "s", terminal=Terminal(screen, answers("")), advice=lambda s: "go left"
-    )
-    text = screen.getvalue()
-    assert "BAD   scan: no board" in text and "BAD   camera left" in text and "WARN  information: go left" in text
+PATTERN = np.full((SIZE[1] * 8, SIZE[0] * 8, 3), 200, np.uint8)  # the fake board's, small
+for i, k in zip(*np.nonzero(np.indices((6, 5)).sum(axis=0) % 2), strict=True):
+    PATTERN[20 + 24 * i : 44 + 24 * i, 30 + 24 * k : 54 + 24 * k] = 30
 
 
-def board_picture(noise=0):
-    """The fake board's pattern, small."""
-    image = np.full((SIZE[1] * 8, SIZE[0] * 8), 200, np.uint8)
-    for i in range(6):
-        for k in range(5):
-            if (i + k) % 2:
-                image[20 + 24 * i : 44 + 24 * i, 30 + 24 * k : 54 + 24 * k] = 30
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-
-
-def close_data():
+@pytest.fixture
+def close_rig():
+    """Whose camera is to take two images of the board held close."""
     data = listed(-4)
     data["plan"]["intrinsics_images"] = 2
     data["rig"]["cameras"]["left"] |= {"width": SIZE[0] * 8, "height": SIZE[1] * 8}
-    return data
+    return make_rig(data)
 
 
-def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(tmp_path):
-    rig, shown = make_rig(close_data()), []
-
-    def show(pitch, name):
-        shown.append(pitch)
-        return board_picture() if len(shown) != 2 else np.zeros_like(board_picture())
-
-    rig.cameras["left"].show = show
-    ask = answers("", "", "", "")
-    record_session(rig, tmp_path / "s", terminal=Terminal(Screen(), ask))
-    session = open_session(tmp_path / "s")
+def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(path, close_rig):
+    shown = [PATTERN, np.zeros_like(PATTERN), PATTERN, PATTERN]  # one is bad, one is of the placement
+    close_rig.cameras["left"].show = lambda pitch, name: shown.pop(0)
+    asked = recorded(close_rig, path, "", "", "", "")
+    session = open_session(path)
     assert len(session.images(purpose="intrinsics")) == 2 and all(r.placement == -1 for r in session.images()[:2])
-    assert [text[15:26] for text in ask.asked[:3]] == ["view 1 of 2", "view 2 of 2", "view 2 of 2"]
-    assert len(shown) == 4  # one was bad, one is of the placement
+    assert [text[15:26] for text in asked[:3]] == ["view 1 of 2", "view 2 of 2", "view 2 of 2"] and not shown
 
 
-def test_images_for_the_intrinsics_are_not_taken_twice(tmp_path):
-    rig = make_rig(close_data())
-    rig.cameras["left"].show = lambda pitch, name: board_picture()
-    recording = Recording(rig, tmp_path / "s")
-    assert recording.close_views_to_do() == [("left", 0), ("left", 1)]
-    recording.run_close("left")
-    recording.close()
-    assert Recording(rig, tmp_path / "s", resume=True).close_views_to_do() == [("left", 1)]
+def test_images_for_the_intrinsics_are_not_taken_twice(path, close_rig):
+    close_rig.cameras["left"].show = lambda pitch, name: PATTERN
+    with Recording(close_rig, path) as recording:
+        assert recording.close_views_to_do() == [("left", 0), ("left", 1)]
+        recording.run_close("left")
+    assert Recording(close_rig, path, resume=True).close_views_to_do() == [("left", 1)]
 
 
 # -------------------------------------------------------------------------------------------------- command line
 
 
 @pytest.fixture
-def rig_file(tmp_path):
+def run(tmp_path, path, rig, monkeypatch, capsys):
+    """Runs the program with the fake rig: exit code, what it says, what it complains about."""
     file = tmp_path / "rig.json"
     file.write_text(json.dumps(listed(-4, 0, 4)))
-    return file
+
+    def run(*texts, ask=None, **options):
+        monkeypatch.setattr(record, "Rig", opened(rig))
+        code = main(file, path, terminal=Terminal(Screen(), ask or Answers(*texts)), **options)
+        said = capsys.readouterr()
+        return code, said.out, said.err.strip()
+
+    return run
 
 
-def run(rig_file, tmp_path, rig, monkeypatch, ask, **options):
-    """Exit code of the program with fakes."""
-    monkeypatch.setattr(record, "Rig", opened(rig))
-    return main(rig_file, tmp_path / "s", terminal=Terminal(Screen(), ask), **options)
+def at_scan(rig, number, action):
+    """Let something happen with a scan, counted from 1."""
+    seen = []
+    rig.lrf.wait = lambda: (seen.append(1), len(seen) == number and action())
 
 
-def test_a_recording_by_command(rig_file, tmp_path, monkeypatch, capsys):
-    assert run(rig_file, tmp_path, make_rig(listed(-4, 0, 4)), monkeypatch, answers("", ""), count=2) == 0
-    assert open_session(tmp_path / "s").placements == (1, 2)
-    assert "placements 1, 2 are safe; 'python -m lrfcal_lib calibrate" in capsys.readouterr().out
-    assert run(rig_file, tmp_path, make_rig(listed(-4, 0, 4)), monkeypatch, answers(""), resume=True) == 0
-    assert open_session(tmp_path / "s").placements == (1, 2, 3)
+def interrupt():
+    raise KeyboardInterrupt
 
 
-def test_ctrl_c_at_the_prompt(rig_file, tmp_path, monkeypatch, capsys):
-    rig = make_rig(listed(-4, 0, 4))
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", KeyboardInterrupt())) == 130
-    assert rig.head.stops and capsys.readouterr().err.strip() == (
-        "stopped by Ctrl-C; placements 1 are safe; --resume goes on from there"
-    )
+def test_a_recording_by_command(run, path):
+    code, said, _ = run("", "", count=2)
+    assert code == 0 and "placements 1, 2 are safe; 'python -m lrfcal_lib calibrate" in said
+    assert run("", resume=True)[0] == 0 and open_session(path).placements == (1, 2, 3)
+
+
+def test_ctrl_c_at_the_prompt(run, rig):
+    said = "stopped by Ctrl-C; placements 1 are safe; --resume goes on from there"
+    assert run("", KeyboardInterrupt())[::2] == (130, said) and rig.head.stops
 
 
 @pytest.mark.parametrize("scans", range(1, 7))
-def test_ctrl_c_amid_a_sweep(rig_file, tmp_path, monkeypatch, capsys, scans):
-    rig, seen = make_rig(listed(-4, 0, 4)), []
-
-    def interrupt():
-        seen.append(1)
-        if len(seen) == scans:
-            raise KeyboardInterrupt
-
-    rig.lrf.wait = interrupt
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "")) == 130
-    assert rig.head.stops >= 1 and not rig.lrf.streaming
-    assert "stopped by Ctrl-C" in capsys.readouterr().err
-    rig.lrf.wait = None
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "", ""), resume=True) == 0
-    assert validate(tmp_path / "s") == []
+def test_ctrl_c_amid_a_sweep(run, rig, path, scans):
+    at_scan(rig, scans, interrupt)
+    code, _, said = run("", "")
+    assert code == 130 and "stopped by Ctrl-C" in said and rig.head.stops >= 1 and not rig.lrf.streaming
+    assert run("", "", "", resume=True)[0] == 0 and validate(path) == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_signals_say_what_is_safe_and_how_to_go_on(rig_file, tmp_path, monkeypatch, capsys, number):
+def test_signals_say_what_is_safe_and_how_to_go_on(run, rig, number):
     """As `emergency` turns them into an exit, amid the second placement."""
-    rig, seen = make_rig(listed(-4, 0, 4)), []
     port.guard(rig.head)
     rig.head.emergency_stop = rig.head.stop
-
-    def end():
-        seen.append(1)
-        if len(seen) == 5:
-            signal.raise_signal(number)
-
-    rig.lrf.wait = end
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "", "")) == 128 + number
-    port.release(rig.head)
+    at_scan(rig, 5, lambda: signal.raise_signal(number))
     said = f"stopped by {number.name}; placements 1 are safe; --resume goes on from there"
-    assert rig.head.stops and capsys.readouterr().err.strip() == said
-    rig.lrf.wait = None
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", ""), resume=True) == 0
+    assert run("", "", "")[::2] == (128 + number, said) and rig.head.stops
+    port.release(rig.head)
+    assert run("", "", resume=True)[0] == 0
 
 
 @pytest.mark.parametrize("removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"])
 @pytest.mark.parametrize("scans", [5, 9, 0])
-def test_a_session_removed_amid_a_recording_is_not_called_safe(rig_file, tmp_path, monkeypatch, capsys, removed, scans):
+def test_a_session_removed_amid_a_recording_is_not_called_safe(run, rig, path, removed, scans):
     """While the second or the last placement is recorded, or before the third one is begun."""
-    rig, seen, path = make_rig(listed(-4, 0, 4)), [], tmp_path / "s" / removed
+    asked, target = [], path / removed
 
-    def remove(*_):
-        seen.append(1)
-        if len(seen) == (scans or 3):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    def remove():
+        shutil.rmtree(target) if target.is_dir() else target.unlink()
+
+    def ask(text):
+        asked.append(text)
+        if not scans and len(asked) == 3:
+            remove()
         return ""
 
-    if scans:
-        rig.lrf.wait = remove
-    code = run(rig_file, tmp_path, rig, monkeypatch, answers("", "", "") if scans else remove)
-    said = capsys.readouterr()
-    whole = removed == "session.json"  # written anew, with all that it stated
-    assert whole or code == 2 and "was removed or damaged while it was recorded: record again" in said.err
-    assert whole or "are safe" not in said.out + said.err
-    assert not whole or validate(tmp_path / "s") == [] and code == 0
+    at_scan(rig, scans, remove)
+    code, out, err = run(ask=ask)
+    if removed == "session.json":  # written anew, with all that it stated
+        assert validate(path) == [] and code == 0
+    else:
+        assert code == 2 and "was removed or damaged while it was recorded: record again" in err
+        assert "are safe" not in out + err
 
 
-FAULTS = [
-    (PortError("lrf: no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout $USER'"), "usermod"),
-    (NoReply("the head does not tell its tilt: check its power"), "check its power"),
-]
-
-
-@pytest.mark.parametrize(("error", "remedy"), FAULTS)
-def test_a_device_that_fails_is_one_line(rig_file, tmp_path, monkeypatch, capsys, error, remedy):
-    rig = make_rig(listed(-4, 0, 4))
+@pytest.mark.parametrize("error", [
+    PortError("lrf: no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout $USER'"),
+    NoReply("the head does not tell its tilt: check its power"),
+])  # fmt: skip
+def test_a_device_that_fails_is_one_line(run, rig, path, error):
+    write(rig, path, count=1)
     rig.head.fail = error
-    assert run(rig_file, tmp_path, rig, monkeypatch, answers("", "")) == 2
-    text = capsys.readouterr().err
-    assert remedy in text and text.count("\n") == 1 and "no placement was finished; --resume" in text
+    assert run("", "", resume=True)[::2] == (2, f"error: {error}; placements 1 are safe; --resume goes on from there")
 
 
-def test_a_full_disk_is_one_line(rig_file, tmp_path, monkeypatch, capsys):
-    with monkeypatch.context() as patch:
-        Full(patch, 40)
-        assert run(rig_file, tmp_path, make_rig(listed(-4, 0, 4)), patch, answers("", "", "")) == 2
-    text = capsys.readouterr().err
-    assert "free some space; placements 1 are safe" in text and text.count("\n") == 1
+def test_a_full_disk_is_one_line(run, monkeypatch):
+    with full_disk(monkeypatch, 40):
+        code, _, said = run("", "", "")
+    assert code == 2 and "free some space; placements 1 are safe" in said and "\n" not in said
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("part", "name", "value", "message"),
     [
-        (("devices", "head", "port"), "/dev/no_such_port", "error: head: there is no port /dev/no_such_port"),
-        (("devices", "head", "pitch_limits_deg"), [0, 1], "pitch_limits_deg are 0 to 1: ask for less"),
-        (("plan", "mode"), "fast", "plan.mode is 'fast'"),
+        ("head", "port", "/dev/no_such_port", "error: head: there is no port /dev/no_such_port"),
+        ("head", "pitch_limits_deg", [0, 1], "pitch_limits_deg are 0 to 1: ask for less"),
+        ("plan", "mode", "fast", "plan.mode is 'fast'"),
     ],
 )
-def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, capsys, key, value, message):
+def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, path, capsys, part, name, value, message):
     data = listed(-4)
-    data[key[0]] = {**data[key[0]], **({key[1]: value} if len(key) == 2 else {})}
-    if len(key) == 3:
-        data[key[0]][key[1]][key[2]] = value
+    {**data, **data["devices"]}[part][name] = value
     (tmp_path / "rig.json").write_text(json.dumps(data))
-    assert command_line.main(["record", str(tmp_path / "rig.json"), str(tmp_path / "s")]) == 2
+    assert command_line.main(["record", str(tmp_path / "rig.json"), str(path)]) == 2
     text = capsys.readouterr().err
-    assert message in text and text.count("\n") == 1 and not (tmp_path / "s").exists()
+    assert message in text and text.count("\n") == 1 and not path.exists()
 
 
 def test_the_command_line_passes_everything_on(monkeypatch, capsys):
@@ -679,21 +613,20 @@ def test_a_scene_is_checked_for_returns_alone(quick):
     assert light.state == "ok" and "scene: 85 scan lines" in light.text
 
 
-def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick):
-    sweep = quick.sweep(2)
-    none = replace(sweep, ranges=np.random.default_rng(1).uniform(1, 9, sweep.ranges.shape))
-    for seen, text in ((none, "no board: "), (None, "no scan line with a range")):
-        (light,) = check_scan(seen, quick.board, quick.T_head_lrf)
-        assert light.state == "bad" and light.text.startswith(text)
-    half = _rows(sweep, slice(None, len(sweep.pitch) // 2))
-    first, _ = check_scan(half, quick.board, quick.T_head_lrf)
-    assert first.state == "warn" and "line hits it: sweep farther" in first.text
-    coarse = check_scan(_rows(sweep, slice(0, None, 10)), quick.board, quick.T_head_lrf)
-    assert coarse[0].state == "warn" and "take a smaller step" in coarse[0].text
+@pytest.mark.parametrize(("change", "state", "text"), [
+    (lambda sweep: None, "bad", "no scan line with a range"),
+    (lambda sweep: replace(sweep, ranges=np.random.default_rng(1).uniform(1, 9, sweep.ranges.shape)), "bad",
+     "no board: "),
+    (lambda sweep: some(sweep, slice(None, len(sweep.pitch) // 2)), "warn", "line hits it: sweep farther"),
+    (lambda sweep: some(sweep, slice(0, None, 10)), "warn", "take a smaller step"),
+])  # fmt: skip
+def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick, change, state, text):
+    first, *rest = check_scan(change(quick.sweep(2)), quick.board, quick.T_head_lrf)
+    assert first.state == state and text in first.text and bool(rest) == (state == "warn")
 
 
-def _rows(sweep, rows):
-    return replace(sweep, ranges=sweep.ranges[rows], pitch=sweep.pitch[rows], time_s=sweep.time_s[rows])
+def some(sweep, which):
+    return replace(sweep, ranges=sweep.ranges[which], pitch=sweep.pitch[which], time_s=sweep.time_s[which])
 
 
 def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick):
@@ -730,18 +663,8 @@ def test_the_rise_of_edges_is_that_of_a_gaussian(sigma):
     assert edge_rise(picture.astype(np.uint8), grid) == pytest.approx(2.563 * sigma, abs=0.6)
 
 
-def test_a_camera_without_images_is_red(tmp_path):
+def test_a_camera_without_images_is_red(path):
     data = listed(-4)
     data["plan"]["placements"][0]["image_pitch_deg"] = []
-    write(make_rig(data), tmp_path / "s")
-    last = check_placement(open_session(tmp_path / "s"), 1)[-1]
-    assert last == Light("camera left", "bad", "no image")
-
-
-def test_a_device_error_keeps_its_note(tmp_path):
-    rig = make_rig(listed(-4, 0))
-    write(rig, tmp_path / "s", count=1)
-    rig.head.fail = DeviceError("gone")
-    with pytest.raises(DeviceError) as caught:
-        record_session(rig, tmp_path / "s", resume=True, terminal=Terminal(Screen(), answers("")))
-    assert caught.value.__notes__ == ["placements 1 are safe; --resume goes on from there"]
+    write(make_rig(data), path)
+    assert check_placement(open_session(path), 1)[-1] == Light("camera left", "bad", "no image")

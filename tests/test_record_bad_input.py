@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -105,45 +106,25 @@ def stands_still(rig):
     return not rig.world.head.tilt.moving(rig.clock.now())
 
 
-def swapped(data, rig):
-    data["devices"]["lrf"]["port"], data["devices"]["head"]["port"] = rig.pan_tilt.path, rig.lrf.path
+SPOILT = {  # what is changed, by the path of its key
+    "error: lrf: there is no port /dev/no_such_port: check cable and power": {"lrf.port": "/dev/no_such_port"},
+    "error: head: ": {"lrf.port": "{head}", "head.port": "{lrf}"},
+    "devices.lrf.port and devices.head.port are both": {"lrf.port": "{head}"},
+    "pitch_limits_deg are -1 to 1: ask for less": {"head.pitch_limits_deg": [-1.0, 1.0]},
+    "error: camera 'left': http://127.0.0.1:9/left.mjpg gives no video: open http":
+        {"cameras.left.source": "http://127.0.0.1:9/left.mjpg"},
+    "is 'python -m lrfcal_lib emulate' still running?": {"control": "/tmp/no_such_socket"},
+}  # fmt: skip
 
 
-def shared(data, rig):
-    data["devices"]["lrf"]["port"] = rig.pan_tilt.path
-
-
-def missing(data, rig):
-    data["devices"]["lrf"]["port"] = "/dev/no_such_port"
-
-
-def too_far(data, rig):
-    data["devices"]["head"]["pitch_limits_deg"] = [-1.0, 1.0]
-
-
-def no_camera(data, rig):
-    data["devices"]["cameras"]["left"]["source"] = "http://127.0.0.1:9/left.mjpg"
-
-
-def no_socket(data, rig):
-    data["devices"]["control"] = "/tmp/no_such_socket"
-
-
-SPOILT = {
-    missing: "error: lrf: there is no port /dev/no_such_port: check cable and power",
-    swapped: "error: head: ",
-    shared: "devices.lrf.port and devices.head.port are both",
-    too_far: "pitch_limits_deg are -1 to 1: ask for less",
-    no_camera: "error: camera 'left': http://127.0.0.1:9/left.mjpg gives no video: open http",
-    no_socket: "is 'python -m lrfcal_lib emulate' still running?",
-}
-
-
-@pytest.mark.parametrize("spoil", SPOILT, ids=lambda spoil: spoil.__name__)
-def test_what_is_wrong_with_a_rig_file_is_one_line(tmp_path, rig, stated, spoil):
-    spoil(stated, rig)
+@pytest.mark.parametrize("message", SPOILT)
+def test_what_is_wrong_with_a_rig_file_is_one_line(tmp_path, rig, stated, message):
+    for path, value in SPOILT[message].items():
+        *way, key = path.split(".")
+        at = reduce(lambda at, key: at[key], way, stated["devices"])
+        at[key] = value.format(head=rig.pan_tilt.path, lrf=rig.lrf.path) if isinstance(value, str) else value
     code, _, err = Program(tmp_path, stated).end()
-    assert code == 2 and SPOILT[spoil] in err.splitlines()[-1] and "Traceback" not in err
+    assert code == 2 and message in err.splitlines()[-1] and "Traceback" not in err
     assert stands_still(rig)
 
 

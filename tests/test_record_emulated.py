@@ -52,8 +52,8 @@ def setup():
 @pytest.fixture(scope="module")
 def simulated_session(setup, tmp_path_factory):
     """The simulator's own session."""
-    path, patch = tmp_path_factory.mktemp("simulated") / "s", pytest.MonkeyPatch()
-    with patch.context() as context:
+    path = tmp_path_factory.mktemp("simulated") / "s"
+    with pytest.MonkeyPatch.context() as context:
         context.setattr(simulated, "placements_of", lambda _: setup[1])
         simulated.simulate(path, setup[0])
     file = path / "session.json"
@@ -97,17 +97,6 @@ def recorded_session(setup, tmp_path_factory):
     return open_session(folder / "s")
 
 
-def covariance_of(solution):
-    """Of the pose."""
-    return solution.trusted[:6, :6]
-
-
-def difference(a, b):
-    """Increments [w, v] from one pose to another."""
-    turn = (b.rotation * a.rotation.inv()).as_rotvec()
-    return np.concatenate([turn, b.translation - a.translation])
-
-
 def test_the_recording_is_sound(recorded_session, setup):
     assert validate(recorded_session.path) == []
     assert recorded_session.placements == (1, 2, 3, 4, 5, 6) and recorded_session.simulated
@@ -128,27 +117,31 @@ def prepared(recorded_session, simulated_session):
     return [prepare(session) for session in (recorded_session, simulated_session)]
 
 
-def calibrated(prepared):
-    """Preprocessing, platform, and the camera's pose by the method of the paper."""
-    platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
-    solutions, problems = calibrate_cameras(observe_all(prepared, platform.T_head_lrf), [METHOD])
-    assert problems == {}
-    return platform, solutions["left", METHOD]
-
-
 def nees(miss, covariance):
     """Squared error in units of its covariance: chi-square distributed where that is right."""
     return miss @ np.linalg.solve(covariance, miss)
 
 
+def compare(recorded, expected, truth, degrees, metres):
+    """Both poses agree within their covariances, and the recorded one with the truth.
+
+    A few coarse sweeps tell little, but not nothing: a wide covariance would hide a wrong pose.
+    """
+    for other, covariance in ((expected.transform, expected.trusted[:6, :6]), (truth, 0.0)):
+        turn = (other.rotation * recorded.transform.rotation.inv()).as_rotvec()
+        miss = np.concatenate([turn, other.translation - recorded.transform.translation])
+        assert nees(miss, recorded.trusted[:6, :6] + covariance) < chi2.ppf(0.999, 6)
+    assert np.linalg.norm(miss[:3]) < np.radians(degrees) and np.linalg.norm(miss[3:]) < metres
+
+
 def test_the_recording_calibrates_as_the_simulated_session(recorded_session, prepared, setup):
-    platforms, (recorded, expected) = zip(*[calibrated(one) for one in prepared], strict=True)
-    miss = difference(recorded.transform, expected.transform)
-    assert nees(miss, covariance_of(recorded) + covariance_of(expected)) < chi2.ppf(0.999, 6)
-    miss = difference(recorded.transform, setup[0].rig.cameras[0].mounting)
-    assert nees(miss, covariance_of(recorded)) < chi2.ppf(0.999, 6)
-    # coarse sweeps of six placements tell little, but not nothing: a wide covariance would hide a wrong pose
-    assert np.linalg.norm(miss[:3]) < np.radians(6) and np.linalg.norm(miss[3:]) < 0.15
+    platforms, cameras = [], []
+    for one in prepared:
+        platforms.append(calibrate_platform(one, one.pitch_noise.offset))
+        solutions, problems = calibrate_cameras(observe_all(one, platforms[-1].T_head_lrf), [METHOD])
+        assert problems == {}
+        cameras.append(solutions["left", METHOD])
+    compare(*cameras, setup[0].rig.cameras[0].mounting, 6, 0.15)
     miss = np.subtract(*(one.parameters()["combined"][0] for one in platforms))
     assert nees(miss, platforms[0].covariance + platforms[1].covariance) < chi2.ppf(0.999, 4)
     for placement in recorded_session.placements:  # the plane of the board, which needs no good calibration
@@ -159,12 +152,7 @@ def test_the_recording_calibrates_as_the_simulated_session(recorded_session, pre
 
 def test_the_joint_estimate_is_that_of_the_simulated_session(prepared, setup):
     joints = [calibrate_jointly(one) for one in prepared]
-    recorded, expected = (one.solution.camera("left") for one in joints)
-    miss = difference(recorded.transform, expected.transform)
-    assert nees(miss, covariance_of(recorded) + covariance_of(expected)) < chi2.ppf(0.999, 6)
-    miss = difference(recorded.transform, setup[0].rig.cameras[0].mounting)
-    assert nees(miss, covariance_of(recorded)) < chi2.ppf(0.999, 6)
-    assert np.linalg.norm(miss[:3]) < np.radians(2) and np.linalg.norm(miss[3:]) < 0.06
+    compare(*(one.solution.camera("left") for one in joints), setup[0].rig.cameras[0].mounting, 2, 0.06)
     axis, other = (chart_parameters(pose_array(one.solution.T_head_lrf)) for one in joints)
     covariance = sum(one.solution.covariance("axis_", "offset_") for one in joints)
     assert nees(axis - other, covariance) < chi2.ppf(0.999, 4)

@@ -13,7 +13,7 @@ import pytest
 from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
-from lrfcal_lib.drivers.head import HEAD, HeadSettings
+from lrfcal_lib.drivers.head import HeadSettings
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
 from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
@@ -113,7 +113,7 @@ def paths(data, way=()):
 def every_key():
     """A rig file that states all that can be stated about devices and plan."""
     data = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
-    head = {name: getattr(HeadSettings(), name) for name in HEAD}
+    head = {name: getattr(HeadSettings(), name) for name in vars(HeadSettings())}
     data["devices"]["head"] |= head | {"degrees_per_second": 4.0, "repeat_s": 0.5, "pitch_limits_deg": [-60, 60]}
     data["devices"]["lrf"] |= {"baudrate": 9600, "address": 1, "password": "SICK_LMS", "measuring_mode": 0,
                                "realtime_indices": True, "interlaced": False}  # fmt: skip
@@ -437,23 +437,22 @@ def stated_rig(**plan):
     return checked(rig_of(json.loads(json.dumps(rig_data(**plan)))))
 
 
-def fake_openers(monkeypatch, **instead):
-    """Let Rig.open make fakes; a device may be an error instead."""
+def fake_drivers(monkeypatch, size=SIZE, **instead):
+    """Let Rig.open make fakes, and list which are open; a driver may raise an error instead."""
     clock, made = Clock(), []
     head = Head(clock)
+    lrf, camera = Lrf(head, clock), Camera("left", head, clock)
+    lrf.set_variant, camera.settings = lambda *_: True, {"size": {"asked": SIZE, "got": size}}
+    for name, device in (("PanTilt", head), ("LMS2xx", lrf), ("Camera", camera)):
 
-    def opener(name, device):
-        def make(*arguments, **options):
-            if name in instead:
-                raise instead[name]
-            made.append(name)
-            device.close = lambda: made.remove(name)
-            return device
+        def make(*_, driver=name, fake=device, **__):
+            if driver in instead:
+                raise instead[driver]
+            made.append(driver)
+            fake.close = lambda: made.remove(driver)
+            return fake
 
-        monkeypatch.setattr(rig_module, f"_open_{name}", make)
-
-    for name, device in (("head", head), ("lrf", Lrf(head, clock)), ("camera", Camera("left", head, clock))):
-        opener(name, device)
+        monkeypatch.setattr(rig_module, name, make)
     return made
 
 
@@ -466,24 +465,23 @@ def test_the_clock_of_a_rig_is_not_set_by_others(monkeypatch):
 
 
 def test_all_devices_are_closed_again(monkeypatch):
-    made = fake_openers(monkeypatch)
+    made = fake_drivers(monkeypatch)
     with Rig.open(stated_rig()) as rig:
-        assert sorted(made) == ["camera", "head", "lrf"] and list(rig.cameras) == ["left"]
+        assert sorted(made) == ["Camera", "LMS2xx", "PanTilt"] and list(rig.cameras) == ["left"]
     assert made == []
 
 
-@pytest.mark.parametrize(("device", "message"), [("lrf", "lrf: there is no port"), ("camera", "camera 'left': there")])
-def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, device, message):
-    made = fake_openers(monkeypatch, **{device: PortError("there is no port")})
-    with pytest.raises(PortError, match=message):
+@pytest.mark.parametrize(("options", "error", "message"), [
+    ({"LMS2xx": PortError("there is no port")}, PortError, "lrf: there is no port"),
+    ({"Camera": PortError("there is no port")}, PortError, "camera 'left': there"),
+    ({"LMS2xx": ValueError("an LMS2xx has 9600 Bd, got 300")}, RigFileError, r"rig\.json: lrf: an LMS2xx has 9600 Bd"),
+    ({"size": (16, 12)}, RigFileError, r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"),
+])  # fmt: skip
+def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
+    made = fake_drivers(monkeypatch, **options)
+    with pytest.raises(error, match=message):
         Rig.open(stated_rig())
     assert made == []
-
-
-def test_a_value_that_a_device_cannot_have_names_the_file(monkeypatch):
-    fake_openers(monkeypatch, lrf=ValueError("an LMS2xx has 9600 Bd, got 300"))
-    with pytest.raises(RigFileError, match=r"rig\.json: lrf: an LMS2xx has 9600 Bd, got 300"):
-        Rig.open(stated_rig())
 
 
 def test_what_the_device_says_about_itself_counts():
@@ -529,22 +527,3 @@ def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
     server.close()
     with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
         rig.move_board(3)
-
-
-def test_a_camera_of_another_size_is_refused(monkeypatch):
-    pytest.importorskip("lrfcal_lib.drivers.video")
-    closed = []
-
-    class Small:
-        settings = {"size": {"asked": SIZE, "got": (16, 12)}}
-
-        def close(self):
-            closed.append(self)
-
-    monkeypatch.setattr("lrfcal_lib.drivers.video.Camera.open", lambda *args, **options: Small())
-    monkeypatch.setattr(rig_module, "_open_head", lambda *args, **_: Head(Clock()))
-    monkeypatch.setattr(rig_module, "_open_lrf", lambda *args, **_: Lrf(None, None))
-    with pytest.raises(RigFileError, match=r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"):
-        Rig.open(stated_rig())
-    assert len(closed) == 1
-

@@ -109,7 +109,7 @@ def server(request):
     "server", [{"period_s": 0.2}, {"period_s": 0.2, "lengths": False}], ids=["lengths", "no lengths"], indirect=True
 )
 def test_newest_frame_of_a_stream(server):
-    with Camera.open(server.url, name="left") as camera:
+    with Camera(server.url, name="left") as camera:
         instant, indices = 0.0, []
         for _ in range(4):
             asked = time.time()
@@ -129,7 +129,7 @@ def test_newest_frame_of_a_stream(server):
 
 
 def test_stream_lost_and_found(server, caplog):
-    with Camera.open(server.url, name="left") as camera:
+    with Camera(server.url, name="left") as camera:
         before = camera.newest(timeout=WAIT_S)
         server.stop()
         until(lambda: camera.lost)
@@ -146,7 +146,7 @@ def test_stream_lost_and_found(server, caplog):
 
 
 def test_silent_stream(server, caplog):
-    with Camera.open(server.url, name="left") as camera:
+    with Camera(server.url, name="left") as camera:
         server.pause(camera)
         with pytest.raises(NoReply, match="no new frame in 0.3 s"):
             camera.newest(after=time.time(), timeout=0.3)
@@ -157,7 +157,7 @@ def test_silent_stream(server, caplog):
 
 
 def test_stream_that_is_silent_for_too_long(server):
-    with Camera.open(server.url, name="left", silence_s=0.5) as camera:
+    with Camera(server.url, name="left", silence_s=0.5) as camera:
         camera.newest(timeout=WAIT_S)
         server.paused = True
         until(lambda: camera.lost)
@@ -181,7 +181,7 @@ def test_a_stream_that_ended_or_fell_silent_is_at_its_end_however_often_it_is_as
 
 
 def test_closing_wakes_who_waits(server):
-    camera = Camera.open(server.url, name="left")
+    camera = Camera(server.url, name="left")
     camera.newest(timeout=WAIT_S)
     server.paused = True
     threading.Timer(0.1, camera.close).start()
@@ -216,7 +216,7 @@ def test_frames_that_piled_up_are_known(server):
 
 
 def test_a_damaged_image_is_left_out(server, monkeypatch):
-    with Camera.open(server.url, name="left") as camera:
+    with Camera(server.url, name="left") as camera:
         server.pause(camera)
         sent = []
         monkeypatch.setattr(MjpegServer, "part",
@@ -234,18 +234,18 @@ def test_no_stream():
     server = MjpegServer()
     server.stop()
     with pytest.raises(PortError, match="gives no video: open http"):
-        Camera.open(server.url, name="left")
+        Camera(server.url, name="left")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:port", "127.0.0.1:99999", "[::1", "", "a" * 70, "x y", ":80"])
 def test_a_url_that_names_no_host(host):
     with pytest.raises(PortError, match="gives no video: open http"):
-        Camera.open(f"http://{host}/left.mjpg", name="left", silence_s=0.3)
+        Camera(f"http://{host}/left.mjpg", name="left", silence_s=0.3)
 
 
 def test_size_and_exposure_that_a_stream_cannot_set(server, caplog):
     asked = {"size": (640, 480), "exposure": 0.01}
-    with Camera.open(server.url, name="left", **asked) as camera:
+    with Camera(server.url, name="left", **asked) as camera:
         assert camera.settings["size"] == {"asked": (640, 480), "got": (64, 48)}
         assert camera.settings["exposure"] == {"asked": 0.01, "got": None}
         assert camera.settings["warnings"] == [
@@ -269,7 +269,7 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*"])
 def test_images_in_the_order_of_their_names(folder, pattern):
-    with Camera.open(folder / pattern if pattern else folder, name="right") as camera:
+    with Camera(folder / pattern if pattern else folder, name="right") as camera:
         assert camera.settings["size"]["got"] == (64, 48)
         frames = [camera.newest(after=time.time()) for _ in range(3)]
         assert [number_of(frame) for frame in frames] == [1, 2, 3]
@@ -283,7 +283,7 @@ def test_images_in_the_order_of_their_names(folder, pattern):
 
 def test_one_grey_image(tmp_path):
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((10, 20), 7, np.uint8))
-    with Camera.open(tmp_path / "grey.png", name="right") as camera:
+    with Camera(tmp_path / "grey.png", name="right") as camera:
         assert np.array_equal(camera.newest().image, np.full((10, 20, 3), 7))
     with pytest.raises(DeviceError, match="right is closed"):
         camera.newest()
@@ -296,7 +296,7 @@ def test_video_file(tmp_path):
     for number in range(5):
         writer.write(numbered(number))
     writer.release()
-    with Camera.open(str(path), name="right", fps=25, size=(64, 48)) as camera:
+    with Camera(str(path), name="right", fps=25, size=(64, 48)) as camera:
         assert camera.settings["fps"] == {"asked": 25, "got": 25.0}
         assert camera.settings["warnings"] == []
         assert [number_of(camera.newest()) for _ in range(5)] == list(range(5))
@@ -311,8 +311,8 @@ def test_bad_files(tmp_path):
     for name, what in [("none.avi", "there is no video"), ("text.avi", "is no video"), ("none.png", "no images in"),
                        ("empty", "there are no images in"), ("x*.png", "there are no images in")]:  # fmt: skip
         with pytest.raises(PortError, match=what):
-            Camera.open(tmp_path / name, name="right")
-    camera = Camera.open(tmp_path / "bad.png", name="right")
+            Camera(tmp_path / name, name="right")
+    camera = Camera(tmp_path / "bad.png", name="right")
     with pytest.raises(PortError, match="bad.png is no image"):
         camera.newest()
 
@@ -372,7 +372,7 @@ def device(monkeypatch):
 
 
 def test_what_a_device_does_as_told(device):
-    with Camera.open(0, name="left", size=(320, 240), exposure=0.005, fps=15) as camera:
+    with Camera(0, name="left", size=(320, 240), exposure=0.005, fps=15) as camera:
         assert camera.settings == {
             "size": {"asked": (320, 240), "got": (320, 240)},
             "exposure": {"asked": 0.005, "got": pytest.approx(0.005)},
@@ -383,7 +383,7 @@ def test_what_a_device_does_as_told(device):
 
 
 def test_device_left_as_it_is(device):
-    with Camera.open("/dev/video3", name="left") as camera:
+    with Camera("/dev/video3", name="left") as camera:
         assert camera.settings["exposure"] == {"asked": None, "got": pytest.approx(0.0157)}
         assert camera.settings["warnings"] == []
         device.grey = True
@@ -392,7 +392,7 @@ def test_device_left_as_it_is(device):
 
 def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
     device.fixed = {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH}
-    with Camera.open("0", name="left", size=(1024, 480), exposure=0.005) as camera:
+    with Camera("0", name="left", size=(1024, 480), exposure=0.005) as camera:
         assert camera.settings["exposure"]["got"] is None
         assert camera.settings["size"]["got"] == (640, 480)
         assert len(camera.settings["warnings"]) == 2
@@ -403,7 +403,7 @@ def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
 
 def test_device_lost_and_found(device, caplog):
     caplog.set_level(logging.WARNING)
-    with Camera.open(0, name="left", exposure=0.005) as camera:
+    with Camera(0, name="left", exposure=0.005) as camera:
         camera.newest(timeout=WAIT_S)
         device.ends = True
         device.there = False
@@ -418,10 +418,10 @@ def test_device_lost_and_found(device, caplog):
 def test_devices_that_cannot_be_opened(device, monkeypatch):
     device.opens = False
     with pytest.raises(PortError, match="/dev/video0 gives no video: close other programs"):
-        Camera.open(0, name="left")
+        Camera(0, name="left")
     monkeypatch.setattr(video.os, "access", lambda path, mode: False)
     with pytest.raises(PortError, match="no permission for /dev/video0: run 'sudo usermod -aG video"):
-        Camera.open(0, name="left")
+        Camera(0, name="left")
     device.there = False
     with pytest.raises(PortError, match="there is no camera /dev/video0: check its plug; present are"):
-        Camera.open(0, name="left")
+        Camera(0, name="left")

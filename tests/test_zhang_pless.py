@@ -155,9 +155,9 @@ def test_joint_solution_agrees_with_scipy(monkeypatch):
         pose = move_pose(pose_array(ours.transform), d[:6])
         model = obs.model.with_parameters(ours.parameters[6:] + d[6:15] * 100)
         boards = move_pose(obs.board_poses[:, :3], d[15:].reshape(-1, 6))
-        planes = plane_terms(pose, triangles, boards, offset)[0]
+        distances = plane_terms(pose, triangles, boards, offset)[0]
         seen = project(obs.pattern_points @ boards[:, :, :3].swapaxes(1, 2) + boards[:, None, :, 3], model)
-        return np.concatenate([planes.ravel(), (seen - obs.pattern_pixels).ravel() / obs.pattern_sigma_px])
+        return np.concatenate([distances.ravel(), (seen - obs.pattern_pixels).ravel() / obs.pattern_sigma_px])
 
     theirs = scipy.optimize.least_squares(residuals, np.zeros(15 + 24), xtol=1e-15, ftol=1e-15, x_scale="jac")
     assert np.sum(ours.residuals**2) == pytest.approx(2 * theirs.cost, rel=1e-6)

@@ -23,15 +23,7 @@ LOW_CONTRAST = 25  # grey levels between white and dark squares
 
 @dataclass(frozen=True)
 class Light:
-    """One check.
-
-    Attributes
-    ----------
-    name : str
-    state : {'ok', 'warn', 'bad'}
-    text : str
-        What was seen, and what to do where it is not good.
-    """
+    """One check; its text says what was seen, and what to do where the state is not 'ok' but 'warn' or 'bad'."""
 
     name: str
     state: str
@@ -55,10 +47,25 @@ def check_placement(session, placement, advice=None):
         'scan', 'edges', one for each camera, and 'information' where there is advice. Nothing is raised for data that
         cannot be used: that is what the lights are for.
     """
+    try:
+        sweep = session.sweep(placement)
+    except SessionError:
+        sweep = None
+    if placement in session.scene_placements and sweep is not None:
+        share = np.isfinite(sweep.ranges).mean()
+        text = f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
+        return [Light("scan", "ok" if share > 0.2 else "warn", text)]
+    lights = check_scan(sweep, session.board, session.T_head_lrf)
     if placement in session.scene_placements:
-        return [_scene(session, placement)]
-    lights = check_scan(_sweep(session, placement), session.board, session.T_head_lrf)
-    lights += [_camera(session, placement, camera) for camera in session.cameras]
+        return lights
+    for name, camera in session.cameras.items():
+        images = [session.read_image(record) for record in session.images(name, placement)]
+        found = [check_image(image, session.board, camera.model) for image in images]
+        good = [light for light in found if light.state != "bad"]
+        worst = max(good or found, key=lambda light: STATES.index(light.state), default=Light("", "bad", "no image"))
+        state = "warn" if 0 < len(good) < len(found) else worst.state
+        text = f"{len(good)} of {len(found)} images: {worst.text}" if found else worst.text
+        lights.append(Light(f"camera {name}", state, text))
     if advice is not None:
         text = advice(session)
         lights.append(Light("information", "warn" if text else "ok", text or "every direction is well determined"))
@@ -66,7 +73,7 @@ def check_placement(session, placement, advice=None):
 
 
 def check_scan(sweep, board, T_head_lrf=None):
-    """Check the scans of a placement.
+    """Lights of the scans of a placement: 'scan' and, where the board was found, 'edges'.
 
     Parameters
     ----------
@@ -74,11 +81,6 @@ def check_scan(sweep, board, T_head_lrf=None):
         None where there is no range at all.
     board : Board
     T_head_lrf : RigidTransform, optional
-
-    Returns
-    -------
-    list of Light
-        'scan' and, where the board was found, 'edges'.
     """
     if sweep is None:
         return [Light("scan", "bad", "no scan line with a range: is something close before the window?")]
@@ -88,38 +90,33 @@ def check_scan(sweep, board, T_head_lrf=None):
         return [Light("scan", "bad", f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls")]
     rows = np.flatnonzero(found.mask.any(axis=1))
     text = f"board on {len(rows)} scan lines at {abs(found.distance):.2f} m, {1000 * found.sigma_range:.1f} mm rms"
-    if len(rows) < FEWEST_LINES:
-        return [Light("scan", "warn", f"{text}: take a smaller step, or go nearer"), _edges(found)]
     cut = [end for end, row in (("first", 0), ("last", len(sweep.pitch) - 1)) if row in rows]
-    if cut and np.ptp(sweep.pitch) > 0:
-        return [Light("scan", "warn", f"{text}; the {' and '.join(cut)} line hits it: sweep farther"), _edges(found)]
-    return [Light("scan", "ok", text), _edges(found)]
+    light = Light("scan", "ok", text)
+    if len(rows) < FEWEST_LINES:
+        light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
+    elif cut and np.ptp(sweep.pitch) > 0:
+        light = Light("scan", "warn", f"{text}; the {' and '.join(cut)} line hits it: sweep farther")
+    return [light, _edges(found)]
 
 
 def _edges(found):
     """How many straight sides of the board the scans cross, and how."""
-    sides = list(edges_in_scan.edge_points(found).sides)
-    known = {side.side for side in sides}
-    if np.ptp(found.sweep.pitch) > 0:
-        sides += [side for side in edges_in_scan.sweep_edges(found).sides if side.side not in known]
-    good = [side for side in sides if side.n_points >= FEWEST_CROSSINGS]
+    sides = {side.side: side for side in edges_in_scan.edge_points(found).sides}
+    for side in edges_in_scan.sweep_edges(found).sides if np.ptp(found.sweep.pitch) > 0 else ():
+        sides.setdefault(side.side, side)
+    good = [side for side in sides.values() if side.n_points >= FEWEST_CROSSINGS]
     told = ", ".join(f"{s.n_points} crossings at {np.degrees(s.angle):.0f} deg" for s in good)
     if not good:
         return Light("edges", "bad", "no straight side: turn the board so that scan lines cross its edges")
-    if len(good) >= 2 and _turned(good):
+    ways = np.array([np.subtract(*side.ends) for side in good])
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    if np.abs(ways @ ways.T).min() < PARALLEL:
         return Light("edges", "ok", f"{len(good)} sides: {told}")
     return Light("edges", "warn", f"{len(good)} sides: {told}; turn the board to show another side")
 
 
-def _turned(sides):
-    """Whether two of the sides are not parallel."""
-    ways = np.array([np.subtract(*side.ends) for side in sides])
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    return bool(np.abs(ways @ ways.T).min() < PARALLEL)
-
-
 def check_image(image, board, model=None, name="image"):
-    """Check an image of the board.
+    """The Light, of this name, of an image of the board.
 
     Parameters
     ----------
@@ -128,11 +125,6 @@ def check_image(image, board, model=None, name="image"):
     model : CameraModel, optional
         Needed for a board without a pattern.
     name : str
-        Of the light.
-
-    Returns
-    -------
-    Light
     """
     if board.pattern is None:
         if model is None:
@@ -143,14 +135,10 @@ def check_image(image, board, model=None, name="image"):
         corners = PatternFinder(board.pattern)(image)
     except PatternNotFound as error:
         return Light(name, "bad", str(error))
-    return _quality(grey(image), corners, board.pattern, name)
-
-
-def _quality(picture, corners, pattern, name):
-    """Sharpness and exposure at the pattern."""
-    grid = corners.reshape(pattern.rows, pattern.columns, 2)
-    rise, (dark, white) = edge_rise(picture, grid), square_levels(picture, grid)
-    text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
+    picture, grid = grey(image), corners.reshape(board.pattern.rows, board.pattern.columns, 2)
+    rise, centres = edge_rise(picture, grid), (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    squares, odd = _at(picture, centres), np.indices(centres.shape[:2]).sum(axis=0) % 2
+    dark, white = sorted(np.median(squares[odd == i]) for i in (0, 1))
     faults = {
         "blurred, hold the board still and focus": rise > BLURRED_PX,
         "too dark, more light or a longer exposure": white < DARK,
@@ -158,6 +146,7 @@ def _quality(picture, corners, pattern, name):
         "little contrast, avoid glare": white - dark < LOW_CONTRAST,
     }
     wrong = [fault for fault, holds in faults.items() if holds]
+    text = f"pattern found, edges rise in {rise:.1f} px, squares {dark:.0f} and {white:.0f} of 255"
     return Light(name, "warn" if wrong else "ok", "; ".join([text, *wrong]))
 
 
@@ -187,43 +176,7 @@ def edge_rise(picture, grid):
     return float(np.median(between * np.ptp(share) * np.linalg.norm(along, axis=1)))
 
 
-def square_levels(picture, grid):
-    """Grey levels of the dark and of the light squares of a chessboard, medians; see :func:`edge_rise`."""
-    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    values, odd = _at(picture, centres), np.indices(centres.shape[:2]).sum(axis=0) % 2
-    return sorted(float(np.median(values[odd == i])) for i in (0, 1))
-
-
 def _at(picture, pixels):
     """Grey levels at pixels of any shape (..., 2), bilinear."""
     u, v = (np.ascontiguousarray(pixels[..., i].reshape(1, -1), np.float32) for i in (0, 1))
     return cv2.remap(picture, u, v, cv2.INTER_LINEAR).reshape(pixels.shape[:-1]).astype(float)
-
-
-def _sweep(session, placement):
-    try:
-        return session.sweep(placement)
-    except SessionError:
-        return None
-
-
-def _camera(session, placement, camera):
-    """The worst of a camera's images of a placement."""
-    name, records = f"camera {camera}", session.images(camera, placement)
-    if not records:
-        return Light(name, "bad", "no image")
-    model = session.cameras[camera].model
-    lights = [check_image(session.read_image(record), session.board, model, name) for record in records]
-    good = [light for light in lights if light.state != "bad"]
-    worst = max(good or lights, key=lambda light: STATES.index(light.state))
-    state = "warn" if good and len(good) < len(lights) else worst.state
-    return Light(name, state, f"{len(good)} of {len(lights)} images: {worst.text}")
-
-
-def _scene(session, placement):
-    sweep = _sweep(session, placement)
-    if sweep is None:
-        return Light("scan", "bad", "no scan line with a range")
-    share = np.isfinite(sweep.ranges).mean()
-    state = "ok" if share > 0.2 else "warn"
-    return Light("scan", state, f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back")

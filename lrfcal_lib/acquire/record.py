@@ -12,8 +12,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
 from lrfcal_lib.acquire.checks import check_image, check_placement
 from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
@@ -22,6 +20,8 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder
 
+FAILED, INTERRUPTED = 2, 130  # exit codes
+MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
 HOW = {
     "stop-and-go": "stop-and-go: the head rests at every pitch step, scans and images are taken at rest",
     "continuous": "continuous: scans are taken while the head moves, each with the pitch at its middle beam",
@@ -65,20 +65,23 @@ class Recording:
     ...     recording.finish()
     """
 
+    finished = property(lambda self: self.writer.finished, doc="Numbers of the placements that are complete and safe.")
+
     def __init__(self, rig, path, *, resume=False, count=None):
-        self.rig, self.path, self.plan = rig, Path(path), rig.stated.plan.to_do(count)
-        stated = rig.stated
-        about = {**stated.about, "source": stated.about["source"] or f"recorded with {stated.path.name}"}
-        about |= {"reference": _reference(rig, self.plan), "platform_sigma": stated.platform_sigma}
-        with self._safely():
+        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(count), rig.stated
+        reference = {
+            "recording": HOW[stated.plan.mode],
+            "pitch": "told by the head" if rig.head.has_feedback else "dead reckoning: the head does not tell it",
+            "scene_placements": [placement.number for placement in self.plan if placement.purpose == "scene"],
+        }
+        about = {**stated.about, "source": stated.about["source"] or f"recorded with {stated.path.name}",
+                 "reference": reference, "platform_sigma": stated.platform_sigma, "resume": resume}  # fmt: skip
+        with self._safely(), contextlib.ExitStack() as stack:
             writer = SessionRecorder(self.path, stated.board, rig.lrf_info, stated.cameras.values(), stated.T_head_lrf,
-                                     resume=resume, **about)  # fmt: skip
-            try:
-                writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
-            except BaseException:
-                writer.close()
-                raise
-        self.writer = writer
+                                     **about)  # fmt: skip
+            stack.callback(writer.close)
+            writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
+            self.writer, _ = writer, stack.pop_all()
 
     def __enter__(self):
         return self
@@ -90,50 +93,20 @@ class Recording:
         """Record nothing any more: the session is free for others, who may go on with it."""
         self.writer.close()
 
-    @property
-    def finished(self):
-        """Numbers of the placements that are complete and safe."""
-        return self.writer.finished
-
     def to_do(self):
-        """The placements of the plan that are not finished, in order.
-
-        Returns
-        -------
-        list of Placement
-        """
+        """The placements of the plan that are not finished, in order."""
         return [placement for placement in self.plan if placement.number not in self.finished]
 
     def close_views_to_do(self):
-        """Images of the board held close that are still to be taken.
-
-        Returns
-        -------
-        list of (str, int)
-            Camera and number of the view, counted from 0.
-        """
+        """Images of the board held close still to be taken: camera and number of the view, counted from 0."""
         wanted, taken = self.rig.stated.plan.intrinsics_images, self.writer.shots_of("intrinsics")
         return [(camera, view) for camera in self.rig.stated.cameras for view in range(taken[camera], wanted)]
 
     def run(self, placement):
-        """Record a placement: a generator that yields every event of the rig once it is on the disk.
+        """Record a placement of :meth:`to_do`: a generator that yields every event of the rig once it is on the disk.
 
-        Parameters
-        ----------
-        placement : Placement
-            Of :meth:`to_do`.
-
-        Yields
-        ------
-        Moved, Scanned, Photographed or Tracked
-            When the generator ends the placement is finished. When it is closed or raises, the head is stopped and
-            the placement is not part of the session.
-
-        Raises
-        ------
-        DeviceError
-        RecordingError
-            If the disk is full or gone.
+        When the generator ends the placement is finished. When it is closed or raises (DeviceError, or RecordingError
+        if the disk is full or gone), the head is stopped and the placement is not part of the session.
         """
         if placement.number in self.writer.data["unfinished"]:  # an earlier run of it was broken off
             self.drop(placement.number)
@@ -141,31 +114,19 @@ class Recording:
             self.writer.begin_placement(placement.number)
         with contextlib.closing(self.rig.acquire(placement)) as events:
             for event in events:
-                with self._safely():
-                    self._write(event)
+                self.write(event)
                 yield event
         with self._safely():
             self.writer.finish_placement()
 
     def run_close(self, camera):
-        """Take an image of the board held close to a camera, and keep it if it shows the pattern.
-
-        Parameters
-        ----------
-        camera : str
-
-        Returns
-        -------
-        Light
-            'bad' where the image was not kept.
-        """
+        """Take an image of the board held close to a camera; the Light is 'bad' where it was not kept: no pattern."""
         with contextlib.closing(self.rig.acquire_close(camera)) as events:
             *_, event = events
-        info = self.rig.stated.cameras[camera]
-        light = check_image(event.frame.image, self.rig.stated.board, info.model, f"camera {camera}")
+        model = self.rig.stated.cameras[camera].model
+        light = check_image(event.frame.image, self.rig.stated.board, model, f"camera {camera}")
         if light.state != "bad":
-            with self._safely():
-                self._write(event)
+            self.write(event)
         return light
 
     def check(self, number, advice=None):
@@ -180,10 +141,7 @@ class Recording:
     def finish(self):
         """Close the session; without this it can still be opened, and the recording can go on.
 
-        Raises
-        ------
-        RecordingError
-            If the session on the disk does not hold what was finished.
+        RecordingError if the session on the disk does not hold what was finished.
         """
         with self._safely():
             self.writer.finish()
@@ -206,17 +164,21 @@ class Recording:
         except (SessionError, OSError):
             return None if self.finished or not self.path.exists() else set()
 
-    def _write(self, event):
+    def write(self, event):
+        """Put an event on the disk; the parts of an interlaced scan share its pitch."""
         writer = self.writer
-        if isinstance(event, Moved):
-            writer.add_platform([(event.time_s, event.commanded, event.pitch if event.measured else math.nan)])
-        elif isinstance(event, Scanned):
-            _add_scans(writer, event)
-        elif isinstance(event, Photographed):
-            about = {"pitch": event.pitch, "time_s": event.frame.time_s, "purpose": event.purpose}
-            writer.add_image(event.camera, event.frame.image, event.placement, **about)
-        elif isinstance(event, Tracked):
-            writer.add_platform([(t, event.commanded, pitch) for t, pitch, measured in event.track if measured])
+        with self._safely():
+            if isinstance(event, Moved):
+                writer.add_platform([(event.time_s, event.commanded, event.pitch if event.measured else math.nan)])
+            elif isinstance(event, Scanned):
+                rows = [(raw, pitch, one.time_s) for one, pitch in zip(event.readings, event.pitch, strict=True)
+                        for raw in one.telegrams]  # fmt: skip
+                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
+            elif isinstance(event, Photographed):
+                about = {"pitch": event.pitch, "time_s": event.frame.time_s, "purpose": event.purpose}
+                writer.add_image(event.camera, event.frame.image, event.placement, **about)
+            elif isinstance(event, Tracked):
+                writer.add_platform([(t, event.commanded, pitch) for t, pitch, measured in event.track if measured])
 
     @contextlib.contextmanager
     def _safely(self):
@@ -230,25 +192,6 @@ class Recording:
             raise RecordingError(f"{self.path}: cannot be written ({error.strerror}): {remedy}; {safe}") from error
 
 
-def _add_scans(writer, event):
-    """All telegrams of an event; the parts of an interlaced scan share its pitch."""
-    telegrams = [raw for reading in event.readings for raw in reading.telegrams]
-    count = [len(reading.telegrams) for reading in event.readings]
-    times = [reading.time_s for reading in event.readings]
-    writer.add_telegrams(event.placement, telegrams, np.repeat(event.pitch, count), np.repeat(times, count))
-
-
-def _reference(rig, plan):
-    """What the session says about how it was recorded."""
-    pitch = "told by the head" if rig.head.has_feedback else "dead reckoning: the head does not tell it"
-    scenes = [placement.number for placement in plan if placement.purpose == "scene"]
-    return {"recording": HOW[rig.stated.plan.mode], "pitch": pitch, "scene_placements": scenes}
-
-
-FAILED, INTERRUPTED = 2, 130  # exit codes
-MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
-
-
 class Terminal:
     """Plain lines; on a terminal one more that is rewritten while the head moves (by carriage returns alone).
 
@@ -256,29 +199,24 @@ class Terminal:
     ----------
     out : text stream, optional
         stdout by default.
-    ask : callable, optional
-        ``ask(text) -> str``; ``input`` by default.
+    ask : callable
+        ``ask(text) -> str``.
     """
 
     def __init__(self, out=None, ask=input):
-        self.out, self._ask = sys.stdout if out is None else out, ask
-        self.live, self._width = self.out.isatty(), 0
-        self._begin("", 1)
+        self.out, self._ask, self._width = sys.stdout if out is None else out, ask, 0
 
     def say(self, text):
-        """A line of its own."""
-        self._wipe()
-        print(text, file=self.out, flush=True)
+        """A line of its own, instead of the one that is rewritten."""
+        if self._width:
+            print("\r" + " " * self._width, end="\r", file=self.out, flush=True)
+            self._width = 0
+        if text:
+            print(text, file=self.out, flush=True)
 
     def ask(self, text):
-        """What the user answers.
-
-        Raises
-        ------
-        RecordingError
-            If nobody can answer.
-        """
-        self._wipe()
+        """What the user answers; RecordingError if nobody can."""
+        self.say("")
         try:
             return self._ask(text).strip().lower()
         except EOFError:
@@ -286,48 +224,30 @@ class Terminal:
                 "nobody is there to move the board: run record in a terminal, or with an emulated rig"
             ) from None
 
-    def begin(self, placement, number, of):
-        """A placement begins."""
+    def follow(self, placement, number, of, events):
+        """Show the recording of a placement while it runs."""
         ends = " to ".join(f"{math.degrees(p):.2f}" for p in placement.pitch[[0, -1]])
-        self._begin(f"placement {placement.number} ({number} of {of})", 1)
-        self.say(f"{self._title}: {placement.purpose}, pitch {ends} deg")
+        self.say(f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch {ends} deg")
+        begun, scans, images, stop, pitch = time.monotonic(), 0, 0, "", 0.0
+        for event in events:
+            if isinstance(event, Moved):
+                stop, pitch = f"stop {event.number} of {event.of}, ", event.pitch
+            elif isinstance(event, Scanned):
+                scans, pitch = scans + len(event.readings), event.pitch[-1]
+            images += isinstance(event, Photographed)
+            counted = f"{scans} scans, {images} images"
+            if self.out.isatty():
+                text = f"  {stop}{math.degrees(pitch):+.2f} deg, {counted}"[: shutil.get_terminal_size().columns - 1]
+                print("\r" + text.ljust(self._width), end="", file=self.out, flush=True)
+                self._width = len(text)
+        self.say(f"  {counted} in {time.monotonic() - begun:.0f} s")
 
-    def _begin(self, title, of):
-        self._title, self._stop, self._of, self._scans, self._images, self._pitch = title, 0, of, 0, 0, 0.0
-        self._began = time.monotonic()
-
-    def show(self, event):
-        """What happened."""
-        if isinstance(event, Moved):
-            self._stop, self._of, self._pitch = event.number, event.of, event.pitch
-        elif isinstance(event, Scanned):
-            self._scans, self._pitch = self._scans + len(event.readings), event.pitch[-1]
-        elif isinstance(event, Photographed):
-            self._images += 1
-        if self.live:
-            self._rewrite(f"  stop {self._stop} of {self._of}, {math.degrees(self._pitch):+.2f} deg, {self._counted()}")
-
-    def end(self, lights):
-        """A placement is finished and checked."""
-        self.say(f"  {self._counted()} in {time.monotonic() - self._began:.0f} s")
-        for light in lights:
-            self.say(f"{MARKS[light.state]}  {light.name}: {light.text}")
-
-    def _counted(self):
-        return f"{self._scans} scans, {self._images} images"
-
-    def _rewrite(self, text):
-        text = text[: shutil.get_terminal_size().columns - 1]
-        print("\r" + text.ljust(self._width), end="", file=self.out, flush=True)
-        self._width = len(text)
-
-    def _wipe(self):
-        if self._width:
-            print("\r" + " " * self._width, end="\r", file=self.out, flush=True)
-            self._width = 0
+    def light(self, light, name=None):
+        """What a check found."""
+        self.say(f"{MARKS[light.state]}  {name or light.name}: {light.text}")
 
 
-def record_session(rig, path, *, resume=False, count=None, advice=None, terminal=None):
+def record_session(rig, path, *, resume=False, count=None, terminal=None):
     """Record a session with an open rig, from the first placement that is missing to the last of the plan.
 
     Parameters
@@ -339,8 +259,6 @@ def record_session(rig, path, *, resume=False, count=None, advice=None, terminal
         Go on with a session that was not finished.
     count : int, optional
         Placements of the plan; all by default.
-    advice : callable, optional
-        See :func:`~lrfcal_lib.acquire.checks.check_placement`.
     terminal : Terminal, optional
 
     Returns
@@ -358,7 +276,7 @@ def record_session(rig, path, *, resume=False, count=None, advice=None, terminal
         terminal.say(f"{path}: going on, {recording.safe()}")
     try:
         _close_views(recording, terminal)
-        _placements(recording, terminal, advice)
+        _placements(recording, terminal)
         recording.finish()
     except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal, see `emergency`
         error.add_note(recording.safe(resume=True))
@@ -372,56 +290,47 @@ def _close_views(recording, terminal):
     """Images for the intrinsics; by hand each until it shows the pattern."""
     wanted = recording.rig.stated.plan.intrinsics_images
     for camera, view in recording.close_views_to_do():
-        while True:
-            title = f"camera '{camera}', view {view + 1} of {wanted}"
+        title, kept = f"camera '{camera}', view {view + 1} of {wanted}", False
+        while not kept:
             emulated = recording.rig.hold_close(camera, view)
             if not emulated:
                 terminal.ask(f"{title}: hold the board close, tilted otherwise than before; Enter ")
             light = recording.run_close(camera)
-            terminal.say(f"{MARKS[light.state]}  {title}: {light.text}")
-            if emulated or light.state != "bad":
-                break
+            terminal.light(light, title)
+            kept = emulated or light.state != "bad"
 
 
-def _placements(recording, terminal, advice):
-    """Each placement that is missing; the user may have one again, or end."""
-    before = None
+def _placements(recording, terminal):
+    """Each placement that is missing; the user may have the one before again (r), or end (q)."""
+    before, of = None, len(recording.plan)
     while todo := recording.to_do():
-        answer = _next_board(recording, terminal, todo[0], before)
+        placement, answer = todo[0], ""
+        if not recording.rig.move_board(placement.number):
+            again = "" if before is None else f", r: placement {before} again"
+            what = "take the board away" if placement.purpose == "scene" else "put the board"
+            text = f"placement {placement.number}: {what}, then press Enter{again} (q: end here) "
+            while (answer := terminal.ask(text)) not in ("", "q", "r" if again else ""):
+                pass
         if answer == "q":
             return
         if answer == "r":
             recording.drop(before)
             before = None
             continue
-        of = len(recording.plan)
-        terminal.begin(todo[0], of - len(todo) + 1, of)
-        for event in recording.run(todo[0]):
-            terminal.show(event)
-        before = todo[0].number
-        terminal.end(recording.check(before, advice))
+        terminal.follow(placement, of - len(todo) + 1, of, recording.run(placement))
+        before = placement.number
+        for light in recording.check(before):
+            terminal.light(light)
 
 
-def _next_board(recording, terminal, placement, before):
-    """Have the board moved: '' to go on, 'r' to record the placement before again, 'q' to end."""
-    if recording.rig.move_board(placement.number):
-        return ""
-    again = "" if before is None else f", r: placement {before} again"
-    what = "take the board away" if placement.purpose == "scene" else "put the board"
-    while True:
-        answer = terminal.ask(f"placement {placement.number}: {what}, then press Enter{again} (q: end here) ")
-        if answer in ("", "q") or answer == "r" and before is not None:
-            return answer
-
-
-def main(rig_file, path, *, resume=False, count=None, mode=None, advice=None, terminal=None):
+def main(rig_file, path, *, resume=False, count=None, mode=None, terminal=None):
     """Record from the command line.
 
     Parameters
     ----------
     rig_file, path : path-like
-    resume, count, advice, terminal
-        As of :func:`record`.
+    resume, count, terminal
+        As of :func:`record_session`.
     mode : {'stop-and-go', 'continuous'}, optional
         Instead of the plan's.
 
@@ -433,21 +342,16 @@ def main(rig_file, path, *, resume=False, count=None, mode=None, advice=None, te
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
-        stated = read_rig_file(rig_file).with_mode(mode)
-        with Rig.open(stated) as rig:
-            recording = record_session(rig, path, resume=resume, count=count, advice=advice, terminal=terminal)
-    except (DeviceError, RecordingError, ValueError) as error:
-        return _failed(f"error: {error}", error, FAILED)
-    except KeyboardInterrupt as error:
-        return _failed("\nstopped by Ctrl-C", error, INTERRUPTED)
-    except SystemExit as error:
-        return _failed(f"\nstopped by {signal.Signals(error.code - 128).name}", error, error.code)
+        with Rig.open(read_rig_file(rig_file).with_mode(mode)) as rig:
+            recording = record_session(rig, path, resume=resume, count=count, terminal=terminal)
+    except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
+        text, code = f"error: {error}", FAILED
+        if isinstance(error, KeyboardInterrupt):
+            text, code = "\nstopped by Ctrl-C", INTERRUPTED
+        elif isinstance(error, SystemExit):
+            text, code = f"\nstopped by {signal.Signals(error.code - 128).name}", error.code
+        with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
+            print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
+        return code
     print(f"{path}: {recording.safe()}; 'python -m lrfcal_lib calibrate {path}' calibrates the rig")
     return 0
-
-
-def _failed(text, error, code):
-    """One line on stderr, notes included."""
-    with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
-        print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
-    return code

@@ -11,14 +11,28 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.drivers.head import ANGLE, HEAD, HeadSettings
-from lrfcal_lib.drivers.stated import FLAG, OBJECT, TEXT, Kind, check, either, listed, need, number, one_of, whole
+from lrfcal_lib.drivers.head import ANGLE, HeadSettings
+from lrfcal_lib.drivers.stated import (
+    FLAG,
+    OBJECT,
+    TEXT,
+    Kind,
+    check,
+    either,
+    kinds,
+    listed,
+    need,
+    number,
+    one_of,
+    whole,
+)
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, parse_session
 
 MODES = ("stop-and-go", "continuous")
 PURPOSES = ("board", "scene")
 MOST_STOPS, FINEST_DEG, MOST_BYTES = 5000, 1e-3, 10_000_000
+HEAD = kinds(HeadSettings)
 DEVICES = {"lrf": OBJECT, "head": OBJECT, "cameras": OBJECT, "control": TEXT}
 LRF = {
     "port": TEXT, "baudrate": one_of(9600, 19200, 38400, 500000), "address": whole(0, 127),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,16 @@ def listed(kind, count=None):
 TEXT = Kind("a text", lambda v: isinstance(v, str) and v.isprintable() and v != "")
 FLAG = one_of(True, False)
 OBJECT = Kind("an object with keys", lambda v: isinstance(v, dict))
+
+
+def stated(kind, default):
+    """A field of a dataclass, for values of a kind."""
+    return field(default=default, metadata={"kind": kind})
+
+
+def kinds(cls):
+    """Kinds of the fields of a dataclass, by name."""
+    return {one.name: one.metadata["kind"] for one in fields(cls)}
 
 
 def check(values, kinds, where, needed=()):

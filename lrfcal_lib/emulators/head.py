@@ -201,10 +201,19 @@ class EmulatedHead(SerialDevice):
             self.at(at + self.watchdog_s, self._stop, "watchdog")
         if frame.command2 in ANSWER:
             return self._tell(frame.command2, at)
+        head, way = self.head, {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
         if not frame.command2 & 1:
-            self._jog(frame, at)
+            if way is None:  # without a direction it is a stop whatever the speeds say
+                self._stop(at)
+            elif not self.faults.hit("stall"):
+                self._absolute_until = -math.inf
+                speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, 0x3F) / 0x3F
+                head.move(at, way * math.tau, speed)
         elif frame.command2 == pelco_d.SET_TILT and self.feedback == "full" and frame.value < pelco_d.TURN:
-            self._go(self.sign * pelco_d.decode_tilt(frame.value), at)
+            if at >= self._absolute_until and not self.faults.hit("stall"):  # a second absolute move is lost
+                goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.tilt.limits))
+                self._absolute_until = at + abs(goal - float(head.tilt.motor(at))) / self.go_speed
+                head.go(at, goal, self.go_speed)
         body = bytes([frame.address, frame.command1, frame.command2, frame.data1, frame.data2])
         answers = {"general": bytes([SYNC, self.address, 0, sum(body) % 256]), "single": b"\x01"}
         if self.reply_kind in answers:
@@ -213,23 +222,6 @@ class EmulatedHead(SerialDevice):
     def _stop(self, at):
         self._absolute_until = -math.inf
         self.head.stop(at + SLIP_S * self.faults.hit("slip"))
-
-    def _jog(self, frame, at):
-        """Up or down; without a direction it is a stop whatever the speeds say."""
-        way = {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
-        if way is None:
-            self._stop(at)
-        elif not self.faults.hit("stall"):
-            self._absolute_until = -math.inf
-            speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, 0x3F) / 0x3F
-            self.head.move(at, way * math.tau, speed)
-
-    def _go(self, goal, at):
-        if at < self._absolute_until or self.faults.hit("stall"):  # a second absolute move is lost
-            return
-        goal = float(np.clip(goal, *self.head.tilt.limits))
-        self._absolute_until = at + abs(goal - float(self.head.tilt.motor(at))) / self.go_speed
-        self.head.go(at, goal, self.go_speed)
 
     def _tell(self, opcode, at):
         """Answer a query, unless the head is too busy or does not know how."""

@@ -15,8 +15,7 @@ import select
 import termios
 import threading
 import tty
-from collections import Counter, defaultdict
-from dataclasses import dataclass
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -125,16 +124,6 @@ REQUEST = ("request_drop", "request_flip", "deaf")
 REPLY = tuple(name for name, fault in FAULTS.items() if fault.change and name not in REQUEST)
 
 
-@dataclass
-class Armed:
-    """When a fault can still happen: `count` times, until an instant, by chance; `seconds` it is to take."""
-
-    count: int = 0
-    until: float = -math.inf
-    chance: float = 0.0
-    seconds: float | None = None
-
-
 class Faults:
     """Switches of one device ('lrf' or 'head'); all that is random follows from the seed.
 
@@ -143,10 +132,10 @@ class Faults:
 
     def __init__(self, device, seed=0, machine=REAL, changed=lambda: None):
         self.device, self.counts, self.changed, self._now = device, Counter(), changed, machine.now
-        self.rng = np.random.default_rng([seed, *device.encode()])
-        self._lock, self._switches = threading.Lock(), defaultdict(Armed)
+        self.rng, self.away_s = np.random.default_rng([seed, *device.encode()]), AWAY_S
+        self._lock, self._times, self._until = threading.Lock(), Counter(), {}
 
-    def inject(self, name, count=1, *, seconds=None, chance=0.0):
+    def inject(self, name, count=1, *, seconds=None):
         """Arm a fault.
 
         Parameters
@@ -157,44 +146,37 @@ class Faults:
             It happens at that many opportunities (replies, requests, ...) from now on.
         seconds : float, optional
             At every opportunity for so long instead; for 'unplug' how long the port is away.
-        chance : float
-            At every opportunity with this probability instead, until it is cleared.
         """
         if name not in FAULTS or self.device not in FAULTS[name].devices:
             known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
             raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
         with self._lock:
-            switch = self._switches[name]
-            if chance:
-                switch.chance = chance
-            elif seconds is None or name == "unplug":
-                switch.count, switch.seconds = switch.count + count, seconds
+            if name == "unplug":
+                self.away_s = AWAY_S if seconds is None else seconds
+            if name == "unplug" or seconds is None:
+                self._times[name] += count
             else:
-                switch.until = self._now() + seconds
+                self._until[name] = self._now() + seconds
         self.changed()
 
     def clear(self, name=None):
         """Disarm one fault, or all."""
         with self._lock:
-            self._switches.clear() if name is None else self._switches.pop(name, None)
+            for switches in (self._times, self._until):
+                switches.clear() if name is None else switches.pop(name, None)
 
     @property
     def armed(self):
         """Names of the faults that can still happen, a set."""
         with self._lock:
-            return {k for k, s in self._switches.items() if s.count > 0 or s.chance or s.until > self._now()}
+            return {*+self._times, *(name for name, end in self._until.items() if end > self._now())}
 
     def hit(self, name):
         """Whether the fault happens at this opportunity, which is then counted."""
         with self._lock:
-            if name not in self._switches:
-                return False
-            switch = self._switches[name]
-            hit = switch.count > 0 or self._now() < switch.until
-            hit = hit or switch.chance > 0 and self.rng.random() < switch.chance
-            switch.count -= switch.count > 0
-            if hit:
-                self.counts[name] += 1
+            hit = self._times[name] > 0 or self._now() < self._until.get(name, 0)
+            self._times[name] -= self._times[name] > 0
+            self.counts.update([name] * bool(hit))
             return hit
 
     def mangle(self, data, names=REPLY):
@@ -204,11 +186,6 @@ class Faults:
                 tries = (FAULTS[name].change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
                 data = next((changed for changed in tries if changed != data), data)
         return data
-
-    def away(self):
-        """Seconds that the port is away after the fault 'unplug' that was armed last."""
-        seconds = self._switches["unplug"].seconds
-        return AWAY_S if seconds is None else seconds
 
 
 def resample(data, sent, read):
@@ -350,7 +327,7 @@ class SerialDevice:
         """Do all that is due by now."""
         if self.port.there and self.faults.hit("unplug"):
             self.port.unplug()
-            self.at(self.clock.now() + self.faults.away() * self.clock.scale, lambda _: self.port.plug())
+            self.at(self.clock.now() + self.faults.away_s * self.clock.scale, lambda _: self.port.plug())
         while self._agenda and self._agenda[0][0] <= self.clock.now() + SOON:
             instant, _, action, _ = heapq.heappop(self._agenda)
             action(instant)

@@ -27,6 +27,7 @@ BURST = 508  # bytes that leave in one turn of the mirror at 500000 Bd
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 LATE_S = 1.0, 0.1  # a stream that lags so far leaves scans out: no host can know how late they are; once it did
 TURN_S = 1 / 75.08  # of the mirror, as 148 us for a ninetieth tells
+POWERED_S = 60.0  # how long ago it was switched on
 KEPT = 20000  # scans and requests on record
 VARIANTS = ((100, 100), (100, 50), (100, 25), (180, 100), (180, 50))  # degrees, 1/100 degree
 BAUD_WORD = {rate: word for word, rate in codec.BAUD.items()}
@@ -144,8 +145,6 @@ class EmulatedLms(SerialDevice):
     clock : Clock, optional
     boot_s : float
         From a restart to the power-on string; a real device takes up to 60 s.
-    powered_s : float
-        How long ago it was switched on; below `boot_s` it sends its power-on string first.
     baudrates : tuple of int
         That the line allows; RS-232 ends at 38400.
     **settings
@@ -169,16 +168,14 @@ class EmulatedLms(SerialDevice):
     baudrate = property(lambda self: self.memory.baudrate, doc="Of the device now.")
     streaming = property(lambda self: self.memory.mode in (STREAM, INTERLACED), doc="Whether scans come by themselves.")
 
-    def __init__(self, source=None, *, path, seed=0, time_scale=1.0, clock=None, boot_s=2.0, powered_s=60.0,
-                 baudrates=tuple(BAUD_WORD), **settings):  # fmt: skip
+    def __init__(self, source=None, *, path, seed=0, time_scale=1.0, clock=None, boot_s=2.0, baudrates=(*BAUD_WORD,),
+                 **settings):  # fmt: skip
         super().__init__("lrf", path, clock or Clock(time_scale), seed)
         self.memory, self.source = Memory(**settings), source or SyntheticSource()
         self.boot_s, self.baudrates, self.rng = boot_s, baudrates, np.random.default_rng([seed, 1])
         self.scans, self.requests, self.telegrams, self.left_out = deque(maxlen=KEPT), deque(maxlen=KEPT), 0, 0
         self._buffer, self._turn, self._partial, self._number, self._effect = b"", 0, 0, 0, None
-        self._zero, self._booting = self.clock.now() - powered_s, powered_s < boot_s
-        if self._booting:
-            self.at(self._zero + boot_s, self._ready)
+        self._zero, self._booting = self.clock.now() - POWERED_S, False
 
     # ------------------------------------------------------------------------------------------- bytes from the host
 

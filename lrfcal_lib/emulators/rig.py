@@ -206,20 +206,15 @@ class EmulatedRig:
         }  # fmt: skip
 
 
-def _faults_of(rig, device):
+def _fault(rig, device, name=None, count=1, seconds=None):
+    """Let a fault of a device happen; without a name none any more."""
     if device not in rig.faults:
         raise ValueError(f"no device '{device}'; there are {', '.join(rig.faults)}")
-    return rig.faults[device]
-
-
-def _fault(rig, device, name, count=1, seconds=None):
-    _faults_of(rig, device).inject(name, int(count), seconds=None if seconds is None else float(seconds))
+    if name is None:
+        rig.faults[device].clear()
+    else:
+        rig.faults[device].inject(name, int(count), seconds=None if seconds is None else float(seconds))
     return {"armed": sorted(rig.faults[device].armed)}
-
-
-def _clear(rig, device=None):
-    for name in rig.faults if device is None else [device]:
-        _faults_of(rig, name).clear()
 
 
 COMMANDS = {
@@ -227,11 +222,13 @@ COMMANDS = {
               "place NUMBER|none: put the board there"),
     "close": (lambda rig, camera, view: rig.world.hold_close(camera, int(view)), "close CAMERA VIEW: hold it close"),
     "placements": (lambda rig: {"placements": rig.plan()["placements"]}, "placements: where the board can be put"),
-    "fault": (_fault, "fault lrf|head NAME [COUNT] [SECONDS]: let something go wrong"),
+    "fault": (lambda rig, device, name, *more: _fault(rig, device, name, *more),
+              "fault lrf|head NAME [COUNT] [SECONDS]: let something go wrong"),
     "faults": (lambda rig: {"faults": {n: f.text for n, f in FAULTS.items()},
                             "counts": {d: dict(f.counts) for d, f in rig.faults.items()}},
                "faults: what can go wrong, and how often it did"),
-    "clear": (_clear, "clear [lrf|head]: no more faults"),
+    "clear": (lambda rig, *devices: [_fault(rig, one) for one in devices or rig.faults] and {},
+              "clear [lrf|head]: no more faults"),
     "status": (EmulatedRig.status, "status: the devices now"),
     "truth": (lambda rig: {"truth": rig.world.truth()}, "truth: what only the simulator knows"),
     "help": (lambda _: {"commands": [text for _, text in COMMANDS.values()]}, "help: this"),

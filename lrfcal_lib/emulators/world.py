@@ -148,28 +148,25 @@ def scaled(rig, width):
     return replace(rig, cameras=tuple(cameras))
 
 
-_setup, _imagers = None, ()  # of the drawing process
+_drawing = None  # in the drawing process: the setup, its cameras' imagers, worlds by place
 
 
 def _begin(setup):
     """Furnish the drawing process, which ends with a parent that was killed."""
-    global _setup, _imagers
+    global _drawing
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this process
     threading.Thread(target=lambda: wait([parent_process().sentinel]) and os._exit(1), daemon=True).start()
     cv2.setNumThreads(1)
-    _setup, _imagers = setup, [Imager(camera.model, camera.exposure) for camera in setup.rig.cameras]
+    imagers = [Imager(camera.model, camera.exposure) for camera in setup.rig.cameras]
+    _drawing = setup, imagers, lru_cache(2)(lambda place: world_of(setup, place.T_platform_board, stand=place.stand))
 
 
-@lru_cache(2)
-def _world(place):
-    return world_of(_setup, place.T_platform_board, stand=place.stand)
-
-
-def _draw(index, place, pitch, seed, quality):
+def _draw(index, place, pitch, seed):
     """JPEG of what a camera sees; runs in the drawing process."""
-    pose = _setup.rig.camera_pose(_setup.rig.cameras[index], pitch)
-    image = _imagers[index].render(_world(place), pose, np.random.default_rng(seed))
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    setup, imagers, world = _drawing
+    pose = setup.rig.camera_pose(setup.rig.cameras[index], pitch)
+    image = imagers[index].render(world(place), pose, np.random.default_rng(seed))
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 class CameraServer:
@@ -264,7 +261,7 @@ class CameraServer:
                     if image is not None:
                         image.cancel()
                     index = self.names.index(key[0])
-                    image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)], QUALITY)
+                    image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
                     self._images[key[0]] = key, image
             return image.result() if image.done() else None
         except BrokenProcessPool as error:
@@ -282,34 +279,30 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self):
         name, _, kind = self.path.strip("/").rpartition(".")
-        if name not in self.cameras.names or kind not in ("mjpg", "jpg"):
-            return self.send_error(404, f"cameras are {', '.join(self.cameras.urls.values())}")
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            self._stream(name) if kind == "mjpg" else self._single(name)
-
-    def _single(self, name):
-        _, data = self.cameras.image(name, timeout=20.0)
-        if data is None:
-            return self.send_error(503, "the head moves")
-        self.send_response(200)
-        self.send_header("Content-Type", "image/jpeg")
-        self.send_header("Content-Length", len(data))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def _stream(self, name):
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.send_header("Cache-Control", "no-cache")
-        self.end_headers()
-        while self.cameras.serving:
-            _, data = self.cameras.image(name)
+        cameras, single = self.cameras, kind == "jpg"
+        if name not in cameras.names or kind not in ("mjpg", "jpg"):
+            return self.send_error(404, f"cameras are {', '.join(cameras.urls.values())}")
+        headers = {"Content-Type": "multipart/x-mixed-replace; boundary=frame", "Cache-Control": "no-cache"}
+        if single:
+            _, data = cameras.image(name, timeout=20.0)
             if data is None:
-                self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
-            else:
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                self.wfile.write(head.encode() + data + b"\r\n")
-                self.cameras.quit.wait(1 / FPS)
+                return self.send_error(503, "the head moves")
+            headers = {"Content-Type": "image/jpeg", "Content-Length": len(data)}
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self.send_response(200)
+            for header in headers.items():
+                self.send_header(*header)
+            self.end_headers()
+            if single:
+                self.wfile.write(data)
+            while cameras.serving and not single:
+                _, data = cameras.image(name)
+                if data is None:
+                    self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
+                else:
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                    self.wfile.write(head.encode() + data + b"\r\n")
+                    cameras.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass

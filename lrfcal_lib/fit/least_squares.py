@@ -156,8 +156,8 @@ def eliminate(hessian, gradient, shared, rcond=1e-13):
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
     own = hessian[:, c:, c:]
     back = np.linalg.solve(own, known) if rcond is None else np.linalg.pinv(own, rcond=rcond, hermitian=True) @ known
-    taken = hessian[:, :c, c:] @ back
-    return hessian[:, :c, :c] - taken[..., :c], gradient[:, :c] - taken[..., c], back
+    across = hessian[:, :c, c:]
+    return hessian[:, :c, :c] - across @ back[..., :c], gradient[:, :c] - (across @ back[..., c:])[..., 0], back
 
 
 def reduced_hessian(hessian, shared):

@@ -1,18 +1,23 @@
-"""Least squares over chessboard corners: intrinsics, poses, the mounting of cameras, the waves of the sheet."""
+"""From a chessboard's corners in images: poses, intrinsics, the mounting of cameras, the waves of the sheet."""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.least_squares import Block, minimise
 from lrfcal_lib.model.camera import CameraModel, project, project_jacobians
-from lrfcal_lib.model.geometry import hat
+from lrfcal_lib.model.geometry import apply_pose, gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
 
 SIGMA_FLOOR_PX = 0.05  # corner detectors are never better than this on real prints
 OUTLIER_SIGMAS = 4.5
 ROBUST_ROUNDS = 6
+LEAST_TILT = np.radians(3.0)  # between views, to observe the focal length
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -23,12 +28,9 @@ class Adjustment:
     ----------
     models : tuple of CameraModel
         With `covariance` where the intrinsics were free; `rms_px` per camera.
-    mounting : tuple of RigidTransform
-        ``T_camera_first`` of every camera; the first is the identity.
-    mounting_covariance : ndarray, shape (cameras - 1, 6, 6)
-    poses : tuple of RigidTransform
-        ``T_first_board`` of every view.
-    pose_covariance : ndarray, shape (views, 6, 6)
+    mounting, poses : RigidTransform
+        Stacks: ``T_camera_first`` of every camera (the first is the identity), ``T_first_board`` of every view.
+    mounting_covariance, pose_covariance : ndarray, shape (cameras - 1, 6, 6), (views, 6, 6)
     relief : ndarray, shape (k,)
         Height of every corner over the sheet's mean plane, along z of the board, metres; zero unless it was free.
     residuals : ndarray, shape (cameras, views, k, 2)
@@ -42,9 +44,9 @@ class Adjustment:
     """
 
     models: tuple
-    mounting: tuple
+    mounting: RigidTransform
     mounting_covariance: np.ndarray
-    poses: tuple
+    poses: RigidTransform
     pose_covariance: np.ndarray
     relief: np.ndarray
     residuals: np.ndarray
@@ -58,196 +60,105 @@ class Adjustment:
         return self.models[0]
 
 
-@dataclass(frozen=True)
-class _State:
-    intrinsics: np.ndarray  # (c, 9)
-    mounting: np.ndarray  # (c, 4, 4)
-    poses: np.ndarray  # (v, 4, 4)
-    relief: np.ndarray  # (m,) coordinates of the height in the basis that is orthogonal to planes
+def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, relief=False, fixed=()):
+    """Bundle adjustment of chessboard views (an Adjustment) with analytic derivatives.
 
-
-def adjust(pixels, pattern, models, poses, mounting=None, *, intrinsics=True, relief=False, fixed=(), iterations=50):
-    """Bundle adjustment of chessboard views by damped Gauss-Newton with analytic derivatives.
-
-    Parameters
-    ----------
-    pixels : array_like, shape (cameras, views, k, 2)
-        Recorded pixels, NaN where a corner was not seen.
-    pattern : Chessboard
-    models : sequence of CameraModel
-        Start values (or the truth, with ``intrinsics=False``).
-    poses : sequence of RigidTransform
-        Start values of ``T_first_board``.
-    mounting : sequence of RigidTransform, optional
-        Start values of ``T_camera_first``; needed for more than one camera.
-    intrinsics : bool
-        Whether the intrinsics are free.
-    relief : bool
-        Whether the sheet may be wavy: one height a corner, common to all views. Heights hold no plane, so the pose is
-        that of the sheet's mean plane.
-    fixed : sequence of int
-        Places in (fx, fy, cx, cy, k1..k5) that stay as they are.
-    iterations : int
-
-    Returns
-    -------
-    Adjustment
-
-    Raises
-    ------
-    ValueError
-        If there are fewer observations than unknowns.
+    `pixels` (cameras, views, k, 2) hold NaN where a corner was not seen, `points` (k, 3) are the corners on the board.
+    The rest are start values, of which the `intrinsics` (but for the `fixed` places in fx, fy, cx, cy, k1..k5) and the
+    `relief` may stay as they are: one height a corner, common to all views, which holds no plane, so that the pose is
+    that of the sheet's mean plane.
     """
-    pixels = np.asarray(pixels, float)
-    points = pattern.points()
+    cameras, views = pixels.shape[:2]
     plane = np.column_stack([np.ones(len(points)), points[:, :2]])
     basis = np.linalg.svd(plane)[0][:, 3:] if relief else np.zeros((len(points), 0))
-    mounts = np.stack([np.eye(4)] + [m.as_matrix() for m in (mounting or ())[1:]])
-    start = np.stack([m.parameters for m in models])
-    state = _State(start, mounts, np.stack([p.as_matrix() for p in poses]), np.zeros(basis.shape[1]))
-    free = _free_columns(state, intrinsics, fixed)
-    seen = np.isfinite(pixels)
+    mounting = RigidTransform.identity(1) if mounting is None else mounting
+    state = np.stack([m.parameters for m in models]), pose_array(mounting), pose_array(poses), np.zeros(basis.shape[1])
+    lens = np.full((cameras, 9), bool(intrinsics))
+    lens[:, list(fixed)] = False
+    cuts = np.cumsum([9 * cameras, 6 * (cameras - 1), 6 * views, basis.shape[1]])
+    free, seen = np.r_[lens.ravel(), np.ones(cuts[3] - cuts[0], bool)], np.isfinite(pixels)
     if seen.sum() < free.sum():
         raise ValueError(f"{seen.sum()} image coordinates cannot determine {free.sum()} unknowns: use more views")
-    state = _iterate(state, pixels, points, basis, free, iterations)
-    return _finish(state, pixels, points, basis, free, models, intrinsics)
 
+    def evaluate(state):
+        predicted, jacobian = predict(state, points, basis)
+        miss = np.where(seen, predicted - pixels, 0.0).ravel()
+        return Block(miss, jacobian.reshape(miss.size, -1)[:, free], seen.ravel().astype(float))
 
-def _free_columns(state, intrinsics, fixed):
-    lens = np.full((len(state.intrinsics), 9), bool(intrinsics))
-    lens[:, list(fixed)] = False
-    rest = 6 * (len(state.mounting) - 1) + 6 * len(state.poses) + len(state.relief)
-    return np.r_[lens.ravel(), np.ones(rest, bool)]
+    def retract(state, step):
+        whole = np.zeros(len(free))
+        whole[free] = step
+        return moved(state, whole)
 
-
-def _iterate(state, pixels, points, basis, free, iterations):
-    damping = 1e-6
-    error, normal, gradient = _normal_equations(state, pixels, points, basis, free)
-    for _ in range(iterations):
-        step = np.zeros(len(free))
-        step[free] = _solve_scaled(normal, gradient, damping)
-        trial = _moved(state, step)
-        trial_error, trial_normal, trial_gradient = _normal_equations(trial, pixels, points, basis, free)
-        if trial_error < error:
-            done = error - trial_error < 1e-12 * error
-            state, error, normal, gradient = trial, trial_error, trial_normal, trial_gradient
-            damping = max(damping / 10, 1e-12)
-            if done:
-                break
-        elif damping > 1e3:
-            break
-        else:
-            damping *= 10
-    return state
-
-
-def _solve_scaled(normal, gradient, damping):
-    """Solve damped normal equations with unit diagonal, so that pixels, radians and metres mix safely."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal * scale[:, None] * scale
-    return scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
-
-
-def _residuals(state, pixels, points, basis, jacobian=True):
-    """Residuals (c, v, k, 2) and their derivatives, one block for each group of unknowns."""
-    height = basis @ state.relief
-    p_board = points + height[:, None] * [0.0, 0.0, 1.0]
-    turned = np.einsum("vij,kj->vki", state.poses[:, :3, :3], p_board)
-    p_first = turned + state.poses[:, None, :3, 3]
-    mounted = np.einsum("cij,vkj->cvki", state.mounting[:, :3, :3], p_first)
-    p_camera = mounted + state.mounting[:, None, None, :3, 3]
-    out, blocks = np.empty(pixels.shape), []
-    for c, lens in enumerate(state.intrinsics):
-        by_point, by_lens = project_jacobians(p_camera[c], CameraModel(1, 1, *lens[:4], lens[4:]))
-        x, y = p_camera[c, ..., 0] / p_camera[c, ..., 2], p_camera[c, ..., 1] / p_camera[c, ..., 2]
-        out[c] = pixels[c] - _predict(x, y, lens, by_lens)
-        blocks.append((by_lens, by_point, by_point @ state.mounting[c, :3, :3]))
-    return out, blocks, turned, mounted
-
-
-def _predict(x, y, lens, by_lens):
-    # the derivatives by fx and fy are the distorted normalised coordinates themselves
-    return np.stack([lens[0] * by_lens[..., 0, 0] + lens[2], lens[1] * by_lens[..., 1, 1] + lens[3]], axis=-1)
-
-
-def _jacobian(state, blocks, turned, mounted, basis):
-    """Derivatives of the prediction, shape (c, v, k, 2, n_parameters)."""
-    cameras, views, corners = len(state.intrinsics), len(state.poses), turned.shape[1]
-    n_lens, n_mount = 9 * cameras, 6 * (cameras - 1)
-    out = np.zeros((cameras, views, corners, 2, n_lens + n_mount + 6 * views + basis.shape[1]))
-    for c, (by_lens, by_point, by_first) in enumerate(blocks):
-        out[c, ..., 9 * c : 9 * c + 9] = by_lens
-        if c:
-            at = n_lens + 6 * (c - 1)
-            out[c, ..., at : at + 3], out[c, ..., at + 3 : at + 6] = -by_point @ hat(mounted[c]), by_point
-        pose = np.concatenate([-by_first @ hat(turned), by_first], axis=-1)
-        start = n_lens + n_mount
-        view = out[c, ..., start : start + 6 * views].reshape(views, corners, 2, views, 6)
-        index = np.arange(views)
-        view[index, :, :, index] = pose
-        out[c, ..., start : start + 6 * views] = view.reshape(views, corners, 2, 6 * views)
-        normal = np.einsum("vkij,vj->vki", by_first, state.poses[:, :3, 2])
-        out[c, ..., start + 6 * views :] = normal[..., None] * basis[None, :, None, :]
-    return out
-
-
-def _normal_equations(state, pixels, points, basis, free):
-    residuals, blocks, turned, mounted = _residuals(state, pixels, points, basis)
-    jacobian = _jacobian(state, blocks, turned, mounted, basis).reshape(residuals.size, -1)[:, free]
-    flat = residuals.ravel()
-    good = np.isfinite(flat)
-    jacobian, flat = jacobian[good], flat[good]
-    return flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
-
-
-def _moved(state, step):
-    cameras, views = len(state.intrinsics), len(state.poses)
-    cuts = np.cumsum([9 * cameras, 6 * (cameras - 1), 6 * views])
-    lens, mount, pose, relief = np.split(step, cuts)
-    mounting = state.mounting.copy()
-    mounting[1:] = _turned(mounting[1:], mount.reshape(-1, 6))
-    poses = _turned(state.poses, pose.reshape(-1, 6))
-    return _State(state.intrinsics + lens.reshape(-1, 9), mounting, poses, state.relief + relief)
-
-
-def _turned(transforms, steps):
-    out = transforms.copy()
-    out[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ transforms[:, :3, :3]
-    out[:, :3, 3] += steps[:, 3:]
-    return out
-
-
-def _finish(state, pixels, points, basis, free, models, intrinsics):
-    error, normal, _ = _normal_equations(state, pixels, points, basis, free)
-    residuals = _residuals(state, pixels, points, basis)[0]
-    count = np.isfinite(residuals).sum()
+    state = minimise(evaluate, state, retract)[0]
+    block = evaluate(state)
+    jacobian, count = block.jacobian[seen.ravel()], seen.sum()
+    normal, error = jacobian.T @ jacobian, block.residuals @ block.residuals
     sigma2 = max(error / max(count - free.sum(), 1), 1e-18)
-    covariance = np.zeros((len(free),) * 2)
+    # unit diagonal, so that pixels, radians and metres mix safely
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
+    covariance = np.zeros((len(free),) * 2)
     covariance[np.ix_(free, free)] = sigma2 * inverse
-    cameras, views = len(models), len(state.poses)
-    at = np.cumsum([0, 9 * cameras, 6 * (cameras - 1), 6 * views])
-    fitted = tuple(
-        m.with_parameters(
-            state.intrinsics[c],
-            covariance[9 * c : 9 * c + 9, 9 * c : 9 * c + 9] if intrinsics else m.covariance,
-            _rms(residuals[c]) if intrinsics else m.rms_px,
+    residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
+    if intrinsics:
+        models = tuple(
+            m.with_parameters(values, covariance[9 * c : 9 * c + 9, 9 * c : 9 * c + 9], _rms(residuals[c]))
+            for c, (m, values) in enumerate(zip(models, state[0], strict=True))
         )
-        for c, m in enumerate(models)
-    )
     return Adjustment(
-        fitted,
-        tuple(RigidTransform.from_matrix(m) for m in state.mounting),
-        _diagonal_blocks(covariance[at[1] : at[2], at[1] : at[2]]),
-        tuple(RigidTransform.from_matrix(p) for p in state.poses),
-        _diagonal_blocks(covariance[at[2] : at[3], at[2] : at[3]]),
-        basis @ state.relief,
+        tuple(models),
+        pose_transform(state[1]),
+        _diagonal_blocks(covariance[cuts[0] : cuts[1], cuts[0] : cuts[1]]),
+        pose_transform(state[2]),
+        _diagonal_blocks(covariance[cuts[1] : cuts[2], cuts[1] : cuts[2]]),
+        basis @ state[3],
         residuals,
         float(np.sqrt(sigma2)),
         _rms(residuals),
         float(count * np.log(max(error, 1e-300) / count) + free.sum() * np.log(count)),
     )
+
+
+def predict(state, points, basis):
+    """Pixels (c, v, k, 2) of corners on a sheet with heights ``basis @ relief``, and their derivatives (..., unknowns).
+
+    The state is (intrinsics (c, 9), ``T_camera_first`` (c, 3, 4), ``T_first_board`` (v, 3, 4), relief); so are the
+    unknowns, without the first mounting, poses as ``[w, v]``.
+    """
+    lenses, mounting, poses, relief = state
+    (cameras, views), corners = (len(lenses), len(poses)), len(points)
+    turned = rotate_points(poses, points + (basis @ relief)[:, None] * UP)
+    p_first = turned + poses[:, None, :, 3]
+    n_lens, n_mount = 9 * cameras, 6 * (cameras - 1)
+    at = n_lens + n_mount + 6 * views
+    pixels = np.empty((cameras, views, corners, 2))
+    out = np.zeros(pixels.shape + (at + basis.shape[1],))
+    own = out[..., n_lens + n_mount : at].reshape(pixels.shape + (views, 6))  # a view
+    every = np.arange(views)
+    for c, (lens, mount) in enumerate(zip(lenses, mounting, strict=True)):
+        mounted = rotate_points(mount, p_first)
+        model = CameraModel(1, 1, *lens[:4], lens[4:])
+        by_point, by_lens = project_jacobians(mounted + mount[:, 3], model)
+        # the derivatives by fx and fy are the distorted normalised coordinates themselves
+        distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
+        pixels[c] = lens[:2] * distorted + lens[2:4]
+        out[c, ..., 9 * c : 9 * c + 9] = by_lens
+        if c:
+            out[c, ..., n_lens + 6 * (c - 1) : n_lens + 6 * c] = gradient_by_pose(mounted[..., None, :], by_point)
+        by_first = by_point @ mount[:, :3]
+        own[c, every, :, :, every] = gradient_by_pose(turned[..., None, :], by_first)
+        out[c, ..., at:] = np.einsum("vkij,vj->vki", by_first, poses[:, :, 2])[..., None] * basis[:, None, :]
+    return pixels, out
+
+
+def moved(state, step):
+    """The state of :func:`predict` after a step of all its unknowns."""
+    lenses, mounting, poses, relief = state
+    cuts = np.cumsum([lenses.size, 6 * (len(mounting) - 1), 6 * len(poses)])
+    lens, mount, pose, height = np.split(step, cuts)
+    mounting = np.concatenate([mounting[:1], move_pose(mounting[1:], mount.reshape(-1, 6))])
+    return lenses + lens.reshape(-1, 9), mounting, move_pose(poses, pose.reshape(-1, 6)), relief + height
 
 
 def _rms(residuals):
@@ -256,48 +167,170 @@ def _rms(residuals):
 
 def _diagonal_blocks(covariance):
     n = len(covariance) // 6
-    index = np.arange(n)
-    return covariance.reshape(n, 6, n, 6)[index, :, index]
+    return covariance.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
 
 
-def adjust_robust(pixels, pattern, models, poses, mounting=None, **options):
+def adjust_robust(pixels, points, models, poses, mounting=None, **options):
     """As :func:`adjust`, without corners far off the rest (glare, a shadow): NaN in `residuals`.
 
     Every corner is judged again after each adjustment, so that one that was pulled out by its neighbour comes back.
     """
-    pixels = np.asarray(pixels, float)
-    result = adjust(pixels, pattern, models, poses, mounting, **options)
+    result = adjust(pixels, points, models, poses, mounting, **options)
     used = np.isfinite(result.residuals)
     for _ in range(ROBUST_ROUNDS):
-        kept = _near_enough(_prediction_errors(result, pixels, pattern))
-        if np.array_equal(kept, used):
+        raised, views = points + result.relief[:, None] * UP, zip(pixels, result.models, result.mounting, strict=True)
+        seen = [p - project(apply_pose(pose_array(mount * result.poses), raised), m) for p, m, mount in views]
+        distance = np.linalg.norm(seen, axis=-1)
+        # the median of a Rayleigh variable is 1.1774 sigma
+        near = distance <= OUTLIER_SIGMAS * max(np.nanmedian(distance) / 1.1774, SIGMA_FLOOR_PX)
+        near = np.broadcast_to(near[..., None], pixels.shape)
+        if np.array_equal(near, used):
             break
-        used = kept
+        used = near
         masked = np.where(used, pixels, np.nan)
-        result = adjust(masked, pattern, result.models, result.poses, result.mounting, **options)
+        result = adjust(masked, points, result.models, result.poses, result.mounting, **options)
     return result
 
 
-def _near_enough(errors):
-    """Which coordinates belong to corners that are not outliers, same shape as `errors`."""
-    distance = np.linalg.norm(errors, axis=-1)
-    # the median of a Rayleigh variable is 1.1774 sigma
-    limit = OUTLIER_SIGMAS * max(np.nanmedian(distance) / 1.1774, SIGMA_FLOOR_PX)
-    return np.broadcast_to((distance <= limit)[..., None], errors.shape)
-
-
-def _prediction_errors(result, pixels, pattern):
-    """Seen minus predicted for all corners, also those the result did without."""
-    raised = pattern.points() + result.relief[:, None] * [0.0, 0.0, 1.0]
-    errors = np.empty(pixels.shape)
-    for c, (model, T_camera_first) in enumerate(zip(result.models, result.mounting, strict=True)):
-        for v, pose in enumerate(result.poses):
-            errors[c, v] = pixels[c, v] - project((T_camera_first * pose).apply(raised), model)
-    return errors
-
-
-def better(result, pixels, pattern, **options):
+def better(result, pixels, points, **options):
     """The same corners adjusted otherwise, where the Bayesian information criterion prefers that."""
     same = np.where(np.isfinite(result.residuals), pixels, np.nan)
-    other = adjust(same, pattern, result.models, result.poses, **options)
+    other = adjust(same, points, result.models, result.poses, **options)
     return other if other.bic < result.bic else result
+
+
+def estimate_intrinsics(pixels, pattern, size, *, relief=False):
+    """Intrinsics of a camera from views of a chessboard: an Adjustment whose first model they are.
+
+    `pixels` are the corners of every view (k, 2) in the order of ``pattern.points()``, `size` is the image's width and
+    height. With `relief` the waves of the sheet are estimated along: paper on cardboard is never flat, and 1 mm of
+    waves costs more than the corner detector does, and biases the intrinsics. The third radial term k5 is kept only
+    where it lowers the Bayesian information criterion. ValueError with fewer than three views, or views that all lie in
+    parallel planes (the focal length stays unobservable).
+    """
+    if len(pixels) < 3:
+        raise ValueError(f"intrinsics need at least three views of the pattern, got {len(pixels)}")
+    pixels, points = np.asarray(pixels, float)[None], pattern.points()
+    board, views = [points.astype(np.float32)] * pixels.shape[1], list(pixels[0].astype(np.float32))
+    size = tuple(int(s) for s in size)
+    with _opencv(f"{len(views)} views of the pattern do not determine the intrinsics"):
+        out = cv2.calibrateCamera(board, views, size, None, None, flags=cv2.CALIB_FIX_K3)
+    matrix, lens, turns, shifts = out[1:5]
+    model = CameraModel(*size, *map(float, (matrix[0, 0], matrix[1, 1], *matrix[:2, 2])), lens.ravel()[:5])
+    turns = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
+    normals = turns.as_matrix()[:, :, 2]
+    spread = np.arccos(np.clip(normals @ normals.T, -1, 1)).max()
+    if spread < LEAST_TILT:
+        raise ValueError(
+            f"the board is parallel to itself within {np.rad2deg(spread):.2f} deg in all {len(views)} views: the focal "
+            "length cannot be observed; tilt the board by 20 deg or more between views"
+        )
+    poses = RigidTransform.from_components(np.reshape(shifts, (-1, 3)), turns)
+    best = adjust_robust(pixels, points, [model], poses, fixed=(8,))
+    if relief:
+        wavy = adjust_robust(pixels, points, best.models, best.poses, relief=True, fixed=(8,))
+        best = better(wavy, pixels, points, relief=False, fixed=(8,))
+    return better(best, pixels, points, relief=bool(np.any(best.relief)))
+
+
+def estimate_relief(pixels, pattern, model):
+    """Shape of a wavy sheet from views by a camera with known intrinsics: an Adjustment.
+
+    Its `relief` is zero where the Bayesian information criterion prefers a flat sheet.
+    """
+    poses = RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in pixels])
+    pixels, points = np.asarray(pixels, float)[None], pattern.points()
+    wavy = adjust_robust(pixels, points, [model], poses, relief=True, intrinsics=False)
+    return better(wavy, pixels, points, relief=False, intrinsics=False)
+
+
+@contextmanager
+def _opencv(what):
+    """OpenCV's refusal of what it was given is one of the values."""
+    try:
+        yield
+    except cv2.error as error:
+        raise ValueError(f"{what} (OpenCV: {error.err})") from error
+
+
+def first_pose(points, pixels, model):
+    """Pose by OpenCV's solver, good enough to start from; ValueError when there is none in front of the camera."""
+    good = np.isfinite(pixels).all(axis=1)
+    board, image = points[good].astype(float), np.ascontiguousarray(pixels[good], float)
+    why, how = f"{good.sum()} corners do not determine a pose in front of the camera", cv2.SOLVEPNP_SQPNP
+    with _opencv(why):
+        found, rotvec, translation = cv2.solvePnP(board, image, model.matrix, model.distortion, flags=how)
+    if not found or not np.isfinite(translation).all() or translation[2, 0] <= 0:
+        raise ValueError(why)
+    return RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))
+
+
+def board_pose(pixels, pattern, model, relief=None, start=None):
+    """Pose of a chessboard in one image.
+
+    Parameters
+    ----------
+    pixels : array_like, shape (k, 2)
+        Recorded pixels in the order of ``pattern.points()``; NaN where a corner is not to be used.
+    pattern : Chessboard
+    model : CameraModel
+    relief : array_like, shape (k,), optional
+        Heights of the corners along z of the board, metres.
+    start : RigidTransform, optional
+        Replaces the start pose of OpenCV's solver.
+
+    Returns
+    -------
+    T_camera_board : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of ``[w, v]`` (see :mod:`lrfcal_lib`), for the given intrinsics. The noise is taken from the residuals, and
+        widened where neighbouring residuals agree (a wavy sheet), because such errors do not average out.
+    used : ndarray of bool, shape (k,)
+        Without glaring corners.
+
+    Raises
+    ------
+    ValueError
+        With fewer than four corners, or when they do not determine a pose.
+    """
+    pixels, points = np.asarray(pixels, float), raised_points(pattern, relief)
+    if pixels.shape != (len(points), 2) or np.isfinite(pixels).all(axis=1).sum() < 4:
+        raise ValueError(f"a pose needs four or more of the pattern's {len(points)} corners, got shape {pixels.shape}")
+    start = first_pose(points, pixels, model) if start is None else start
+    start = RigidTransform.concatenate([start])
+    result = adjust_robust(pixels[None, None], points, [model], start, intrinsics=False)
+    residuals, factor = result.residuals[0, 0], max(1.0, SIGMA_FLOOR_PX / result.sigma_px) ** 2
+    # a smooth fit is worse by this factor because neighbouring residuals agree, AR(1) in x and y
+    grid = residuals.reshape(pattern.rows, pattern.columns, 2)
+    for axis in (0, 1):
+        a, b = (np.delete(grid, where, axis=axis) for where in (-1, 0))
+        rho = np.clip(np.nansum(a * b) / max(np.nansum((a**2 + b**2) / 2), 1e-300), 0.0, 0.8)
+        factor *= (1 + rho) / (1 - rho)
+    return result.poses[0], result.pose_covariance[0] * factor, np.isfinite(residuals).all(axis=1)
+
+
+def raised_points(pattern, relief=None):
+    """Corners of a pattern on a wavy sheet, board frame, metres; shape (k, 3)."""
+    return pattern.points() + (0.0 if relief is None else np.asarray(relief, float)[:, None] * UP)
+
+
+def stereo_transform(first, second, pattern, models, *, intrinsics=False, relief=False):
+    """Relative pose of two cameras from chessboard views, and how well it is known: an Adjustment.
+
+    `first` and `second` hold the corners (k, 2) by placement, in the same order in both cameras; ``.mounting[1]`` is
+    ``T_second_first``. `intrinsics` refines those of both cameras along, `relief` lets the sheet be wavy.
+    """
+    common = sorted(set(first) & set(second))
+    if not common:
+        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
+    pixels = np.array([[first[p] for p in common], [second[p] for p in common]])
+    poses = [
+        RigidTransform.concatenate([board_pose(p, pattern, m)[0] for p in views])
+        for views, m in zip(pixels, models, strict=True)
+    ]
+    between = poses[1] * poses[0].inv()
+    shift, turn = np.median(between.translation, axis=0), between.rotation.mean()
+    mounting = RigidTransform.concatenate([RigidTransform.identity(), RigidTransform.from_components(shift, turn)])
+    options = {"intrinsics": intrinsics, "relief": relief}
+    fixed = (8,) if all(m.distortion[4] == 0 for m in models) else ()
+    return adjust_robust(pixels, pattern.points(), models, poses[0], mounting, fixed=fixed, **options)

@@ -20,6 +20,7 @@ from lrfcal_lib.model.geometry import (
     hat,
     motion_words,
     move_pose,
+    pose_array,
     pose_transform,
     rotate_points,
 )
@@ -429,7 +430,7 @@ def estimate_with_intrinsics(residual, obs, pose, *, method, uses, required=True
             "refinement needs a printed pattern"
         )
     first = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
-    sets, pose = plane_sets(obs, 3 if required else 1), first.state
+    sets, pose = plane_sets(obs, 3 if required else 1), pose_array(first.transform)
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, first)
     triangles, offset, rest = correct_and_compress(sets, pose)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset

@@ -7,28 +7,28 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.least_squares import Block, solve
-from lrfcal_lib.fit.residuals import AXIS_COLUMNS as CHART
-from lrfcal_lib.fit.residuals import SIGMA_FLOOR, chart_parameters, move_head, prior_terms
+from lrfcal_lib.fit.least_squares import Block, name_words, solve
+from lrfcal_lib.fit.residuals import AXIS_COLUMNS, SIGMA_FLOOR, chart_parameters, move_head, pad
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
-    TiltAxis,
     axis_of,
     cross,
     fit_line,
     fit_plane,
+    hat,
     head_from_axis,
     lrf_to_platform,
     move_pose,
-    paper_parameters,
     pose_array,
     pose_transform,
     tilt,
 )
+from lrfcal_lib.model.observations import check_finite
 
-SIGMA_SKEW = np.radians(0.2)
-GAUGE = ("rotation about the tilt axis", "translation along the tilt axis")
+SIGMA_SKEW, SIGMA_GAP = np.radians(0.2), 0.002  # of boards: the right angle of the two edges, their distance (metres)
+LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is useless
+TINY = 1e-30  # of a complex step: derivatives without rounding
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,7 @@ class PlatformObservations:
     face_placement: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     def __post_init__(self):
-        for name in ("points", "covariance", "pitch", "face_points", "face_covariance", "face_pitch"):
-            bad = ~np.isfinite(getattr(self, name))
-            if bad.any():
-                raise ValueError(f"{name} holds {int(bad.sum())} values that are not finite: leave such points out")
+        check_finite(self)
         if not np.isin(self.edge, (1, 2)).all():
             raise ValueError(f"edge must be 1 or 2 (the two perpendicular edges), got {np.unique(self.edge)}")
 
@@ -74,51 +71,32 @@ class PlatformSolution:
 
     Attributes
     ----------
-    T_head_lrf : RigidTransform
-        In the gauge of :func:`lrfcal_lib.model.geometry.head_from_axis`.
-    axis : TiltAxis
-    phi, ty : ndarray, shape (3,), and float
-        The paper's parameters of the same axis. As ``ty -> 0``, phi_x loses its meaning.
-    covariance : ndarray, shape (4, 4)
-        Of ``(w_y, w_z, v_y, v_z)``, see the module; radians and metres. From the propagated noise.
-    covariance_placements : ndarray, shape (4, 4), or None
-        The same from the scatter over the placements; see :class:`lrfcal_lib.fit.result.Solution`.
-    unobservable : tuple of str
-        Motions that the data leave open. What no pitching data can show (`gauge`) is not counted.
-    gauge : tuple of str
-    skipped : dict of int to str
-        Placements left out, with the reason.
+    solution : Solution
+        Of the least squares problem; its four unknowns are ``(w_y, w_z, v_y, v_z)`` of T_head_lrf.
     placements : ndarray of int, shape (p,)
         Placements used.
     skew, gap : ndarray, shape (p,)
         Deviation of the two edges from a right angle (radians), and their distance (metres), at the solution.
-    solution : Solution
-        Of the least squares problem (residuals, Jacobian, cost history, ...).
+    skipped : dict of int to str
+        Placements left out, with the reason.
     """
 
-    T_head_lrf: RigidTransform
-    axis: TiltAxis
-    phi: np.ndarray
-    ty: float
-    covariance: np.ndarray
-    covariance_placements: np.ndarray | None
-    unobservable: tuple[str, ...]
-    gauge: tuple[str, ...]
-    skipped: dict[int, str]
+    solution: Solution
     placements: np.ndarray
     skew: np.ndarray
     gap: np.ndarray
-    solution: Solution
+    skipped: dict[int, str]
+
+    gauge = ("rotation about the tilt axis", "translation along the tilt axis")  # what no pitching data can show
 
     @property
-    def sigma_direction(self):
-        """Standard deviation of the direction, radians (root of the trace of its two angles)."""
-        return float(np.sqrt(np.trace(self.solution.trusted[:2, :2])))
+    def T_head_lrf(self):
+        """In the gauge of :func:`lrfcal_lib.model.geometry.head_from_axis`."""
+        return head_from_axis(self.axis)
 
     @property
-    def sigma_offset(self):
-        """Standard deviation of the offset, metres (root of the trace of its two components)."""
-        return float(np.sqrt(np.trace(self.solution.trusted[2:, 2:])))
+    def axis(self):
+        return axis_of(self.solution.transform)
 
     @property
     def converged(self):
@@ -128,46 +106,21 @@ class PlatformSolution:
         return f"PlatformSolution({self.solution.method}, {self.axis}, {len(self.placements)} placements)"
 
 
-def start_head(T0=None, prior=None):
-    """Start value of ``T_head_lrf``: given, or the prior's, or an axis through the LRF's origin along its x."""
-    start = T0 if T0 is not None else prior.T_head_lrf if prior is not None else RigidTransform.identity()
-    return head_from_axis(axis_of(start))
+def start_head(T0):
+    """Start value of ``T_head_lrf``: given, or an axis through the LRF's origin along its x."""
+    return head_from_axis(axis_of(RigidTransform.identity() if T0 is None else T0))
 
 
-def solve_platform(
-    obs,
-    T0=None,
-    prior=None,
-    *,
-    sigma_skew=SIGMA_SKEW,
-    sigma_gap=0.002,
-    sigma_pitch=0.0,
-    use_face=True,
-    loss=None,
-    scale=1.0,
-    max_iterations=100,
-    required=True,
-):
+def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
     """The tilt axis from 3D line fits, weighted by propagated noise.
 
     Parameters
     ----------
     obs : PlatformObservations
     T0 : RigidTransform, optional
-        Start value of ``T_head_lrf``; see :func:`start_head`.
-    prior : PlatformPrior, optional
-        A rough measurement that enters with its weight.
-    sigma_skew, sigma_gap : float
-        Tolerances of the board: right angle of the two edges (radians) and their distance (metres). The
-        perpendicularity and coplanarity of equations (13) and (14) are residuals with these weights.
+        Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
     sigma_pitch : float
         Standard deviation of a recorded pitch, radians.
-    use_face : bool
-        Also require the face points to lie in the plane of edge 1.
-    loss : {None, 'huber', 'cauchy'}
-        Robust loss for single points, with `scale` (standard deviations, or 'auto').
-    scale : float or 'auto'
-    max_iterations : int
     required : bool
         False: report unobservable motions instead of raising.
 
@@ -183,291 +136,172 @@ def solve_platform(
     Notes
     -----
     Equations (1) to (15) with total least squares lines instead of projected fits: every placement has a board of its
-    own (pose, skew, gap: 8 unknowns, eliminated by a Schur complement), an edge point has two distances from its edge.
-    A placement with one edge serves too when it has face points.
+    own (pose, skew, gap: 8 unknowns, eliminated by a Schur complement), an edge point has two distances from its edge,
+    a face point one from the plane. The perpendicularity and coplanarity of equations (13) and (14) are residuals with
+    the tolerances of the board. A placement with one edge serves too when it has face points.
     """
-    head = pose_array(start_head(T0, prior))
-    data, boards, skipped = prepare_boards(obs, pose_transform(head), use_face)
-    weights = (sigma_skew, sigma_gap, sigma_pitch)
-    options = dict(
-        names=AXIS_NAMES,
-        method="platform_3d",
-        read=lambda s: (pose_transform(s[0]), chart_parameters(s[0])),
-        shared=4,
-        loss=loss,
-        scale=scale,
-        max_iterations=max_iterations,
-        words=axis_words,
-        freedom=degrees_of_freedom(data, prior),
-        limit=0.5,
-        n_observations=int(data.used.sum() + data.face_used.sum()),
-    )
-
-    def evaluate(state):
-        return platform_blocks(state, data, weights, prior)
-
-    first = solve(evaluate, (head, boards, np.zeros((len(boards), 2))), move_platform, required=False, **options)
-    gauge = head_from_axis(axis_of(first.transform))
-    _, boards, _ = prepare_boards(obs, gauge, use_face)
-    state = (pose_array(gauge), boards, np.zeros((len(boards), 2)))
-    found = solve(evaluate, state, move_platform, required=required, earlier=[first.cost_history], **options)
-    first = 2 * data.used.shape[1] + data.face_used.shape[1]
-    skew, gap = (found.residuals[:, first : first + 2] * [sigma_skew, sigma_gap]).T
-    return platform_solution(found, data.placements, skew, gap, skipped)
+    gauge, earlier = start_head(T0), []
+    for final in (False, True):  # the second time in the gauge of the axis that was found
+        data, boards, skipped = prepare_boards(obs, gauge)
+        points, p = int(data.edge["used"].sum() + data.face["used"].sum()), len(boards)
+        found = solve(
+            lambda state, data=data: platform_blocks(state, data, sigma_pitch),
+            (pose_array(gauge), boards, np.zeros((p, 2))), move_platform, names=AXIS_NAMES, method="platform_3d",
+            read=lambda state: (pose_transform(state[0]), chart_parameters(state[0])), words=_words, shared=4,
+            freedom=points + int(data.edge["used"].sum()) + 2 * p - 4 - 8 * p, limit=0.5, max_iterations=100,
+            n_observations=points, required=required and final, earlier=earlier,
+        )  # fmt: skip
+        gauge, earlier = head_from_axis(axis_of(found.transform)), [found.cost_history]
+    skew, gap = found.state[2].T
+    return PlatformSolution(found, data.placements, skew, gap, skipped)
 
 
-def platform_solution(found, placements, skew, gap, skipped):
-    """Wrap a solved axis."""
-    T = head_from_axis(axis_of(found.transform))
-    phi, ty = paper_parameters(T)
-    return PlatformSolution(
-        T,
-        axis_of(T),
-        phi,
-        ty,
-        found.covariance,
-        found.covariance_placements,
-        found.unobservable,
-        GAUGE,
-        skipped,
-        placements,
-        skew,
-        gap,
-        found,
-    )
-
-
-def axis_words(direction):
+def _words(direction):
     """A combination of the four motions of the axis in words."""
-    large = [
-        words
-        for words, value in zip(AXIS_WORDS, direction, strict=True)
-        if abs(value) > 0.3 * np.max(np.abs(direction))
-    ]
-    return " with ".join(large)
+    return name_words(direction, AXIS_WORDS, 0.3)
 
 
 @dataclass(frozen=True)
-class PaddedBoards:
-    """Observations padded to the same number of points for every placement, and the start of each board."""
+class Boards:
+    """Observations padded by placement: `edge` and `face` with points, covariance, pitch, second, used.
+
+    `second` is 1 for points of edge 2, 0 for others; `lone` marks placements with one edge.
+    """
 
     placements: np.ndarray
-    points: np.ndarray
-    covariance: np.ndarray
-    pitch: np.ndarray
-    second: np.ndarray
-    used: np.ndarray
-    face: np.ndarray
-    face_covariance: np.ndarray
-    face_pitch: np.ndarray
-    face_used: np.ndarray
+    edge: dict
+    face: dict
     lone: np.ndarray
 
 
-def degrees_of_freedom(data, prior):
-    rows = 2 * data.used.sum() + data.face_used.sum() + 2 * len(data.placements) + (0 if prior is None else 4)
-    return int(rows) - 4 - 8 * len(data.placements)
+def prepare_boards(obs, T_head_lrf):
+    """Padded observations, a start board (x along edge 1, z its normal) of every placement, and why some are skipped.
 
-
-def prepare_boards(obs, T_head_lrf, use_face):
-    """Group and pad the observations, and fit a start board (x along edge 1, z its normal) to every placement."""
+    Boards are pose arrays (p, 3, 4), ``T_platform_board``.
+    """
     p_platform = lrf_to_platform(obs.points, obs.pitch, T_head_lrf)
     face_platform = lrf_to_platform(obs.face_points, obs.face_pitch, T_head_lrf)
-    kept, rows, faces, boards, skipped = [], [], [], [], {}
-    for placement in np.unique(obs.placement):
+    kept, boards, rows, faces, skipped = [], [], [], [], {}
+    for placement in np.unique(obs.placement).tolist():
         edges = [np.flatnonzero((obs.placement == placement) & (obs.edge == e)) for e in (1, 2)]
-        face = np.flatnonzero(obs.face_placement == placement) if use_face else np.zeros(0, int)
-        edges = sorted((e for e in edges if len(e) >= 2), key=lambda e: obs.edge[e[0]])
-        reason, board = _start_board([p_platform[e] for e in edges], face_platform[face])
-        if reason:
-            skipped[int(placement)] = reason
+        edges, face = [e for e in edges if len(e) >= 2], np.flatnonzero(obs.face_placement == placement)
+        try:
+            boards.append(_start_board([p_platform[e] for e in edges], face_platform[face]))
+        except DegenerateGeometry as error:
+            skipped[placement] = str(error)
             continue
-        kept.append(int(placement))
-        boards.append(board)
+        kept.append(placement)
         rows.append(edges)
         faces.append(face)
     if not kept:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    return _pad(obs, kept, rows, faces), np.array(boards), skipped
+    second = np.concatenate([np.repeat([0.0, 1.0][: len(edges)], [len(e) for e in edges]) for edges in rows])
+    edge = _padded(obs, "", [np.concatenate(edges) for edges in rows], second)
+    face = _padded(obs, "face_", faces, np.zeros(sum(map(len, faces))))
+    return Boards(np.array(kept), edge, face, np.array([len(e) == 1 for e in rows])), np.array(boards), skipped
+
+
+def _padded(obs, prefix, rows, second):
+    """Some rows of each placement, padded; with a floor of the noise, because no board is flat."""
+    every, place = np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    group = {name: getattr(obs, prefix + name)[every] for name in ("points", "covariance", "pitch")}
+    group = pad(group | {"second": second, "placement": place}, len(rows))
+    return group | {"covariance": group["covariance"] + SIGMA_FLOOR**2 * np.eye(3)}
 
 
 def _start_board(edges, face):
-    """Pose array of the board from its edge and face points in the platform frame, or the reason why not."""
+    """Pose array of the board from its edge and face points in the platform frame."""
     if not edges:
-        return "fewer than two points on either edge", None
+        raise DegenerateGeometry("fewer than two points on either edge")
     point, x, _ = fit_line(edges[0])
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
-        z = np.cross(x, second)
+        z, cosine, between = np.cross(x, second), x @ second, point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
-            return "the two edges are nearly parallel: edges 1 and 2 must be perpendicular", None
-        z /= np.linalg.norm(z)
-        point = point + x * _along(point, x, point2, second)
+            raise DegenerateGeometry("the two edges are nearly parallel: edges 1 and 2 must be perpendicular")
+        # the origin is where edge 1 comes nearest to edge 2
+        point = point + x * (between @ x - cosine * (between @ second)) / (1 - cosine**2)
     elif len(face) >= 3:
         normal = fit_plane(face)[0]
         z = normal - x * (x @ normal)
-        z /= np.linalg.norm(z)
     else:
-        return "only one edge, and no points on the face", None
-    return "", np.column_stack([x, np.cross(z, x), z, point])
+        raise DegenerateGeometry("only one edge, and no points on the face")
+    z /= np.linalg.norm(z)
+    return np.column_stack([x, np.cross(z, x), z, point])
 
 
-def _along(point, direction, point2, direction2):
-    """How far along the first line it comes nearest to the second."""
-    c, between = direction @ direction2, point2 - point
-    return (between @ direction - c * (between @ direction2)) / (1 - c * c)
-
-
-def _pad(obs, placements, rows, faces):
-    index, used = _padded([np.concatenate(r) for r in rows])
-    second, _ = _padded([np.concatenate([np.full(len(e), i) for i, e in enumerate(r)]) for r in rows])
-    face, face_used = _padded(faces)
-    covariance, floor = obs.covariance, SIGMA_FLOOR**2 * np.eye(3)
-    empty = len(obs.face_points) == 0
-    face_points = np.zeros((1, 3)) if empty else obs.face_points
-    face_covariance = np.zeros((1, 3, 3)) if empty else obs.face_covariance
-    face_pitch = np.zeros(1) if empty else obs.face_pitch
-    lone = np.array([len(r) == 1 for r in rows])
-    return PaddedBoards(
-        np.array(placements),
-        obs.points[index],
-        covariance[index] + floor,
-        obs.pitch[index],
-        second.astype(float),
-        used,
-        face_points[face],
-        face_covariance[face] + floor,
-        face_pitch[face],
-        face_used,
-        lone,
-    )
-
-
-def _padded(rows):
-    """Indices of ragged rows as a rectangle (zeros behind), and which of them count."""
-    width = max(1, max(len(r) for r in rows))
-    index, used = np.zeros((len(rows), width), int), np.zeros((len(rows), width), bool)
-    for i, r in enumerate(rows):
-        index[i, : len(r)], used[i, : len(r)] = r, True
-    return index, used
-
-
-def platform_blocks(state, data, weights, prior):
-    """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
-    head, boards, bends = state
-    sigma_skew, sigma_gap, sigma_pitch = weights
-    skew, gap = bends[:, 0], bends[:, 1]
-    blocks = [_edge_block(head, boards, skew, gap, data, sigma_pitch), _face_block(head, boards, data, sigma_pitch)]
-    p = len(boards)
-    board_rows = np.zeros((p, 2, 12))
-    board_rows[:, 0, 10] = board_rows[:, 1, 11] = 1.0
-    blocks.append(Block(bends, board_rows, np.broadcast_to([1 / sigma_skew, 1 / sigma_gap], (p, 2))))
-    blocks.append(_lone_block(head, boards, data))
-    if prior is not None:
-        blocks.append(_prior_block(head, prior, p))
-    return blocks
-
-
-def _rows(head, boards, points, pitch, gradient):
-    """Jacobian rows by the axis chart (4) and the board's pose (6), and the gradient by the LRF point.
-
-    `gradient` (p, n, 3) is that of a scalar by the board coordinates of the point.
-    """
+def board_coordinates(head, boards, points, pitch):
+    """Board coordinates (p, n, 3) of LRF points; Jacobians by axis 4 and board's pose 6, by LRF point 3, by pitch."""
     rotated = points @ head[:, :3].T
     q = tilt(rotated + head[:, 3], pitch)
-    by_platform = gradient @ np.swapaxes(boards[:, :, :3], -1, -2)
-    by_head = tilt(by_platform, -pitch)
-    axis = np.concatenate([cross(rotated, by_head), by_head], axis=-1)[..., CHART]
-    board = np.concatenate([cross(by_platform, q - boards[:, None, :, 3]), -by_platform], axis=-1)
-    by_pitch = by_platform[..., 2] * q[..., 1] - by_platform[..., 1] * q[..., 2]
-    return np.concatenate([axis, board], axis=-1), by_head @ head[:, :3], by_pitch
+    lever, to_board = q - boards[:, None, :, 3], np.swapaxes(boards[:, None, :, :3], -1, -2)
+    turned = to_board @ np.swapaxes(tilt(np.eye(3), pitch[..., None]), -1, -2)  # B^T Rx(pitch)
+    eye = np.broadcast_to(np.eye(3), turned.shape)
+    axis = (turned @ np.concatenate([-hat(rotated), eye], axis=-1))[..., AXIS_COLUMNS]
+    board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
+    by_pitch = (to_board @ cross(np.array([1.0, 0.0, 0.0]), q)[..., None])[..., 0]
+    return lever @ boards[:, :, :3], np.concatenate([axis, board], axis=-1), turned @ head[:, :3], by_pitch
 
 
-def _board_coordinates(head, boards, points, pitch):
-    q = tilt(points @ head[:, :3].T + head[:, 3], pitch)
-    return (q - boards[:, None, :, 3]) @ boards[:, :, :3]
+def distances(state, group):
+    """Distances of points from their edge, in the board's plane and across it, (p, n, 2), and their Jacobians.
+
+    Edge 1 lies along x of the board, edge 2 along y but for the skew and the gap. The second distance serves for points
+    on the face, too.
+    """
+    head, boards, bends = state
+    b, J, by_point, by_pitch = board_coordinates(head, boards, group["points"], group["pitch"])
+    second, skew, gap = group["second"], bends[:, :1], bends[:, 1:]
+    c, s = second * np.cos(skew), second * np.sin(skew)
+    inside = np.stack([c, 1 - second + s, 0 * c], axis=-1)
+    normals = np.stack([inside, np.broadcast_to([0.0, 0.0, 1.0], inside.shape)], axis=-2)
+    r = (normals @ b[..., None])[..., 0] - np.stack([0 * second, second * gap], axis=-1)
+    bend = np.zeros(r.shape + (2,))
+    bend[..., 0, 0], bend[..., 1, 1] = c * b[..., 1] - s * b[..., 0], -second
+    by_pitch = (normals @ by_pitch[..., None])[..., 0]
+    return r, np.concatenate([normals @ J, bend], axis=-1), normals @ by_point, by_pitch
 
 
-def _edge_block(head, boards, skew, gap, data, sigma_pitch):
-    """Two distances of an edge point from its edge, in the board's plane and across it."""
-    b = _board_coordinates(head, boards, data.points, data.pitch)
-    inside = _inside(skew, data.second)
-    r = np.stack([np.sum(inside * b, axis=-1), b[..., 2] - data.second * gap[:, None]], axis=-1)
-    J, by_point, by_pitch = _edge_rows(head, boards, skew, data.points, data.pitch, data.second)
-    by_pitch = by_pitch * sigma_pitch
-    noise = by_point @ data.covariance @ np.swapaxes(by_point, -1, -2) + by_pitch[..., :, None] * by_pitch[..., None, :]
+def distance_block(state, group, sigma_pitch, which):
+    """Some of the :func:`distances` of a group's points, whitened by the noise of points and pitch."""
+    r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
+    pull = group["covariance"] @ np.swapaxes(by_point, -1, -2)
+    by_pitch = sigma_pitch * by_pitch
+    noise = by_point @ pull + by_pitch[..., :, None] * by_pitch[..., None, :]
     force = np.linalg.solve(noise, r[..., None])
-    points = data.points - (data.covariance @ np.swapaxes(by_point, -1, -2) @ force)[..., 0]
-    pitch = data.pitch - sigma_pitch * np.sum(by_pitch * force[..., 0], axis=-1)
-    corrected = _edge_rows(head, boards, skew, points, pitch, data.second)[0]
-    whitener = np.linalg.inv(np.linalg.cholesky(noise)) * data.used[..., None, None]
-    p = len(boards)
+    points = group["points"] - (pull @ force)[..., 0]
+    pitch = group["pitch"] - sigma_pitch * np.sum(by_pitch * force[..., 0], axis=-1)
+    corrected = distances(state, group | {"points": points, "pitch": pitch})[1][:, :, which]
+    whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
+    p = len(r)
     return Block(r.reshape(p, -1), J.reshape(p, -1, 12), whitener, corrected=corrected.reshape(p, -1, 12))
 
 
-def _inside(skew, second):
-    """Normals, in the board's plane, of the edge of each point (edge 1 along x, edge 2 along y but for the skew)."""
-    c, s = np.cos(skew)[:, None], np.sin(skew)[:, None]
-    return np.stack([second * c, 1 - second + second * s, 0 * second], axis=-1)
-
-
-def _edge_rows(head, boards, skew, points, pitch, second):
-    """Jacobian (p, n, 2, 12) of the two distances, and their gradients by the LRF point and the pitch."""
-    inside = _inside(skew, second)
-    pairs = [_rows(head, boards, points, pitch, g) for g in (inside, np.broadcast_to([0.0, 0.0, 1.0], inside.shape))]
-    rows, by_point, by_pitch = (np.stack([pair[i] for pair in pairs], axis=2) for i in range(3))
-    b = _board_coordinates(head, boards, points, pitch)
-    bend = np.zeros(rows.shape[:-1] + (2,))
-    c, s = np.cos(skew)[:, None], np.sin(skew)[:, None]
-    bend[..., 0, 0] = second * (c * b[..., 1] - s * b[..., 0])
-    bend[..., 1, 1] = -second
-    return np.concatenate([rows, bend], axis=-1), by_point, by_pitch
-
-
-def _face_block(head, boards, data, sigma_pitch):
-    """Distances of face points from the board's plane."""
-    r = _board_coordinates(head, boards, data.face, data.face_pitch)[..., 2]
-    up = np.broadcast_to([0.0, 0.0, 1.0], data.face.shape)
-    rows, by_point, by_pitch = _rows(head, boards, data.face, data.face_pitch, up)
-    pull = (by_point[..., None, :] @ data.face_covariance)[..., 0, :]
-    variance = np.sum(pull * by_point, axis=-1) + (by_pitch * sigma_pitch) ** 2
-    force = r / variance
-    pitch = data.face_pitch - sigma_pitch**2 * by_pitch * force
-    corrected = _rows(head, boards, data.face - pull * force[..., None], pitch, up)[0]
-    bend = np.zeros(rows.shape[:-1] + (2,))
-    jacobian, corrected = (np.concatenate([x, bend], axis=-1) for x in (rows, corrected))
-    return Block(r, jacobian, data.face_used / np.sqrt(variance), corrected=corrected)
-
-
-def _lone_block(head, boards, data):
-    """A board seen with one edge may slide along it: its origin is held at the middle of that edge's points."""
-    count = np.maximum(data.used.sum(axis=1), 1)[:, None]
-    b = _board_coordinates(head, boards, data.points, data.pitch)
-    rows, _, _ = _rows(head, boards, data.points, data.pitch, np.broadcast_to([1.0, 0.0, 0.0], b.shape))
-    mean = np.sum(b[..., 0] * data.used, axis=1, keepdims=True) / count
-    slope = np.sum(rows * data.used[..., None], axis=1, keepdims=True) / count[..., None]
-    jacobian = np.concatenate([slope, np.zeros(slope.shape[:-1] + (2,))], axis=-1)
-    return Block(mean, jacobian, data.lone[:, None] * 100.0)
-
-
-def _prior_block(head, prior, p):
-    """The prior counts once: every placement holds a part, so that leaving one out (the scatter) keeps the rest."""
-    r, J = prior_terms(head, prior)
-    jacobian = np.zeros((p, 4, 12))
-    jacobian[..., :4] = J
-    weights = np.repeat([1 / prior.sigma_direction, 1 / prior.sigma_offset], 2) / np.sqrt(p)
-    return Block(np.tile(r, (p, 1)), jacobian, np.tile(weights, (p, 1)))
+def platform_blocks(state, data, sigma_pitch):
+    """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
+    head, boards, bends = state
+    p, used = len(boards), data.edge["used"][..., None]
+    tolerance = np.zeros((p, 2, 12))
+    tolerance[:, 0, 10] = tolerance[:, 1, 11] = 1.0
+    # a board seen with one edge may slide along it: its origin is held at the middle of that edge's points
+    b, J, _, _ = board_coordinates(head, boards, data.edge["points"], data.edge["pitch"])
+    along = np.concatenate([b[..., :1], J[..., 0, :]], axis=-1) * used
+    middle = np.sum(along, axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
+    return [
+        distance_block(state, data.edge, sigma_pitch, slice(0, 2)),
+        distance_block(state, data.face, sigma_pitch, slice(1, 2)),
+        Block(bends, tolerance, np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))),
+        Block(middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), data.lone[:, None] * 100.0),
+    ]
 
 
 def move_platform(state, step):
+    """Retraction of axis, boards, and their skew and gap."""
     common, own = step
     return move_head(state[0], common), move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
 
 
-LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is useless
-
-
-def solve_projected(obs, T0=None, *, least_slope=LEAST_SLOPE, max_iterations=100, required=True):
+def solve_projected(obs, T0=None, *, required=True):
     """The tilt axis by the paper's projected line fits.
 
     Parameters
@@ -475,10 +309,7 @@ def solve_projected(obs, T0=None, *, least_slope=LEAST_SLOPE, max_iterations=100
     obs : PlatformObservations
         Its edge points are used, without their covariance.
     T0 : RigidTransform, optional
-        Start value of ``T_head_lrf``; see :func:`lrfcal_lib.solvers.platform.start_head`.
-    least_slope : float
-        A placement is left out when an edge is nearer than this (radians) to the xy or the xz plane of the platform.
-    max_iterations : int
+        Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
     required : bool
         False: report unobservable motions instead of raising.
 
@@ -501,137 +332,87 @@ def solve_projected(obs, T0=None, *, least_slope=LEAST_SLOPE, max_iterations=100
     and (10) grow beyond bounds for level edges) and the gap D in metres. These have different units and no weights: the
     result depends on that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
-    head = pose_array(start_head(T0))
-    groups, skipped = _usable(obs, head, least_slope)
+    gauge = start_head(T0)
+    groups, skipped = _slanted(obs, lrf_to_platform(obs.points, obs.pitch, gauge))
     if not groups:
         raise DegenerateGeometry(f"projected fits: no placement can be used: {skipped}; use the 3D fits instead")
-    rows = np.concatenate([np.full(2 * (len(a) + len(b)) + 2, placement) for placement, a, b in groups])
-    options = dict(
-        names=AXIS_NAMES, method="platform_projected", words=axis_words, groups=rows, limit=np.inf, required=required,
-        read=lambda state: (pose_transform(state), chart_parameters(state)), max_iterations=max_iterations,
-    )  # fmt: skip
-    first = solve(lambda state: projected_block(state, obs, groups), head, move_head, **options)
-    gauge = pose_array(head_from_axis(axis_of(first.transform)))
-    count = len(first.residuals)
-    scatter = max(np.sqrt(np.sum(first.residuals**2) / max(count - 4, 1)), 1e-6)
-    found = solve(
-        lambda state: _scaled(projected_block(state, obs, groups), scatter), gauge, move_head,
-        earlier=[first.cost_history], **options,
-    )  # fmt: skip
-    placements = np.array([g[0] for g in groups])
-    skew, gap = _properties(found, groups, scatter)
-    return platform_solution(found, placements, skew, gap, skipped)
+    rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
+
+    def solved(head, scatter, **earlier):
+        return solve(
+            lambda head: projected_block(head, obs, groups.values(), scatter), pose_array(head), move_head,
+            names=AXIS_NAMES, method="platform_projected", words=_words, groups=np.repeat(list(groups), rows),
+            read=lambda head: (pose_transform(head), chart_parameters(head)), limit=np.inf, required=required,
+            max_iterations=100, **earlier,
+        )  # fmt: skip
+
+    first = solved(gauge, 1.0)
+    scatter = max(np.sqrt(np.sum(first.residuals**2) / max(len(first.residuals) - 4, 1)), 1e-6)
+    found = solved(head_from_axis(axis_of(first.transform)), scatter, earlier=[first.cost_history])
+    cosine, gap = scatter * found.residuals[np.cumsum(rows) - [[2], [1]]]  # the last two of every placement
+    return PlatformSolution(found, np.array(list(groups)), np.arcsin(np.clip(cosine, -1, 1)), gap, skipped)
 
 
-def _scaled(block, scatter):
-    return Block(block.residuals, block.jacobian, np.full_like(block.residuals, 1.0 / scatter))
-
-
-def _properties(found, groups, scatter):
-    """Cosine of the two edges and their gap, the last two residuals of every placement."""
-    ends = np.cumsum([2 * (len(a) + len(b)) + 2 for _, a, b in groups])
-    residuals = found.residuals * scatter
-    return np.arcsin(np.clip(residuals[ends - 2], -1, 1)), residuals[ends - 1]
-
-
-def _usable(obs, head, least_slope):
-    """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate planes; reasons."""
-    q = tilt(obs.points @ head[:, :3].T + head[:, 3], obs.pitch)
-    groups, skipped = [], {}
-    for placement in np.unique(obs.placement):
-        rows = [np.flatnonzero((obs.placement == placement) & (obs.edge == e)) for e in (1, 2)]
-        reason = ""
-        for number, r in enumerate(rows, start=1):
-            if len(r) < 3:
-                reason = reason or f"edge {number} has {len(r)} points, at least 3 needed"
+def _slanted(obs, p_platform):
+    """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate planes, and why not others."""
+    groups, skipped = {}, {}
+    for placement in np.unique(obs.placement).tolist():
+        groups[placement] = [np.flatnonzero((obs.placement == placement) & (obs.edge == e)) for e in (1, 2)]
+        reasons = []
+        for number, rows in enumerate(groups[placement], start=1):
+            if len(rows) < 3:
+                reasons.append(f"edge {number} has {len(rows)} points, at least 3 needed")
                 continue
-            direction = np.abs(fit_line(q[r])[1])
-            for axis, plane in ((2, "xy"), (1, "xz")):
-                if direction[axis] < least_slope:
-                    reason = (
-                        reason or f"edge {number} is parallel to the {plane} plane: its projected fits divide by zero"
-                    )
-        if reason:
-            skipped[int(placement)] = reason
-        else:
-            groups.append((int(placement), *rows))
+            direction = np.abs(fit_line(p_platform[rows])[1])
+            level = [plane for axis, plane in ((2, "xy"), (1, "xz")) if direction[axis] < LEAST_SLOPE]
+            reasons += [f"edge {number} is parallel to the {p} plane: its projected fits divide by zero" for p in level]
+        if reasons:
+            skipped[placement] = reasons[0]
+            del groups[placement]
     return groups, skipped
 
 
-def projected_block(head, obs, groups):
-    """The six terms of equation (15) of every placement, with their analytic Jacobian by the axis chart.
+def projected_block(head, obs, groups, scatter=1.0):
+    """The six terms of equation (15) of every placement (rows of edge 1, rows of edge 2) over their common scatter.
 
-    Parameters
-    ----------
-    head : ndarray, shape (3, 4)
-        ``T_head_lrf``.
-    obs : PlatformObservations
-    groups : list of (placement, rows of edge 1, rows of edge 2)
-
-    Returns
-    -------
-    Block
+    The Jacobian by the axis chart comes from complex steps, exact but for rounding.
     """
     rotated = obs.points @ head[:, :3].T
-    q = tilt(rotated + head[:, 3], obs.pitch)
-    slopes = np.stack([_coordinate_slope(rotated, obs.pitch, axis) for axis in range(3)], axis=1)
-    parts = [_placement_terms(q, slopes, a, b) for _, a, b in groups]
-    residuals, jacobian = (np.concatenate([part[i] for part in parts]) for i in range(2))
-    return Block(residuals, jacobian, np.ones_like(residuals))
+    by_axis = np.concatenate([-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1)
+    by_axis = np.moveaxis(by_axis[..., AXIS_COLUMNS], -1, 0)
+    q = tilt(rotated + head[:, 3], obs.pitch) + TINY * 1j * tilt(by_axis, obs.pitch)
+    terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1) / scatter
+    return Block(terms[0].real, terms.imag.T / TINY, np.ones(terms.shape[1]))
 
 
-def _coordinate_slope(rotated, pitch, axis):
-    """Derivative (n, 4) of a platform coordinate of every point by the axis chart."""
-    gradient = tilt(np.broadcast_to(np.eye(3)[axis], rotated.shape), -pitch)
-    return np.concatenate([cross(rotated, gradient), gradient], axis=1)[:, CHART]
+def _six_terms(first, second):
+    """Errors of the four projected fits, ``u1 . u2``, and the gap D of equation (14) of one placement, (4, m)."""
+    (errors1, u1, p1), (errors2, u2, p2) = (_projected_line(q) for q in (first, second))
+    normal = cross(u1, u2)
+    gap = _dot(normal, p1 - p2) / np.sqrt(_dot(normal, normal))
+    return np.concatenate([errors1, errors2, _dot(u1, u2), gap], axis=-1)
 
 
-def _placement_terms(q, slopes, first, second):
-    """Residuals (2 n1 + 2 n2 + 2,) of one placement and their Jacobian."""
-    lines = [_projected_line(q[rows], slopes[rows]) for rows in (first, second)]
-    (u1, du1, p1, dp1), (u2, du2, p2, dp2) = (line[2:] for line in lines)
-    normal = np.cross(u1, u2)
-    dnormal = np.cross(du1.T, u2) + np.cross(u1, du2.T)
-    length, between = np.linalg.norm(normal), p1 - p2
-    gap = normal @ between / length
-    dgap = (dnormal @ between + (dp1 - dp2).T @ normal) / length - gap * (dnormal @ normal) / length**2
-    residuals = [lines[0][0], lines[1][0], [u1 @ u2, gap]]
-    jacobian = [lines[0][1], lines[1][1], np.stack([u2 @ du1 + u1 @ du2, dgap])]
-    return np.concatenate(residuals), np.concatenate(jacobian)
+def _projected_line(q):
+    """Fit ``x = a z + b`` and ``z = c y + d`` (equations (7), (8)) to the points (4, n, 3) of one edge.
 
-
-def _projected_line(q, slopes):
-    """Fit ``x = a z + b`` and ``z = c y + d`` (equations (7), (8)) to one edge.
-
-    Returns
-    -------
-    errors : ndarray, shape (2 n,)
-        Over the root of n.
-    jacobian : ndarray, shape (2 n, 4)
-    direction, its jacobian (3, 4), point, its jacobian (3, 4)
-        Equations (9) to (12): ``u ~ (a, 1 / c, 1)`` as a unit vector and ``p = (b, -d / c, 0)``.
+    Returns the errors (4, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~ (a, 1 / c, 1)`` as
+    a unit vector and the point ``p = (b, -d / c, 0)``.
     """
-    x, y, z = q.T
-    dx, dy, dz = (slopes[:, i] for i in range(3))
-    e1, de1, a, da, b, db = _regression(z, dz, x, dx)
-    e2, de2, c, dc, d, dd = _regression(y, dy, z, dz)
-    root = np.sqrt(len(q))
-    raw, draw = np.array([a, 1 / c, 1.0]), np.stack([da, -dc / c**2, 0 * da])
-    length = np.linalg.norm(raw)
-    u = raw / length
-    du = (draw - np.outer(u, u @ draw)) / length
-    point, dpoint = np.array([b, -d / c, 0.0]), np.stack([db, -dd / c + d * dc / c**2, 0 * da])
-    return np.concatenate([e1, e2]) / root, np.concatenate([de1, de2]) / root, u, du, point, dpoint
+    x, y, z = np.moveaxis(q, -1, 0)
+    (e1, a, b), (e2, c, d) = _regression(z, x), _regression(y, z)
+    u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
+    errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
+    return errors, u / np.sqrt(_dot(u, u)), np.concatenate([b, -d / c, 0 * b], axis=-1)
 
 
-def _regression(s, ds, v, dv):
-    """Errors, slope and offset of the straight-line fit ``v = slope s + offset``, each with its derivative."""
-    sc, dsc, vc, dvc = (w - w.mean(axis=0) for w in (s, ds, v, dv))
-    total = sc @ sc
-    slope = sc @ vc / total
-    errors = vc - slope * sc
-    dslope = (dsc.T @ errors + (dvc - slope * dsc).T @ sc) / total
-    derrors = dvc - slope * dsc - np.outer(sc, dslope)
-    offset = v.mean() - slope * s.mean()
-    doffset = dv.mean(axis=0) - slope * ds.mean(axis=0) - dslope * s.mean()
-    return errors, derrors, slope, dslope, offset, doffset
+def _regression(s, v):
+    """Errors, slope and offset of the straight-line fit ``v = slope s + offset``."""
+    s_mean, v_mean = (w.mean(axis=-1, keepdims=True) for w in (s, v))
+    slope = _dot(s - s_mean, v - v_mean) / _dot(s - s_mean, s - s_mean)
+    return v - v_mean - slope * (s - s_mean), slope, v_mean - slope * s_mean
+
+
+def _dot(a, b):
+    """Scalar product along the last axis, without conjugation."""
+    return np.sum(a * b, axis=-1, keepdims=True)
