@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lrfcal_lib.calibrate.outline import cells_of, named_sides, outline_of, platform_of
+from lrfcal_lib.calibrate.outline import as_recorded, cells_of, named_sides, outline_of, platform_of
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_source, tilt
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
@@ -28,34 +28,21 @@ NAME_DISTANCE = 0.08  # metres between a side in the cloud and the board edge it
 NAME_ANGLE = np.deg2rad(3.0)  # between them; a side turned more is none (a cloud cut by hand, an occluder)
 RIGHT_ANGLE = 0.15  # largest |cosine| between two sides that are taken for the board's perpendicular edges
 
-# tables without rows: what the columns of observations hold
+# tables without rows
 NUMBER, WHOLE = np.zeros(0), np.zeros(0, int)
-POINTS = {"points": np.zeros((0, 3)), "covariance": np.zeros((0, 3, 3)), "placement": WHOLE}
-CROSSINGS = POINTS | {
-    "lines": np.zeros((0, 3)), "line_sigma": NUMBER, "edge": np.zeros(0, object), "across": np.zeros(0, bool),
-    "half_step": np.zeros((0, 3)), "noise": np.zeros((0, 3, 3)), "radius": NUMBER, "background": NUMBER,
-}  # fmt: skip
-CORNERS = POINTS | {"pixels": np.zeros((0, 2)), "sigma_px": NUMBER}
-RANGES = {"range": NUMBER, "bearing": NUMBER, "pitch": NUMBER, "sigma": NUMBER, "placement": WHOLE}
-BEAMS = {
-    "bearing": NUMBER, "pitch": NUMBER, "hit": np.zeros(0, bool), "edge": WHOLE, "radius": NUMBER,
-    "background": NUMBER, "step": NUMBER, "placement": WHOLE,
-}  # fmt: skip
-VIEWS = {
-    "camera": WHOLE, "pitch": NUMBER, "pose": np.zeros((0, 4, 4)), "covariance": np.zeros((0, 6, 6)),
-    "placement": WHOLE, "lens": np.zeros((0, 6, 9)),
-}  # fmt: skip
+RANGES = dict.fromkeys(("range", "bearing", "pitch", "sigma"), NUMBER) | {"placement": WHOLE}
+BEAMS = dict.fromkeys(("bearing", "pitch", "radius", "background", "step"), NUMBER)
+BEAMS |= {"hit": np.zeros(0, bool), "edge": WHOLE, "placement": WHOLE}
+VIEWS = {"camera": WHOLE, "pitch": NUMBER, "pose": np.zeros((0, 4, 4)), "covariance": np.zeros((0, 6, 6))}
+VIEWS |= {"placement": WHOLE, "lens": np.zeros((0, 6, 9))}
+EDGES = {"points": np.zeros((0, 3)), "covariance": np.zeros((0, 3, 3)), "pitch": NUMBER}
+EDGES |= {"placement": WHOLE, "edge": WHOLE}
 
 
-def stack(prefix, columns, parts):
-    """Parts of a table end to end: its columns by name, with a prefix."""
-    parts = list(parts)
-    return {prefix + key: np.concatenate([none, *(part[key] for part in parts)]) for key, none in columns.items()}
-
-
-def as_recorded(placement, p_lrf, pitch):
-    """Corrects nothing."""
-    return p_lrf, np.asarray(pitch)
+def stack(prefix, parts, nothing=()):
+    """Parts of a table end to end: its columns by name, with a prefix; `nothing` is one without rows."""
+    parts = list(parts) or [nothing]
+    return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
 def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE):
@@ -108,9 +95,9 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
         pattern_points=pattern,
         pattern_pixels=np.array(pixels).reshape(n, k, 2),
         pattern_sigma_px=max(model.rms_px or 0.0, 0.05),
-        **stack("plane_", POINTS, planes),
-        **stack("crossing_", CROSSINGS, crossed),
-        **stack("scene_", CORNERS, _corners(prepared, camera, variant, T_head_lrf)),
+        **stack("plane_", planes),
+        **stack("crossing_", crossed),
+        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf)),
     )
 
 
@@ -213,8 +200,7 @@ def platform_observations(prepared, variant="half_step"):
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
-    columns = POINTS | {"pitch": NUMBER}
-    return PlatformObservations(**stack("", columns | {"edge": WHOLE}, edges), **stack("face_", columns, faces))
+    return PlatformObservations(**stack("", edges, EDGES), **stack("face_", faces))
 
 
 def _perpendicular(along, swept):
@@ -376,9 +362,9 @@ def observe_joint(prepared, views=None):
         mounts=tuple(session.cameras[c].mount for c in views),
         T_head_lrf=session.T_head_lrf,
         lens_covariance=np.array([np.zeros((9, 9)) if C is None else C for C in spreads]) if views else None,
-        **stack("face_", RANGES, map(_ranges, scans.values(), range(len(scans)))),
-        **stack("beam_", BEAMS, _beams(prepared, scans)),
-        **stack("view_", VIEWS, _views(prepared, views, list(scans))),
+        **stack("face_", map(_ranges, scans.values(), range(len(scans))), RANGES),
+        **stack("beam_", _beams(prepared, scans), BEAMS),
+        **stack("view_", _views(prepared, views, list(scans)), VIEWS),
     )
 
 

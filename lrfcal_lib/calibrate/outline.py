@@ -12,16 +12,9 @@ from scipy.stats import f as f_distribution
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.residuals import beam_terms, edge_shift, flip_sigma, pad
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    fit_line,
-    fit_plane,
-    hat,
-    lrf_to_platform,
-    polar_to_points,
-    tilt,
-)
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_platform, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_scan import edge_cells
 
@@ -31,6 +24,11 @@ FEWEST_CELLS = 8
 ROUNDS = 40
 FAR = np.diag([1e2, 1.0])  # information of a side that no beam tells anything about: a metre and a radian are far
 ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
+
+
+def as_recorded(placement, p_lrf, pitch):
+    """Corrects nothing."""
+    return p_lrf, np.asarray(pitch)
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class EdgeModel:
     range_offset, range_offset_sigma : float
         Recorded minus true range, metres.
     T_head_lrf : RigidTransform
-    correct : callable, optional
+    correct : callable
         ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to
         points is not used, `range_offset` is.
     """
@@ -61,11 +59,7 @@ class EdgeModel:
     range_offset: float = 0.0
     range_offset_sigma: float = 0.0
     T_head_lrf: RigidTransform = field(default_factory=RigidTransform.identity)
-    correct: Callable | None = None
-
-    def pitch(self, placement, p_lrf, pitch):
-        """Recorded pitch without its known errors, radians."""
-        return pitch if self.correct is None else self.correct(placement, p_lrf, pitch)[1]
+    correct: Callable = as_recorded
 
 
 @dataclass(frozen=True)
@@ -102,9 +96,9 @@ class MeasuredBoard:
 
 def plane_frame(points):
     """A frame in the plane of some points, shape (4, 4): origin in their middle, z towards the origin of the points."""
-    normal, distance, _ = fit_plane(points)
+    normal, distance, _ = geometry.fit_plane(points)
     normal, distance = (-normal, -distance) if distance > 0 else (normal, distance)
-    across = np.linalg.svd(hat(normal))[2][0]
+    across = np.linalg.svd(geometry.hat(normal))[2][0]
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2] = across, np.cross(normal, across), normal
     centre = np.nanmean(points, axis=0)
@@ -238,10 +232,10 @@ def likely_outline_of(prepared, placement, model):
     """
     sides = list(named_sides(prepared, placement, stretch=LEAST_STRETCH))
     points, pitch, _ = face_points(prepared.scans[placement])
-    face = points, model.pitch(placement, points, pitch), prepared.scans[placement].sigma_range
+    face = points, model.correct(placement, points, pitch)[1], prepared.scans[placement].sigma_range
     cells = cells_of(prepared, placement)
     on_board = polar_to_points(cells.range_m, cells.bearing)
-    cells = replace(cells, pitch=model.pitch(placement, on_board, cells.pitch))
+    cells = replace(cells, pitch=model.correct(placement, on_board, cells.pitch)[1])
     names = {side: name for name, _, side, _ in sides}
     measured = measure_outline(cells, face, names, prepared.board.edges, model)
     return measured, frozenset(name for name, _, _, swept in sides if swept)

@@ -7,16 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.calibrate import reconstruct
-from lrfcal_lib.calibrate.observe import (
-    FACE_POINTS,
-    as_recorded,
-    name_sides,
-    observe,
-    observe_all,
-    observe_joint,
-    platform_observations,
-)
-from lrfcal_lib.calibrate.outline import EdgeModel, platform_of
+from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
+from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded, platform_of
 from lrfcal_lib.fit.residuals import chart_parameters, edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -31,6 +23,7 @@ from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
 from lrfcal_lib.solvers.platform import solve_platform, solve_projected
 
 LAPSE = 0.01  # share of beams about an edge that something else than the edge decides
+PITCH_POINTS = 300  # of a placement's face, for the errors of its pitch
 LEAST_SIDES = 8  # of all placements, for a spread of the edge bias from side to side
 
 
@@ -226,7 +219,7 @@ def find_pitch_errors(prepared):
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
     if not fixed or not scans:
         return None
-    faces = [face_points(scan, 2 * FACE_POINTS)[:2] for scan in scans.values()]
+    faces = [face_points(scan, PITCH_POINTS)[:2] for scan in scans.values()]
     points, pitch = (np.concatenate(parts) for parts in zip(*faces, strict=True))
     number = np.repeat(list(scans), [len(pitch) for _, pitch in faces])
     direction = {placement: session.sweep_direction(placement) for placement in scans}
@@ -323,14 +316,15 @@ def axis_from_chart(parameters):
     return geometry.TiltAxis(direction, np.array([-(direction[1] * y + direction[2] * z) / direction[0], y, z]))
 
 
-def calibrate_cameras(observations, methods=tuple(METHODS)):
+def calibrate_cameras(observations, methods=METHODS):
     """Calibrate every camera by every method.
 
     Parameters
     ----------
     observations : dict of (str, str) to CameraObservations
         Of :func:`observe_all`.
-    methods : sequence of str
+    methods : iterable of str
+        Of :data:`lrfcal_lib.solvers.METHODS`.
 
     Returns
     -------
