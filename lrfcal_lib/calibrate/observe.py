@@ -178,18 +178,9 @@ def _corners(prepared, camera, variant, T_head_lrf):
 
 
 def platform_observations(prepared, variant="half_step"):
-    """Two perpendicular sides and the face of the board in every sweep, for the platform calibration.
+    """Two perpendicular sides and the face of the board in every sweep, a PlatformObservations; no cameras are needed.
 
-    Parameters
-    ----------
-    prepared : Prepared
-        No cameras are needed.
-    variant : {'half_step', 'last_beam'}
-
-    Returns
-    -------
-    PlatformObservations
-        Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that one.
+    Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that one.
     """
     edges, faces = [], []
     for placement, swept in prepared.swept[variant].items():
@@ -220,18 +211,9 @@ def _perpendicular(along, swept):
 def name_sides(prepared):
     """Name the sides that scans cross: the nearest edge of the board, which the images place in the scan.
 
-    Parameters
-    ----------
-    prepared : Prepared
-        With views. The cameras' poses come from the planes alone (Zhang and Pless), which needs no names.
-
-    Returns
-    -------
-    names : dict of int to dict of int to str
-        Edge name by placement and side number. Sides farther than 8 cm from every edge stay unnamed; all do where
-        nobody knows the outline of the board.
-    problems : dict of int or str to str
-        Of :func:`rough_poses`, and why a side has no name.
+    The cameras' poses come from the planes alone (Zhang and Pless), which needs no names. Returns edge names by
+    placement and side number, and problems: of :func:`rough_poses`, and why sides have no name. Those farther than 8 cm
+    from every edge have none; nor has any where nobody knows the outline of the board.
     """
     rough, problems = rough_poses(prepared)
     names = {}
@@ -253,18 +235,9 @@ def name_sides(prepared):
 
 
 def rough_poses(prepared):
-    """Poses of the cameras from the planes alone, and which placements disagree with all others.
+    """Poses ``T_camera_source`` of the cameras from the planes alone, and problems by placement or camera.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    rough : dict of str to RigidTransform
-        ``T_camera_source`` by camera.
-    problems : dict of int or str to str
-        Of each outlying placement, and each camera without a pose.
+    Problems are placements that disagree with all others, and why a camera has no pose.
     """
     rough, problems = {}, {}
     for camera in prepared.views:
@@ -310,17 +283,9 @@ def _angle_to_line(points, line):
 
 
 def all_views(prepared):
-    """The board in all images of a session, at every pitch, with the intrinsics and outline that are known by now.
+    """The board in all images of a session, by camera, with the intrinsics and outline that are known by now.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    dict of str to list of BoardView
-        By camera; images of no placement are left out. Where every placement has one image these are the prepared
-        views.
+    Images of no placement are left out. Where every placement has one image these are the prepared views.
     """
     session = prepared.session
     records = [r for r in session.images(purpose="board") if r.placement >= 0 and r.camera in prepared.views]
@@ -332,18 +297,9 @@ def all_views(prepared):
 
 
 def observe_joint(prepared, views=None):
-    """Everything that the joint estimate uses of a session.
+    """Everything that the joint estimate uses of a session, of the placements that `prepared.problems` does not name.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    views : dict of str to list of BoardView, optional
-        See :func:`all_views`.
-
-    Returns
-    -------
-    JointObservations
-        Of the placements that `prepared.problems` does not name.
+    `views` are lists of BoardView by camera; those of :func:`all_views` when left out.
     """
     views, session, board = all_views(prepared) if views is None else views, prepared.session, prepared.board
     scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.problems}

@@ -124,18 +124,8 @@ def corners_and_lengths(lines, edges):
 def measure_board(face, sides, edges):
     """Measure a board's outline in a cloud: plane through the face, lines through its sides, corners where they meet.
 
-    Parameters
-    ----------
-    face : ndarray, shape (n, 3)
-        Points on the face, metres.
-    sides : dict of str to ndarray, shape (k, 3)
-        Edge points by edge name, same frame.
-    edges : tuple of str
-        All edges of the board in order around it.
-
-    Returns
-    -------
-    MeasuredBoard
+    `face` are points (n, 3), `sides` edge points (k, 3) by edge name, metres; `edges` all edges in order around the
+    board.
     """
     pose = plane_frame(face)
     lines = {}
@@ -178,8 +168,7 @@ def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
     Returns
     -------
     measured : MeasuredBoard
-        In the platform frame. Without sides of which less than 40 % is seen: a stub does not carry a line to its
-        corners.
+        Without sides of which less than 40 % is seen: a stub does not carry a line to its corners.
     across : frozenset of str
         Edges found across the scan lines (where the sweep enters or leaves the board): their place hangs on the
         recorded pitch.
@@ -211,24 +200,9 @@ def cells_of(prepared, placement):
 
 
 def likely_outline_of(prepared, placement, model):
-    """Measure the board's outline in one sweep by likelihood; see :func:`outline_of`.
+    """Measure the board's outline in one sweep by likelihood, with an EdgeModel from other placements.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    placement : int
-    model : EdgeModel
-        From other placements.
-
-    Returns
-    -------
-    measured : MeasuredBoard
-    across : frozenset of str
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the sweep does not cross enough scan lines to span a plane, or no side has enough beams.
+    Returns and raises what :func:`outline_of` does; also raises DegenerateGeometry when no side has enough beams.
     """
     sides = list(named_sides(prepared, placement, stretch=LEAST_STRETCH))
     points, pitch, _ = face_points(prepared.scans[placement])
@@ -244,26 +218,9 @@ def likely_outline_of(prepared, placement, model):
 def measure_outline(cells, face, names, edges, model):
     """Measure a board of unknown size in one sweep.
 
-    Parameters
-    ----------
-    cells : EdgeCells
-    face : tuple
-        Points on the face (LRF frame, metres), their pitch (radians), and the standard deviation of a range (metres).
-    names : dict of int to str
-        Edge of each side.
-    edges : tuple of str
-        All edges in order around the board.
-    model : EdgeModel
-        From other placements.
-
-    Returns
-    -------
-    MeasuredBoard
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the face does not span a plane, or no side has enough cells.
+    `cells` are its beams about the edges (EdgeCells), `face` points on it (LRF frame, metres), their pitch (radians)
+    and the standard deviation of a range (metres), `names` the edge of each side, `edges` all edges in order around the
+    board. Raises DegenerateGeometry if the face does not span a plane, or no side has enough cells.
     """
     pose, bend = face_surface(face, model)
     found = {side: name for side, name in names.items() if np.sum(cells.side == side) >= FEWEST_CELLS}
@@ -291,21 +248,10 @@ def measure_outline(cells, face, names, edges, model):
 
 
 def face_surface(face, model):
-    """The face of a board as a plane and its bend.
+    """The face of a board (see :func:`measure_outline`) as a plane, see :func:`plane_frame`, and its bend (6,).
 
-    Parameters
-    ----------
-    face : tuple
-        See :func:`measure_outline`.
-    model : EdgeModel
-
-    Returns
-    -------
-    pose : ndarray, shape (4, 4)
-        See :func:`plane_frame`; platform frame.
-    bend : ndarray, shape (6,)
-        Height over the plane, ``bend . (1, x, y, x^2, x y, y^2)``, metres; zero where the points do not ask for it
-        (F test at 0.1 %): cardboard bends by a centimetre, and a ray at a slant then meets it elsewhere.
+    Height over the plane is ``bend . (1, x, y, x^2, x y, y^2)``, metres; zero where the points do not ask for it (F
+    test at 0.1 %): cardboard bends by a centimetre, and a ray at a slant then meets it elsewhere.
     """
     points, pitch, _ = face
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -414,14 +360,13 @@ def fused_outline_of(joint, placement):
     Parameters
     ----------
     joint : JointCalibration
-        Its estimate without the placement is used where there is one (see
-        :func:`lrfcal_lib.calibrate.pipeline.leave_out`).
+        Its estimate without the placement is used where there is one.
     placement : int
 
     Returns
     -------
     measured : MeasuredBoard
-        In the platform frame. Every camera's edges count alike.
+        Every camera's edges count alike.
     across : None
         No end hangs on beams or on where a sweep enters or leaves the board.
 
@@ -450,10 +395,7 @@ def fused_outline_of(joint, placement):
 
 
 def edge_on_plane(edge, model, T_platform_camera, centre, normal):
-    """Points of an image edge where its lines of sight meet a plane, platform frame, shape (k, 3).
-
-    The ends of the stretch are moved onto the fitted line first.
-    """
+    """Points (k, 3) of an image edge where its lines of sight meet a plane, platform frame."""
     ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]
     uv = ends[0] + ALONG[:, None] * (ends[1] - ends[0])
     rays = np.column_stack([(uv - [model.cx, model.cy]) / [model.fx, model.fy], np.ones(len(uv))])

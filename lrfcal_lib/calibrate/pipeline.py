@@ -176,16 +176,9 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
 
 @cached
 def prepare(session):
-    """Preprocess scans and images, and name the sides that scans cross.
+    """Preprocess scans and images of a session, and name the sides that scans cross.
 
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    Prepared
-        Placements that cannot be used are in `problems` with their reason.
+    Placements that cannot be used are in `problems` of the Prepared, with their reason.
     """
     ready = prepare_images(prepare_scans(session))
     names, problems = name_sides(ready)
@@ -204,16 +197,9 @@ def without(prepared):
 
 
 def find_pitch_errors(prepared):
-    """Ask the cameras that are fixed to the base whether the platform tells the truth about its pitch.
+    """Ask the cameras that are fixed to the base whether the platform tells the truth about its pitch: PitchErrors.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    PitchErrors or None
-        None where no camera is fixed to the base, or too few placements are seen.
+    None where no camera is fixed to the base, or too few placements are seen.
     """
     session, scans = prepared.session, prepared.scans
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
@@ -232,16 +218,7 @@ def find_pitch_errors(prepared):
 
 
 def pitch_noise(errors):
-    """How far a recorded pitch is off, from the errors of all sweeps; zero where the data do not ask for any.
-
-    Parameters
-    ----------
-    errors : PitchErrors or None
-
-    Returns
-    -------
-    PitchNoise
-    """
+    """How far a recorded pitch is off, from PitchErrors (or None); zero where the data do not ask for any."""
     if errors is None or errors.wanted == "none":
         return PitchNoise()
     model = errors.models[errors.wanted]
@@ -317,21 +294,9 @@ def axis_from_chart(parameters):
 
 
 def calibrate_cameras(observations, methods=METHODS):
-    """Calibrate every camera by every method.
+    """Calibrate every camera by some methods of :data:`lrfcal_lib.solvers.METHODS`.
 
-    Parameters
-    ----------
-    observations : dict of (str, str) to CameraObservations
-        Of :func:`observe_all`.
-    methods : iterable of str
-        Of :data:`lrfcal_lib.solvers.METHODS`.
-
-    Returns
-    -------
-    solutions : dict of (str, str) to Solution
-        By camera and method.
-    problems : dict of (str, str) to str
-        Why a method has no result for a camera.
+    Returns a Solution, or in words why there is none, by camera and method.
     """
     solutions, problems = {}, {}
     for camera in dict.fromkeys(camera for camera, _ in observations):
@@ -344,20 +309,11 @@ def calibrate_cameras(observations, methods=METHODS):
 
 
 def joint_settings(prepared, observations):
-    """Which unknowns the data of a session ask for.
+    """Which unknowns the data of a session ask for: keyword arguments of `solve_joint`.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    observations : JointObservations
-
-    Returns
-    -------
-    dict
-        Keyword arguments of :func:`lrfcal_lib.solvers.joint.solve_joint`: the axis and the scale of
-        the pitch where something sweeps; a pitch error of every sweep where cameras on the base show that there is one;
-        a spread of the edge bias where there are sides enough; the stated platform as a prior with its stated standard
-        deviations.
+    The axis and the scale of the pitch where something sweeps; a pitch error of every sweep where cameras on the base
+    show that there is one; a spread of the edge bias where there are sides enough; the stated platform as a prior with
+    its stated standard deviations.
     """
     session, noise, places = prepared.session, prepared.pitch_noise, observations.face_placement
     spans = [np.ptp(observations.face_pitch[places == i]) for i in np.unique(places)]
@@ -377,19 +333,8 @@ def joint_settings(prepared, observations):
 def calibrate_jointly(prepared):
     """Estimate everything about a session's rig at once.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    JointCalibration
-        What the session does not determine is in `solution.unobservable` and `solution.warnings`, in words.
-
-    Raises
-    ------
-    DegenerateGeometry
-        When there is no start value, or most placements contradict each other.
+    What the session does not determine is in `unobservable` and `warnings` of the solution, in words. Raises
+    DegenerateGeometry when there is no start value, or most placements contradict each other.
     """
     observations = observe_joint(prepared)
     settings = joint_settings(prepared, observations)
@@ -399,14 +344,7 @@ def calibrate_jointly(prepared):
 def with_joint(calibration):
     """Add the joint estimate to a calibration: its axis, its cameras, and observations made with them.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
-    Returns
-    -------
-    Calibration
-        Unchanged but for a problem where the session does not determine the whole rig.
+    Where the session does not determine the whole rig, only a problem is added.
     """
     platform = calibration.platform
     try:
@@ -424,18 +362,10 @@ def with_joint(calibration):
 
 
 def leave_out(joint, groups=8):
-    """The estimate without each placement: groups of them are left out in turn.
+    """The estimate without each placement: `groups` of them are left out in turn.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-    groups : int
-        Placements are dealt out to so many groups; as many as there are placements leaves out one at a time.
-
-    Returns
-    -------
-    JointCalibration
-        With `without` filled; placements whose absence leaves something open are missing there.
+    Returns the JointCalibration with `without` filled; placements whose absence leaves something open are missing
+    there.
     """
     numbers, found = np.array(list(joint.solution.boards)), {}
     for group in range(min(groups, len(numbers))):
@@ -449,19 +379,7 @@ def leave_out(joint, groups=8):
 
 
 def left_out_residuals(joint, camera):
-    """Residuals of every placement under the estimate from all the others.
-
-    Parameters
-    ----------
-    joint : JointCalibration
-        With `without`.
-    camera : str
-
-    Returns
-    -------
-    edge_px, plane_m : ndarray
-        As :func:`lrfcal_lib.evaluate.tables.left_out_residuals`: crossings of scan lines, and face points.
-    """
+    """Residuals of every placement under the estimate from all the others: crossings (pixels), face points (metres)."""
     edges, planes = [np.zeros(0)], [np.zeros(0)]
     for placement, solution in joint.without.items():
         held = joint.seen_by(camera, solution).along().select([placement])
@@ -473,20 +391,8 @@ def left_out_residuals(joint, camera):
 def stereo_reference(prepared):
     """Relative pose of the first two cameras from the chessboard in both images.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    cameras : (str, str)
-    T_second_first : RigidTransform
-    covariance : ndarray, shape (6, 6)
-
-    Raises
-    ------
-    ValueError
-        With fewer than two cameras, without a pattern, or when no placement is seen by both.
+    Returns their names, ``T_second_first`` and its covariance (6, 6). Raises ValueError with fewer than two cameras,
+    without a pattern, or when no placement is seen by both.
     """
     pattern, pair = prepared.board.pattern, tuple(prepared.views)[:2]
     if len(pair) < 2 or pattern is None:

@@ -95,18 +95,7 @@ def _sample(image, uv):
 
 
 def blend(colors):
-    """Mean colour of all cameras that see a point.
-
-    Parameters
-    ----------
-    colors : sequence of ndarray, shape (n, 3)
-        NaN where a camera does not see the point.
-
-    Returns
-    -------
-    colors : ndarray of uint8, shape (n, 3)
-    seen : ndarray of bool, shape (n,)
-    """
+    """Mean colours (n, 3) over layers with NaN where a camera does not see a point, and whether any does."""
     stack = np.stack(colors)
     count = np.isfinite(stack[..., 0]).sum(axis=0)
     mean = np.nansum(stack, axis=0) / np.maximum(count, 1)[:, None]
@@ -121,18 +110,7 @@ def join(clouds):
 
 
 def write_ply(path, cloud):
-    """Write a cloud as a binary coloured PLY.
-
-    Parameters
-    ----------
-    path : path-like
-    cloud : Cloud
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    """Write a cloud as a binary coloured PLY. Raises OSError if the file cannot be written."""
     import open3d as o3d
 
     geometry = o3d.t.geometry.PointCloud(o3d.core.Tensor(cloud.points.astype(np.float32)))

@@ -270,15 +270,12 @@ def solve(
         ``direction (k,) -> str``; the names with the largest components by default.
     groups : array_like, shape (n,), optional
         Placement of every residual, for `covariance_placements` (with `shared` the leading axis is the placement).
-    freedom : float, optional
-        Degrees of freedom of chi-square; number of residuals minus unknowns by default.
+    freedom, n_observations : optional
+        Degrees of freedom of chi-square, and number of observations; by default those of the residuals.
     required : bool
         Raise when something stays unobservable (single problems only).
-    n_observations : int, optional
-    chi2_rest : float or ndarray
-        Chi-square that no unknown can change (compressed away), added for the inflation.
-    earlier : sequence of ndarray
-        Cost histories of earlier rounds, put before this one's.
+    chi2_rest, earlier
+        Chi-square that no unknown can change (compressed away), and cost histories of earlier rounds.
 
     Returns
     -------
@@ -309,7 +306,8 @@ def solve(
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
         freedom = r.size // chi2.size - own
-    inflation = _inflation(chi2, freedom)
+    too_large = (freedom > 0) & (chi2 > chi2_distribution.ppf(0.999, max(freedom, 1)))
+    inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = read(state)
     return Solution(
         transform, parameters, tuple(names), converged,
@@ -321,13 +319,6 @@ def solve(
         unobservable=lost, method=method, n_observations=n_observations or r.shape[-1], chi2=chi2, inflation=inflation,
         state=state,
     )  # fmt: skip
-
-
-def _inflation(chi2, freedom):
-    """Chi-square per degree of freedom where it is above the 99.9 % limit of the stated noise, otherwise 1."""
-    if freedom <= 0:
-        return np.ones_like(chi2)
-    return np.where(chi2 > chi2_distribution.ppf(0.999, freedom), chi2 / freedom, 1.0)
 
 
 def _by_placement(r, J, weights, groups, shared):

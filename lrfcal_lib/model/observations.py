@@ -158,23 +158,15 @@ class CameraObservations(_Groups):
         points = (self.crossing_points, self.plane_points, self.scene_points, self.pattern_points)
         n, m, q, k = (0 if rows is None else rows.shape[-2] for rows in points)
         p = 0 if self.board_poses is None else self.board_poses.shape[-3]
-        defaults = {
-            "crossing_lines": np.zeros((0, 3)),
-            "crossing_line_sigma": np.full(n, 0.5),
-            "crossing_edge": np.full(n, ""),
-            "crossing_across": np.zeros(n, bool),
-            "crossing_half_step": np.zeros((n, 3)),
-            "crossing_noise": np.zeros((n, 3, 3)),
-            "crossing_radius": np.full(n, 0.005),
-            "crossing_background": np.zeros(n),
-            "placements": np.arange(p),
-            "board_poses": np.zeros((0, 4, 4)),
-            "board_covariance": np.zeros((p, 6, 6)),
-            "pattern_points": np.zeros((0, 3)),
-            "pattern_pixels": np.full((p, k, 2), np.nan),
-            "scene_pixels": np.zeros((0, 2)),
-            "scene_sigma_px": np.full(q, 0.5),
-        }
+        zeros = {
+            "crossing_lines": (0, 3), "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3),
+            "crossing_background": n, "board_poses": (0, 4, 4), "board_covariance": (p, 6, 6),
+            "pattern_points": (0, 3), "scene_pixels": (0, 2),
+        }  # fmt: skip
+        defaults = {name: np.zeros(shape) for name, shape in zeros.items()}
+        defaults |= {"crossing_edge": np.full(n, ""), "crossing_across": np.zeros(n, bool), "placements": np.arange(p)}
+        defaults |= {"crossing_line_sigma": np.full(n, 0.5), "scene_sigma_px": np.full(q, 0.5)}
+        defaults |= {"crossing_radius": np.full(n, 0.005), "pattern_pixels": np.full((p, k, 2), np.nan)}
         for group, count in (("crossing", n), ("plane", m), ("scene", q)):
             defaults[f"{group}_points"] = np.zeros((0, 3))
             defaults[f"{group}_covariance"] = np.tile(ROUGH_NOISE, (count, 1, 1))

@@ -128,22 +128,10 @@ class JointSolution:
         return self.solution.trusted[np.ix_(index, index)]
 
     def correct(self, placement, p_lrf, pitch):
-        """Measured points and recorded pitch as they should have been.
+        """Measured points (n, 3) and recorded pitch of a placement as they should have been.
 
-        Parameters
-        ----------
-        placement : int
-        p_lrf : ndarray, shape (n, 3)
-            LRF frame, metres.
-        pitch : array_like, broadcastable to (n,)
-            Radians.
-
-        Returns
-        -------
-        p_lrf : ndarray, shape (n, 3)
-            Without the range offset.
-        pitch : ndarray
-            With scale, offset by direction and the sweep's own errors, as far as they were estimated.
+        Without the range offset; with scale, offset by direction and the sweep's own errors, as far as they were
+        estimated.
         """
         p_lrf, pitch = np.asarray(p_lrf, float), np.asarray(pitch, float)
         length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
@@ -260,22 +248,9 @@ def solve_joint(
 
 
 def solve_again(obs, like):
-    """Solve for other placements with the settings, noise levels and start value of a solution.
+    """Solve for some of the placements of a solution with its settings, noise levels and start value.
 
-    Parameters
-    ----------
-    obs : JointObservations
-        Some of the placements that `like` was made from (for leave-one-out and random halves).
-    like : JointSolution
-
-    Returns
-    -------
-    JointSolution
-
-    Raises
-    ------
-    DegenerateGeometry
-        When these placements leave a motion open.
+    Raises DegenerateGeometry when these placements leave a motion open.
     """
     known = list(like.boards)
     rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
@@ -362,10 +337,8 @@ def image_name(obs, row):
 def best_start(obs, unknowns, sweep_sigma, T0=None):
     """The most promising start value, what is left of the observations with it, and in words what is not.
 
-    Raises
-    ------
-    DegenerateGeometry
-        When more than 30 % of the placements contradict the rest: then nobody knows which ones are wrong.
+    More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
+    wrong.
     """
     data, least = replace(gather(obs), sweep_sigma=tuple(sweep_sigma)), np.inf
     for number, state in enumerate(start_states(obs, T0)):

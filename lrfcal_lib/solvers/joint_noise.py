@@ -29,19 +29,10 @@ TERMS = {
 
 
 def pose_by_intrinsics(T_camera_board, corners, model):
-    """How the pose of a board that fits given pixels changes with the intrinsics.
+    """How the pose of a board that fits given pixels changes with the intrinsics, shape (6, 9).
 
-    Parameters
-    ----------
-    T_camera_board : RigidTransform
-    corners : ndarray, shape (k, 3)
-        Of the pattern, board frame, metres.
-    model : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (6, 9)
-        Derivative of the increments ``[w, v]`` by the intrinsics; zeros with fewer than six corners.
+    Derivative of the increments ``[w, v]`` of T_camera_board, from the pattern's corners (k, 3) that were seen (board
+    frame, metres); zeros with fewer than six.
     """
     if len(corners) < LEAST_CORNERS:
         return np.zeros((6, LENS))

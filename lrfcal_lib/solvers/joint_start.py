@@ -23,24 +23,11 @@ FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
 def start_states(obs, T0=None):
-    """Start values to choose from, made one by one.
+    """Start values (JointState) to choose from, made one by one.
 
-    Parameters
-    ----------
-    obs : JointObservations
-    T0 : RigidTransform, optional
-        Rough ``T_head_lrf``.
-
-    Yields
-    ------
-    JointState
-        From the closed form of the axis, from T0, from the stated platform, from an axis along x through the mirror;
-        with cameras from scan lines at the pitch of their images, then from whole sweeps.
-
-    Raises
-    ------
-    DegenerateGeometry
-        When no placement gives the pose of a board.
+    From the closed form of the axis, from T0, from the stated platform, from an axis along x through the mirror; with
+    cameras from scan lines at the pitch of their images, then from whole sweeps. Raises DegenerateGeometry when no
+    placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
         raise DegenerateGeometry("no ranges on the boards' faces: a start value needs them; give one as start=")
