@@ -49,7 +49,7 @@ class Trials:
         Increments that take the truth to the estimate.
     covariances : ndarray, shape (t, k, k)
         As the solver states them.
-    bounds : ndarray, shape (t, k, k), or None
+    bounds : ndarray, shape (t, k, k)
         Cramer-Rao bounds at the truth.
     failed : dict of int to str
         Seeds whose draw the solver refused, with its words.
@@ -59,7 +59,7 @@ class Trials:
     seeds: np.ndarray
     errors: np.ndarray
     covariances: np.ndarray
-    bounds: np.ndarray | None
+    bounds: np.ndarray
     failed: dict
 
 
@@ -95,7 +95,7 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
     return in_stated_gauge(state, obs)
 
 
-def monte_carlo(draw, solve, seeds, *, bounds=True):
+def monte_carlo(draw, solve, seeds):
     """Solve many draws whose truth is known: :class:`Trials`.
 
     Parameters
@@ -106,8 +106,6 @@ def monte_carlo(draw, solve, seeds, *, bounds=True):
         ``JointObservations -> JointSolution``.
     seeds : iterable of int
         One generator each.
-    bounds : bool
-        Whether to compute the Cramer-Rao bound of every draw.
 
     Raises
     ------
@@ -125,14 +123,12 @@ def monte_carlo(draw, solve, seeds, *, bounds=True):
         names = names or found.solution.names
         if names != found.solution.names:
             raise ValueError(f"seed {seed} estimates {found.solution.names}, earlier ones {names}")
-        limit = [bound(obs, truth, found.unknowns)] if bounds else []
-        error = state_errors(found.state, truth, found.unknowns)
-        rows.append((int(seed), error, found.solution.covariance, *limit))
+        error, limit = state_errors(found.state, truth, found.unknowns), bound(obs, truth, found.unknowns)
+        rows.append((int(seed), error, found.solution.covariance, limit))
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Trials(names, *columns, *([] if bounds else [None]), failed)
+    return Trials(names, *(np.array(column) for column in zip(*rows, strict=True)), failed)
 
 
 def state_errors(state, truth, unknowns):
@@ -149,15 +145,14 @@ def pose_errors(poses, true):
     return np.concatenate([turn.as_rotvec(), poses[..., 3] - true[..., 3]], axis=-1)
 
 
-def bound(obs, truth, unknowns, **levels):
+def bound(obs, truth, unknowns):
     """Cramer-Rao bound of the shared unknowns from the expected information at the truth, shape (c, c).
 
     Nothing of the drawn values enters but which beams and views there are, so it checks the covariance that a solver
-    takes from its own residuals. Board poses, and whatever else a placement owns, count as unknown. `levels` are noise
-    levels of :class:`lrfcal_lib.fit.residuals.JointData`, e.g. ``face_scale=2.0``. DegenerateGeometry when the data
-    leave a direction of the shared unknowns open.
+    takes from its own residuals. Board poses, and whatever else a placement owns, count as unknown.
+    DegenerateGeometry when the data leave a direction of the shared unknowns open.
     """
-    data = replace(gather(obs), **levels)
+    data = gather(obs)
     read, missed = (
         named_blocks(truth, replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)}), unknowns)
         for hit in (True, False)
@@ -219,8 +214,8 @@ def consistency(trials):
 
 def _judge(trials, index, factor):
     """One row: a group in its unit, or (factor None) unknowns of many units, each in its own bounds."""
-    e, C = trials.errors[:, index], trials.covariances[:, index][:, :, index]
-    B = C if trials.bounds is None else trials.bounds[:, index][:, :, index]
+    e = trials.errors[:, index]
+    C, B = (X[:, index][:, :, index] for X in (trials.covariances, trials.bounds))
     stated_sigma, least_sigma = (np.sqrt(np.diagonal(X, axis1=1, axis2=2)) for X in (C, B))
     unit = 1 / least_sigma if factor is None else np.full(e.shape, factor)
     scale = unit[:, :, None] * unit[:, None, :]
