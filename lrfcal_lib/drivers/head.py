@@ -436,7 +436,7 @@ def drawn_to_readings(rows):
     return track
 
 
-class PanTilt:
+class PanTilt(port.Closed):
     """A head on a serial line; a context manager. It is stopped on every way out, Ctrl-C and SIGTERM included.
 
     Parameters
@@ -503,12 +503,6 @@ class PanTilt:
         echo = "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
         return (f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the wires A and B, "
                 f"address {self.settings.address} and {self.settings.baudrate} Bd, or state feedback false")
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def close(self):
         """Stop the head and close the port; a second call does nothing."""
