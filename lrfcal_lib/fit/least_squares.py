@@ -139,18 +139,10 @@ def _frozen_cost(blocks, roots, axes):
 def eliminate(hessian, gradient, shared, rcond=1e-13):
     """Schur complement: what each placement says about the shared unknowns once its own are eliminated.
 
-    Parameters
-    ----------
-    hessian, gradient : ndarray, shapes (p, k, k) and (p, k)
-        The first `shared` = c unknowns are common to all placements.
-    rcond : float or None
-        Smaller eigenvalues of the placements' own blocks are no information; None where the blocks are regular.
-
-    Returns
-    -------
-    reduced, right : ndarray, shapes (p, c, c) and (p, c)
-    back : ndarray, shape (p, k - c, c + 1)
-        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a placement's own.
+    The first `shared` = c unknowns of the normal equations (p, k, k), (p, k) are common to all placements; eigenvalues
+    of the placements' own blocks below `rcond` are no information (None: the blocks are regular). Returned are the
+    reduced equations (p, c, c), (p, c) and ``back`` (p, k - c, c + 1): a step x of the shared unknowns goes with
+    ``-(back[..., c] + back[..., :c] x)`` of a placement's own.
     """
     c = shared
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
@@ -334,12 +326,10 @@ def _by_placement(r, J, weights, groups, shared):
 
 
 def null_space(hessian, scales, limit=1.0):
-    """Directions that normal equations do not determine.
+    """Directions that normal equations (k, k) of whitened residuals do not determine.
 
     Parameters
     ----------
-    hessian : ndarray, shape (k, k)
-        Of whitened residuals.
     scales : array_like, shape (k,)
         What counts as a change by one: 1 rad, 1 m, 1000 px, ...
     limit : float
@@ -394,20 +384,11 @@ def name_words(direction, names, share=0.05):
 
 
 def placement_covariance(hessians, scores):
-    """First-order jackknife over placements (CR3), from what each placement adds to the normal equations.
+    """First-order jackknife over g placements (CR3), from what each adds to the normal equations.
 
-    Parameters
-    ----------
-    hessians : ndarray, shape (..., g, k, k)
-    scores : ndarray, shape (..., g, k)
-        ``J^T r`` of each placement at the solution.
-
-    Returns
-    -------
-    covariance : ndarray, shape (..., k, k), or None
-        None with fewer than three placements, or where the others do not determine the estimate.
-    shifts : ndarray, shape (..., g, k), or None
-        Change of the estimate when that placement is left out.
+    `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the changes (..., g, k) of
+    the estimate when that placement is left out; None with fewer than three placements, or where the others do not
+    determine the estimate.
     """
     groups = hessians.shape[-3]
     total = np.sum(hessians, axis=-3, keepdims=True)

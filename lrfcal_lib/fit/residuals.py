@@ -134,19 +134,10 @@ _LOG_ODDS = np.log(disc_share(_X)) - np.log(disc_share(-_X))
 
 
 def disc_edge(log_odds):
-    """Where an edge cuts a unit disc so that its inner share has given log odds; inverts :func:`disc_share`.
+    """Where an edge cuts a unit disc so that its inner share has log odds ``ln(share / (1 - share))``.
 
-    Parameters
-    ----------
-    log_odds : array_like
-        ``ln(share / (1 - share))``.
-
-    Returns
-    -------
-    x : ndarray
-        Distance of the disc's centre from the edge in radii, positive outside; between -1 and 1.
-    slope : ndarray
-        ``dx / dlog_odds`` (negative).
+    Inverts :func:`disc_share`; returns the distance x of the disc's centre from the edge in radii, positive outside,
+    between -1 and 1, and ``dx / dlog_odds`` (negative).
     """
     log_odds = np.asarray(log_odds, float)
     x = np.interp(-log_odds, -_LOG_ODDS, _X)
@@ -198,10 +189,9 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
 
     Parameters
     ----------
-    margin : ndarray
-        How far inside the place where readings flip the beam's centre lies, metres (shift - distance from the edge).
-    sigma : array_like
-        Standard deviation of where a reading flips, metres.
+    margin, sigma : array_like
+        How far inside the place where readings flip the beam's centre lies (shift - distance from the edge), and the
+        standard deviation of that place, metres.
     hit : ndarray of bool
         Whether the board was read.
     lapse : float
@@ -209,11 +199,9 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
 
     Returns
     -------
-    cost, score, information : ndarray
-        Negative log likelihood, its derivative by the margin, and the observed information on the margin (never
-        negative; with `lapse` that of the majorising function of an EM step).
-    by_log_sigma : ndarray
-        Derivative of the cost by ``ln sigma``.
+    cost, score, information, by_log_sigma : ndarray
+        Negative log likelihood, its derivative by the margin, the observed information on the margin (never negative;
+        with `lapse` that of the majorising function of an EM step), and the cost's derivative by ``ln sigma``.
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
@@ -260,16 +248,13 @@ class JointState:
 
     Attributes
     ----------
-    head : ndarray, shape (3, 4)
-        ``T_head_lrf``.
-    cameras : ndarray, shape (c, 3, 4)
-        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+    head, cameras, boards : ndarray, shapes (3, 4), (c, 3, 4), (p, 3, 4)
+        ``T_head_lrf``, ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform'),
+        ``T_platform_board``.
     sensor : ndarray, shape (5,)
         In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
     size : ndarray, shape (e,)
         By how much each edge lies outside the stated one, metres.
-    boards : ndarray, shape (p, 3, 4)
-        ``T_platform_board``.
     sweeps : ndarray, shape (p, 2)
         Offset (radians) and stretch of the recorded pitch of each sweep.
     sides : ndarray, shape (p, e)
@@ -348,29 +333,14 @@ class Unknowns:
 class JointData:
     """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
 
-    Attributes
-    ----------
-    face, beam, view : dict of str to ndarray
-        Fields of a group of :class:`lrfcal_lib.model.observations.JointObservations`, with `used` and ``ray``
-        (LRF frame) or, for views, ``whitener`` (p, v, 6, 6).
-    lines : ndarray, shape (e, 3)
-    middle, direction : ndarray, shape (p,)
-    on_head : ndarray of bool, shape (c,)
-    face_scale, view_scale : float, and ndarray, shape (c,)
-        Factors on the stated standard deviations.
-    sigma_pitch : float
-        Standard deviation of the recorded pitch of a single image, radians: what a head at rest is off by.
-    face_share, beam_share : float
-        Independent errors per observation: below one where neighbours repeat each other's errors.
-    lapse : float
-        See :func:`lrfcal_lib.fit.residuals.beam_terms`.
-    sweep_sigma : tuple of float
-        Standard deviation of the sweeps' own offset (radians) and stretch.
-    side_sigma : float
-        Scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom: most
-        backgrounds are alike, some are dark).
-    prior : PlatformPrior or None
-        The stated platform; it yields where the data contradict it.
+    `face`, `beam` and `view` hold the fields of that group of JointObservations, with ``ray`` (LRF frame) or, for
+    views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and `direction` (p,) the sweeps'. Then
+    come factors on the stated standard deviations of ranges and of each camera's views, the standard deviation of the
+    recorded pitch of a single image (what a head at rest is off by, radians), shares of independent errors per
+    observation (below one where neighbours repeat each other's errors), `lapse` (see :func:`beam_terms`), what is
+    expected of the sweeps' own offset (radians) and stretch, the scale of the sides' deviations of the log odds
+    (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are dark), and the stated
+    platform, which yields where the data contradict it.
     """
 
     face: dict
@@ -397,20 +367,14 @@ def pad(group, count, width=1):
     Rows of a placement keep their order; zeros stand behind them, and `used` marks what is no padding. n is `width` at
     least.
     """
-    place = group["placement"]
-    order = np.argsort(place, kind="stable")
-    number = np.bincount(place, minlength=count)
-    width = int(number.max(initial=width))
-    slot = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
-    out = {}
+    order, number = np.argsort(group["placement"], kind="stable"), np.bincount(group["placement"], minlength=count)
+    used = np.arange(number.max(initial=width)) < number[:, None]
+    out = {"used": used}
     for key, value in group.items():
         if key != "placement":
-            filled = np.zeros((count, width) + value.shape[1:], value.dtype)
-            filled[place[order], slot] = value[order]
-            out[key] = filled
-    used = np.zeros((count, width), bool)
-    used[place[order], slot] = True
-    return out | {"used": used}
+            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
+            out[key][used] = value[order]
+    return out
 
 
 def gather(obs):

@@ -64,22 +64,10 @@ def point_block(pose, obs):
 
 
 def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
-    """The pose of a camera by least squares, from a residual that depends on nothing else.
+    """The pose (..., 3, 4) of a camera by least squares, from ``residual(pose, obs) -> Block``.
 
-    Parameters
-    ----------
-    residual : callable
-        ``residual(pose, obs) -> Block``.
-    obs : CameraObservations
-    pose : ndarray, shape (..., 3, 4)
-        Start value.
-    method, uses : str
-        Name of the method, and the kind of observations that `residual` has rows of.
-    weighted : bool
-        False: every residual counts the same, the mean of their propagated variances.
-    required : bool
-    **options
-        ``loss``, ``scale`` and ``max_iterations`` of :func:`lrfcal_lib.fit.least_squares.minimise`.
+    `uses` is the kind of observations that the residual has rows of. Without weights every residual counts the same:
+    the mean of their propagated variances.
     """
 
     def evaluate(pose):
@@ -201,7 +189,7 @@ def freeze_intervals(state, obs, sight, lengths, softness):
     return half, np.sqrt(np.take_along_axis(variance, best, axis=0)[0])
 
 
-def estimate_likely_pose(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
+def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
     """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges lie.
 
     `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is
