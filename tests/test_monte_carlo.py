@@ -112,56 +112,22 @@ def test_errors_are_the_increments_that_were_applied():
 
 def test_bound_is_the_variance_of_the_score():
     """Fisher information both ways: the expectation of the second derivative is the variance of the first."""
-    rng = np.random.default_rng(4)
+    rng, unknowns, c = np.random.default_rng(4), Unknowns(2, 3), Unknowns(2, 3).shared
     obs, truth, _ = draw(rng, 3, see_images=2)
-    unknowns = Unknowns(2, 3)
-    limit = bound(obs, truth, unknowns)
-    data, draws = gather(obs), 400
-    J = numeric_predictions(truth, data, unknowns)
-    chance = np.exp(-named_blocks(truth, with_hit(data, True), unknowns)["beam"].cost)
-    slope = {hit: beam_slopes(truth, with_hit(data, hit), unknowns) for hit in (True, False)}
+    data = gather(obs)
+    hits = (replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)}) for hit in (False, True))
+    missed, read = (named_blocks(truth, given, unknowns) for given in hits)
+    chance = np.exp(-read["beam"].cost)
+    slope = [r[..., None] * J for r, J in (whiten(blocks["beam"]) for blocks in (missed, read))]
     scores = []
-    for _ in range(draws):
-        plain = sum(np.swapaxes(j, 1, 2) @ rng.normal(size=j.shape[:2] + (1,)) for j in J)[..., 0]
+    for _ in range(400):
+        noise = ((J, rng.normal(size=J.shape[:2])) for J in (whiten(read[name])[1] for name in ("face", "view")))
+        plain = sum(np.einsum("pri,pr->pi", J, e) for J, e in noise)
         hit = rng.random(chance.shape) < chance
-        scores.append(plain + np.sum(np.where(hit[..., None], slope[True], slope[False]), axis=1))
-    information = np.mean(np.einsum("dpi,dpj->dpij", scores, scores), axis=0)
-    c = unknowns.shared
-    found = np.sqrt(np.diag(np.linalg.inv(reduced_hessian(information, c).sum(axis=0))))
-    assert np.allclose(found / np.sqrt(np.diag(limit)), 1.0, atol=0.2)
-
-
-def with_hit(data, hit):
-    return replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)})
-
-
-def columns_of(state, unknowns, function, step=1e-6):
-    """Central differences of a function (p, n) of the state by all unknowns, (p, n, k)."""
-    out = []
-    for i in range(unknowns.shared + unknowns.own):
-        two = []
-        for e in (step, -step):
-            shared, own = np.zeros(unknowns.shared), np.zeros((len(state.boards), unknowns.own))
-            if i < unknowns.shared:
-                shared[i] = e
-            else:
-                own[:, i - unknowns.shared] = e
-            two.append(function(move_state(state, (shared, own), unknowns)))
-        out.append((two[0] - two[1]) / (2 * step))
-    return np.stack(out, axis=-1)
-
-
-def numeric_predictions(state, data, unknowns):
-    """Whitened numeric Jacobians of ranges and views."""
-    return [
-        columns_of(state, unknowns, lambda s, n=name: whiten(named_blocks(s, data, unknowns)[n], False)[0])
-        for name in ("face", "view")
-    ]
-
-
-def beam_slopes(state, data, unknowns):
-    """Scores of the beams, by differences of their costs."""
-    return columns_of(state, unknowns, lambda s: named_blocks(s, data, unknowns)["beam"].cost)
+        scores.append(plain + np.sum(np.where(hit[..., None], slope[1], slope[0]), axis=1))
+    information = reduced_hessian(np.mean(np.einsum("dpi,dpj->dpij", scores, scores), axis=0), c).sum(axis=0)
+    ratio = np.diag(np.linalg.inv(information)) / np.diag(bound(obs, truth, unknowns))
+    assert np.allclose(np.sqrt(ratio), 1.0, atol=0.2)
 
 
 def test_what_leaves_no_bound_is_named():

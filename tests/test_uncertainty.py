@@ -18,15 +18,8 @@ from lrfcal_lib.evaluate.uncertainty import (
     range_noise,
     spread,
 )
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import (
-    lrf_to_platform,
-    lrf_to_source,
-    move_pose,
-    polar_to_points,
-    pose_array,
-    pose_transform,
-)
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
@@ -39,19 +32,19 @@ MOUNTS = ("head", "platform")
 
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
     mix = size * rng.normal(size=(13, 13)) / 3
-    pose = None if camera is None else pose_array(camera)
-    return Chain(pose_array(HEAD), pose, mount == "head", (mix @ mix.T,), np.zeros((0, 13)))
+    pose = None if camera is None else geometry.pose_array(camera)
+    return Chain(geometry.pose_array(HEAD), pose, mount == "head", (mix @ mix.T,), np.zeros((0, 13)))
 
 
 def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     """The chain carried out with the library's transforms, all links changed by `change` (13,)."""
-    head = pose_transform(move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0)))
+    head = geometry.pose_transform(geometry.move_pose(chain.head, np.insert(change[:4], [0, 2], 0.0)))
     scale = lambda angle: angle * (1 + change[11]) + change[12]  # noqa: E731
-    p = polar_to_points(distance - change[10], bearing)
-    source = lrf_to_source(p, scale(pitch), head, "head" if chain.on_head else "platform", scale(image_pitch))
+    p = geometry.polar_to_points(distance - change[10], bearing)
+    source = geometry.lrf_to_source(p, scale(pitch), head, "head" if chain.on_head else "platform", scale(image_pitch))
     if chain.camera is None:
         return source
-    return pose_transform(move_pose(chain.camera, change[4:10])).apply(source)
+    return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(source)
 
 
 @pytest.fixture(scope="module", params=MOUNTS)
@@ -79,7 +72,7 @@ def test_jacobian_of_the_chain(mount, camera):
 def test_beams_to_inverts_the_platform():
     rng = np.random.default_rng(1)
     bearing, pitch, distance = rng.uniform(0.6, 2.5, 50), rng.uniform(-0.8, 0.8, 50), rng.uniform(0.5, 5, 50)
-    points = lrf_to_platform(polar_to_points(distance, bearing), pitch, HEAD)
+    points = geometry.lrf_to_platform(geometry.polar_to_points(distance, bearing), pitch, HEAD)
     assert np.allclose(beams_to(points, HEAD), [bearing, pitch, distance], atol=1e-9)
 
 

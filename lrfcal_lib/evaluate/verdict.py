@@ -15,6 +15,8 @@ from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 
 YES, CARE, NO = "yes", "with care", "no"
+FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
+         NO: "This calibration cannot be trusted"}  # fmt: skip
 DISTANCES = (1.0, 2.0, 5.0)  # metres
 FEWEST, FEW = 3, 6  # placements
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
@@ -88,19 +90,13 @@ class Verdict:
 
     def record(self):
         """Answer, reasons and expected errors, ready for JSON."""
-        errors = {f"{distance:g}": values for distance, values in self.errors.items()}
-        reasons = [vars(reason) for reason in self.reasons]
+        reasons, errors = [vars(reason) for reason in self.reasons], {f"{d:g}": e for d, e in self.errors.items()}
         return {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
 
     def sentences(self):
         """For the first page: the warning before anything else, the errors, what to record next."""
-        first = {
-            YES: "This calibration can be trusted.",
-            CARE: "Use this calibration with care: ",
-            NO: "This calibration cannot be trusted: ",
-        }[self.answer]
-        words = [r.words for r in self.reasons]
-        out = [first + ("; ".join(words) + "." if words else "")]
+        why = "; ".join(reason.words for reason in self.reasons)
+        out = [f"{FIRST[self.answer]}: {why}." if why else f"{FIRST[self.answer]}."]
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
         out += self.notes
         if self.errors:
@@ -222,9 +218,8 @@ def _without_joint(calibration, method):
     fewest = min(len(calibration.observations[camera, "half_step"].all_placements) for camera in solved)
     if fewest < FEW:
         reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
-    for camera in (c for c in prepared.views if c not in solved):
-        words = f"camera '{camera}' is not handed over ({problems.get((camera, method), 'no result')})"
-        reasons.append(Reason(CARE, "cameras", words))
+    lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
+    reasons += [Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})") for c, why in lost.items()]
     # the range offset of the cloud may be what the maker admits
     platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
@@ -282,17 +277,12 @@ def _left_out(calibration, method):
 def diagnose(solution):
     """Weaknesses of a JointSolution and of the recording behind it: list of Reason."""
     iterations, view = solution.solution.iterations, solution.data.view
-    seen = {
-        name: int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
-        for number, name in enumerate(solution.transforms)
-    }
+    seen = [np.any(view["used"] & (view["camera"] == i), axis=1).sum() for i in range(len(solution.transforms))]
+    seen = list(zip(seen, solution.transforms, strict=True))
     own = [words for words in solution.warnings if not words.startswith(SAID)]
     findings = [
         (not solution.converged, NO, "convergence", f"the estimate has not converged after {iterations} iterations"),
-        *(
-            (count < FEWEST, CARE, "cameras", f"camera '{name}' sees the board in {count} placements only")
-            for name, count in seen.items()
-        ),
+        *((n < FEWEST, CARE, "cameras", f"camera '{c}' sees the board in {n} placements only") for n, c in seen),
         (solution.unobservable, NO, "unobservable", f"the data do not determine {'; '.join(solution.unobservable)}"),
         *_of_placements(solution),
         *_of_residuals(solution),

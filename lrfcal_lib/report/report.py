@@ -29,7 +29,7 @@ from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 
-NOTEBOOKS = ROOT / "notebooks"
+NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
 OWN_FILES = ("figures", "tables", "parts", "findings.json", "calibration.json", "cloud.ply", "index.html")
 PART = ".report-"  # begins the names of folders in which a report is being written
@@ -81,7 +81,7 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session_path = Path(session_path).resolve()
     session = open_session(session_path)
     out = Path(out or ROOT / "reports" / session_path.name).resolve()
-    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb") if notebooks is None else map(Path, notebooks))
+    paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
         runs = _execute_all(paths, environment, new, jobs)
@@ -192,8 +192,7 @@ def _stop(number, frame):
 
 
 def _report(session, options):
-    begin = time.monotonic()
-    out = Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
+    begin, out = time.monotonic(), Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, options.jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
@@ -206,8 +205,7 @@ def _report(session, options):
 def _store_all(session):
     open_session(session)
     with TemporaryDirectory(prefix="lrfcal-") as cache:
-        paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
-        errors = {path.name: store(path, session.resolve(), cache) for path in paths}
+        errors = {path.name: store(path, session.resolve(), cache) for path in sorted(NOTEBOOKS.glob(NUMBERED))}
     for name, error in errors.items():
         print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
     return 1 if any(errors.values()) else 0
@@ -301,18 +299,14 @@ def _write_index(out, session, runs, found, seconds):
         (Path(__file__).parent / "report.html.jinja").read_text(encoding="utf-8")
     )
     page = template.render(
-        session=session,
-        runs=runs,
-        found=found,
-        seconds=seconds,
-        failed=[run for run in runs if run.error],
+        session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
         verdicts=[entry for run in runs for entry in found[run.name]["verdicts"]],
         thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
         rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
         files=[name for name in ("calibration.json", "cloud.ply", "findings.json") if (out / name).is_file()],
         provenance=_provenance(session),
-    )
+    )  # fmt: skip
     (out / "index.html").write_text(page, encoding="utf-8")
 
 
