@@ -234,7 +234,7 @@ def _lrf_info(beam):
     view, step = (float(bearings[0]), float(bearings[-1])), math.radians(beam.resolution / 100)
     return LrfInfo(
         f"{beam.name} (emulated)", view, step, beam.sigma_range, range_resolution=beam.unit,
-        max_range=LARGEST_WORD * beam.unit, spot=(beam.spot_exit, beam.divergence),
+        max_range=LARGEST_WORD * beam.unit, spot_exit=beam.spot_exit, spot_divergence=beam.divergence,
     )  # fmt: skip
 
 
