@@ -46,18 +46,8 @@ LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its 
 class ImageRecord:
     """One row of images.csv.
 
-    Attributes
-    ----------
-    camera : str
-    file : Path
-        Where the image is now.
-    placement : int
-        -1 where the image belongs to no placement.
-    pitch : float
-        Of the platform, radians; NaN where unknown or of no importance (camera on the base).
-    time_s : float
-        NaN where unknown.
-    purpose : {'intrinsics', 'board', 'scene'}
+    `file` is where the image is now; `placement` -1 where it belongs to none; `pitch` of the platform (radians) and
+    `time_s` are NaN where unknown; `purpose` one of 'intrinsics', 'board', 'scene'.
     """
 
     camera: str
@@ -70,17 +60,9 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class EdgePick:
-    """An edge of the board picked by hand; overrides the detector.
+    """An edge of the board picked by hand in an image; overrides the detector.
 
-    Attributes
-    ----------
-    camera : str
-    file : Path
-        The image.
-    edge : str
-        Name of the board's edge.
-    ends : ndarray, shape (2, 2)
-        Two pixels on the edge as recorded (distorted), far apart.
+    `ends`, shape (2, 2), are two pixels on the edge as recorded (distorted), far apart.
     """
 
     camera: str
@@ -136,22 +118,9 @@ def read_npz(file, within):
 def check_scans(scans):
     """Scan lines with consistent shapes and credible units.
 
-    Parameters
-    ----------
-    scans : dict of ndarray
-        ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and intensities (N, B)
-        where there are any.
-
-    Returns
-    -------
-    dict of ndarray
-        The same as floats (placement: integers); ranges that are zero or infinite became NaN, in place.
-
-    Raises
-    ------
-    KeyError, ValueError
-        For a missing array, wrong shapes, ranges in millimetres, angles in degrees, bearings that do not ascend, or
-        no range at all.
+    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and
+    intensities (N, B) where there are any; gives the same as floats (placement: integers), zero or infinite ranges NaN.
+    KeyError or ValueError for a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
     """
     ranges = np.asarray(scans["ranges"], float)
     if ranges.ndim != 2:
@@ -253,22 +222,9 @@ def read_edges(path, stated, records):
 
 
 def image_size(file, within=None):
-    """Width and height of a PNG or JPEG image from its header; also notices a cut-off end.
+    """Width and height of a PNG or JPEG image from its header; SessionError if it is missing, cut off, or neither.
 
-    Parameters
-    ----------
-    file : path-like
-    within : path-like, optional
-        The session's folder, where it is a file of a session.
-
-    Returns
-    -------
-    tuple of int
-
-    Raises
-    ------
-    SessionError
-        For a missing, truncated or other file.
+    `within` is the session's folder, where the image is a file of a session.
     """
     return size_in_header(file, read_bytes(file, within))
 
@@ -318,15 +274,12 @@ class Sweep:
 
     Attributes
     ----------
-    placement : int
     ranges : ndarray, shape (L, B)
         Metres, in the order of acquisition; NaN where nothing came back or nothing was recorded.
     bearings : ndarray, shape (B,)
         Radians, ascending; 0 right, pi/2 ahead.
-    pitch : ndarray, shape (L,)
-        Radians; positive lifts the view.
-    time_s : ndarray, shape (L,)
-        NaN where unknown.
+    pitch, time_s : ndarray, shape (L,)
+        Radians, positive lifts the view; seconds, NaN where unknown.
     intensities : ndarray, shape (L, B), or None
     """
 
@@ -344,10 +297,8 @@ class Session:
 
     Attributes
     ----------
-    path : Path
     name, licence, source : str
         `source` says where the recording came from.
-    simulated : bool
     board : Board
     lrf : LrfInfo
     T_head_lrf : RigidTransform or None
@@ -387,21 +338,7 @@ class Session:
     telegrams: TelegramLog | None = field(default=None, repr=False)
 
     def sweep(self, placement):
-        """The scan lines of a placement.
-
-        Parameters
-        ----------
-        placement : int
-
-        Returns
-        -------
-        Sweep
-
-        Raises
-        ------
-        SessionError
-            If the placement is not in the session, or has no scan line with a range.
-        """
+        """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
         if placement not in self.placements:
             raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
         rows = self.scans["placement"] == placement
@@ -411,38 +348,15 @@ class Session:
         return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
 
     def images(self, camera=None, placement=None, purpose=None):
-        """The records of images that match all that is given, in the order of images.csv.
-
-        Parameters
-        ----------
-        camera : str, optional
-        placement : int, optional
-        purpose : str, optional
-
-        Returns
-        -------
-        tuple of ImageRecord
-        """
+        """The records of images that match all that is given, in the order of images.csv."""
         wanted = {"camera": camera, "placement": placement, "purpose": purpose}
         wanted = {k: v for k, v in wanted.items() if v is not None}
         return tuple(r for r in self.image_records if all(getattr(r, k) == v for k, v in wanted.items()))
 
     def read_image(self, record):
-        """The pixels of an image.
+        """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width, 3).
 
-        Parameters
-        ----------
-        record : ImageRecord
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3)
-            Blue, green, red.
-
-        Raises
-        ------
-        SessionError
-            If the file cannot be decoded or has another size than the camera.
+        SessionError if the file cannot be decoded or has another size than the camera.
         """
         camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
         check_image_size(record.file, size_in_header(record.file, data), camera)
@@ -465,17 +379,13 @@ class Session:
         return tuple(p for p in self.placements if p not in scenes)
 
     def telegram_report(self, placement=None):
-        """What became of the recorded telegrams: counts, CRC failures, special values by reason.
-
-        Parameters
-        ----------
-        placement : int, optional
-            All by default.
+        """What became of the recorded telegrams, of a placement or (by default) of all.
 
         Returns
         -------
         dict
-            See :meth:`lrfcal_lib.session.telegrams.TelegramLog.report`.
+            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
+            'wrong_crc_offsets' : tuple of int.
 
         Raises
         ------
@@ -496,12 +406,7 @@ class Session:
 
 
 def open_session(path):
-    """Open a session and check all of it.
-
-    Parameters
-    ----------
-    path : path-like
-        The session's folder.
+    """Open a session (its folder) and check all of it.
 
     Returns
     -------
@@ -530,16 +435,9 @@ def open_session(path):
 
 
 def validate(path):
-    """Everything that is wrong with a session, as sentences.
+    """Everything that is wrong with a session, as sentences; none for a sound one.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    list of str
-        Empty for a sound session. The first entry is what keeps the session from being opened, if anything does.
+    The first is what keeps the session from being opened, if anything does.
     """
     try:
         session = open_session(path)
