@@ -14,22 +14,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import (
-    SCHEMA,
-    CameraInfo,
-    LrfInfo,
-    SessionError,
-    check_amount,
-    listed,
-    naming,
-    opened,
-    parse_session,
-    read_bytes,
-    read_json,
-    read_table,
-    reading,
-    short,
-)
+from lrfcal_lib.session import stated
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, opened, reading, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
@@ -82,7 +68,7 @@ def read_scans(path, file):
     if file not in SOURCES:
         raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
     lrf, lexists = path / "lrf", os.path.lexists
-    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, listed(lrf, path))):
+    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, stated.listed(lrf, path))):
         raise SessionError(
             f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') completes it"
         )
@@ -108,7 +94,7 @@ def read_npz(file, within):
             with naming(file):
                 if kind.kind not in "fiub" or kind.itemsize > 8:
                     raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
-                check_amount(values)
+                stated.check_amount(values)
             with archive.open(f"{key}.npy") as member:
                 scans[key] = np.lib.format.read_array(member, allow_pickle=False)
     with naming(file):
@@ -172,16 +158,16 @@ def inside(path, name, where):
     return path / name
 
 
-def read_images(path, stated, unfinished=None):
+def read_images(path, facts, unfinished=None):
     """The records of images.csv; every image must exist, be complete and have its camera's size.
 
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
     """
-    file, cameras = path / "images.csv", stated["cameras"]
+    file, cameras = path / "images.csv", facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
     out, skipped = [], {str(p) for p in unfinished or ()}
-    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
@@ -191,7 +177,7 @@ def read_images(path, stated, unfinished=None):
             if row["purpose"] not in PURPOSES:
                 raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
             placement = int(row["placement"] or -1)
-            if placement not in (*stated["placements"], -1):
+            if placement not in (*facts["placements"], -1):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
@@ -200,11 +186,11 @@ def read_images(path, stated, unfinished=None):
     return tuple(out)
 
 
-def read_edges(path, stated, records):
+def read_edges(path, facts, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
     file, out = path / "edges.csv", []
-    known, edges = {(r.camera, r.file) for r in records}, stated["board"].edges
-    rows = read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
+    known, edges = {(r.camera, r.file) for r in records}, facts["board"].edges
+    rows = stated.read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -226,7 +212,7 @@ def image_size(file, within=None):
 
     `within` is the session's folder, where the image is a file of a session.
     """
-    return size_in_header(file, read_bytes(file, within))
+    return size_in_header(file, stated.read_bytes(file, within))
 
 
 def size_in_header(file, data):
@@ -358,7 +344,7 @@ class Session:
 
         SessionError if the file cannot be decoded or has another size than the camera.
         """
-        camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
+        camera, data = self.cameras[record.camera], stated.read_bytes(record.file, self.path)
         check_image_size(record.file, size_in_header(record.file, data), camera)
         with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -419,19 +405,19 @@ def open_session(path):
         away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
-    data = read_json(path / "session.json", path)
-    if data.get("schema") != SCHEMA:
-        raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
+    data = stated.read_json(path / "session.json", path)
     with naming(path / "session.json"):
-        stated = parse_session(data)
-        unfinished = stated.pop("unfinished")
+        if data.get("schema") != stated.SCHEMA:
+            raise ValueError(f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'")
+        facts = stated.parse_session(data)
+        unfinished = facts.pop("unfinished")
         scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
-    records = read_images(path, stated, unfinished)
-    picks = read_edges(path, stated, records)
-    problems = missing_parts(stated["placements"], scans, records, stated["cameras"], unfinished)
-    problems += () if log is None else (*log.problems, *other_than_stated(scans, stated["lrf"]))
+    records = read_images(path, facts, unfinished)
+    picks = read_edges(path, facts, records)
+    problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)
+    problems += () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
     found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
-    return Session(path=path, **found, **stated)
+    return Session(path=path, **found, **facts)
 
 
 def validate(path):
@@ -456,7 +442,7 @@ def _disorder(session):
     """What two writers, or hands, do to tables: time that runs back within a placement, rows that stand there twice."""
     for name, (columns, group, once) in ORDERED.items():
         file, last, seen = session.path / name, {}, {}
-        rows = read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
+        rows = stated.read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
         for line, row in enumerate(rows, start=2):
             where, what = f"{file} line {line}", tuple(row[key] for key in once)
             if what in seen:
