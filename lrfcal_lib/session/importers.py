@@ -31,14 +31,12 @@ LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from wh
 
 
 def import_lasersetero(src, dst, *, intrinsics="own"):
-    """Make a session of the public LMS400 + ZED recording.
+    """Make a session `dst` of the public LMS400 + ZED recording.
 
     Parameters
     ----------
     src : path-like
         Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and ``Calib_Results_{left,right}.m``.
-    dst : path-like
-        The new session.
     intrinsics : {'own', 'published'}
         'own' leaves the intrinsics open, so that they are estimated from the session's images; 'published' takes them
         from the Bouguet results. Either way the published ones are kept in the session's reference.
@@ -173,22 +171,10 @@ def read_pcd(file):
 
 
 def read_bouguet(file):
-    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox.
+    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if something is missing.
 
-    Parameters
-    ----------
-    file : path-like
-
-    Returns
-    -------
-    dict
-        ``model``: CameraModel (the toolbox prints three standard deviations; they become the covariance's diagonal);
-        ``reference``: the same as plain numbers, with ``T_camera_board`` by image number (millimetres became metres).
-
-    Raises
-    ------
-    SessionError
-        If the file or a value in it is missing.
+    A dict: ``model``, a CameraModel (the toolbox prints three standard deviations, which its covariance holds squared),
+    and ``reference``, the same as plain numbers, with ``T_camera_board`` by image number (millimetres became metres).
     """
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}

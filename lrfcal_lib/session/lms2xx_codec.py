@@ -23,15 +23,8 @@ class TelegramError(ValueError):
 class Telegram:
     """A telegram without its frame.
 
-    Attributes
-    ----------
-    code : int
-        Command, or command + 0x80 in replies.
-    data : bytes
-        Without code and status.
-    status : int or None
-        Last byte of a reply; None in telegrams to the device.
-    address : int
+    `code` is the command, or command + 0x80 in replies; `data` without code and status; `status` the last byte of a
+    reply, None in telegrams to the device.
     """
 
     code: int
@@ -46,16 +39,14 @@ class Stream:
 
     Attributes
     ----------
-    offset, length : ndarray of int, shape (n,)
+    offset, length, code : ndarray, shape (n,)
         Of whole telegrams with the right CRC.
-    code : ndarray of uint8, shape (n,)
     rejected : ndarray of int, shape (m,)
         Offsets outside of those where a telegram seems to begin whose CRC is wrong.
     skipped : int
         Bytes before `pending` that belong to no telegram.
     pending : int
-        Where a telegram may begin whose end has not come yet, so that the bytes from there on must be kept; the number
-        of bytes if there is none.
+        Where a telegram may begin whose end has not come yet (the bytes from there on must be kept), or the end.
     """
 
     offset: np.ndarray
@@ -102,21 +93,7 @@ def times_power(power):
 
 
 def encode_telegram(code, data=b"", *, status=None, address=None):
-    """Bytes of a telegram.
-
-    Parameters
-    ----------
-    code : int
-        Command, or reply code.
-    data : bytes-like
-    status : int, optional
-        Makes it a reply: appended to the data.
-    address : int, optional
-        By default 0x00 to the device, 0x80 for replies.
-
-    Returns
-    -------
-    bytes
+    """Bytes of a telegram; `status` makes it a reply, addresses are 0x00 to the device and 0x80 for replies by default.
 
     Raises
     ------
@@ -135,17 +112,7 @@ def encode_telegram(code, data=b"", *, status=None, address=None):
 
 
 def parse_telegram(raw):
-    """Take the frame off one telegram (from the start byte to the CRC, nothing else).
-
-    Returns
-    -------
-    Telegram
-
-    Raises
-    ------
-    TelegramError
-        If the start byte, the length or the CRC is wrong.
-    """
+    """The Telegram in bytes from the start byte to the CRC; TelegramError if start, length or CRC is wrong."""
     raw = bytes(raw)
     if len(raw) < OVERHEAD + 1 or raw[0] != STX:
         raise TelegramError(f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}")
@@ -276,8 +243,6 @@ class Scans:
         As sent, flags included.
     ranges : ndarray, shape (n, B)
         Metres; inf where the device says larger than its maximum, NaN for all other special values.
-    unit : {'cm', 'mm'}
-    mode : int
     partial : ndarray of int, shape (n,)
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
@@ -333,7 +298,7 @@ def special_values(words, mode):
 
 
 def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
-    """Values of a scan as a device sends them.
+    """Values of a scan as a device sends them, ndarray of uint16.
 
     Parameters
     ----------
@@ -347,11 +312,6 @@ def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
         Index into `REASONS` for each value; where it is not 0 the range does not count.
     flags : array_like of int
         The upper bits.
-
-    Returns
-    -------
-    ndarray of uint16
-        In the shape of `ranges`.
 
     Raises
     ------
@@ -383,11 +343,6 @@ def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, add
         0 to 3 for the quarters of a degree of an interlaced scan, -1 for a whole scan.
     indices : tuple of int, optional
         Real-time indices: scan and telegram, modulo 256.
-    status, address : int
-
-    Returns
-    -------
-    bytes
 
     Raises
     ------
@@ -419,24 +374,9 @@ def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, flags=0, **options):
 
 
 def decode_scan(raw, mode=0):
-    """One scan out of the telegram 0xB0.
+    """One scan out of the whole telegram 0xB0, Scans with one row, in a measuring mode that the telegram does not tell.
 
-    Parameters
-    ----------
-    raw : bytes-like
-        The whole telegram.
-    mode : int
-        Measuring mode, which the telegram does not tell; 0 is the factory's.
-
-    Returns
-    -------
-    Scans
-        With one row.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another telegram, or its number of values does not fit its length.
+    TelegramError if it is damaged, another telegram, or its number of values does not fit its length.
     """
     telegram = parse_telegram(raw)
     if telegram.code != SCAN:

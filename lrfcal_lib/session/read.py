@@ -14,22 +14,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import (
-    SCHEMA,
-    CameraInfo,
-    LrfInfo,
-    SessionError,
-    check_amount,
-    listed,
-    naming,
-    opened,
-    parse_session,
-    read_bytes,
-    read_json,
-    read_table,
-    reading,
-    short,
-)
+from lrfcal_lib.session import stated
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, opened, reading, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
@@ -46,18 +32,8 @@ LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its 
 class ImageRecord:
     """One row of images.csv.
 
-    Attributes
-    ----------
-    camera : str
-    file : Path
-        Where the image is now.
-    placement : int
-        -1 where the image belongs to no placement.
-    pitch : float
-        Of the platform, radians; NaN where unknown or of no importance (camera on the base).
-    time_s : float
-        NaN where unknown.
-    purpose : {'intrinsics', 'board', 'scene'}
+    `file` is where the image is now; `placement` -1 where it belongs to none; `pitch` of the platform (radians) and
+    `time_s` are NaN where unknown; `purpose` one of 'intrinsics', 'board', 'scene'.
     """
 
     camera: str
@@ -70,17 +46,9 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class EdgePick:
-    """An edge of the board picked by hand; overrides the detector.
+    """An edge of the board picked by hand in an image; overrides the detector.
 
-    Attributes
-    ----------
-    camera : str
-    file : Path
-        The image.
-    edge : str
-        Name of the board's edge.
-    ends : ndarray, shape (2, 2)
-        Two pixels on the edge as recorded (distorted), far apart.
+    `ends`, shape (2, 2), are two pixels on the edge as recorded (distorted), far apart.
     """
 
     camera: str
@@ -100,7 +68,7 @@ def read_scans(path, file):
     if file not in SOURCES:
         raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
     lrf, lexists = path / "lrf", os.path.lexists
-    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, listed(lrf, path))):
+    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, stated.listed(lrf, path))):
         raise SessionError(
             f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') completes it"
         )
@@ -126,7 +94,7 @@ def read_npz(file, within):
             with naming(file):
                 if kind.kind not in "fiub" or kind.itemsize > 8:
                     raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
-                check_amount(values)
+                stated.check_amount(values)
             with archive.open(f"{key}.npy") as member:
                 scans[key] = np.lib.format.read_array(member, allow_pickle=False)
     with naming(file):
@@ -136,22 +104,9 @@ def read_npz(file, within):
 def check_scans(scans):
     """Scan lines with consistent shapes and credible units.
 
-    Parameters
-    ----------
-    scans : dict of ndarray
-        ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and intensities (N, B)
-        where there are any.
-
-    Returns
-    -------
-    dict of ndarray
-        The same as floats (placement: integers); ranges that are zero or infinite became NaN, in place.
-
-    Raises
-    ------
-    KeyError, ValueError
-        For a missing array, wrong shapes, ranges in millimetres, angles in degrees, bearings that do not ascend, or
-        no range at all.
+    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and
+    intensities (N, B) where there are any; gives the same as floats (placement: integers), zero or infinite ranges NaN.
+    KeyError or ValueError for a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
     """
     ranges = np.asarray(scans["ranges"], float)
     if ranges.ndim != 2:
@@ -203,16 +158,16 @@ def inside(path, name, where):
     return path / name
 
 
-def read_images(path, stated, unfinished=None):
+def read_images(path, facts, unfinished=None):
     """The records of images.csv; every image must exist, be complete and have its camera's size.
 
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
     """
-    file, cameras = path / "images.csv", stated["cameras"]
+    file, cameras = path / "images.csv", facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
     out, skipped = [], {str(p) for p in unfinished or ()}
-    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
@@ -222,7 +177,7 @@ def read_images(path, stated, unfinished=None):
             if row["purpose"] not in PURPOSES:
                 raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
             placement = int(row["placement"] or -1)
-            if placement not in (*stated["placements"], -1):
+            if placement not in (*facts["placements"], -1):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
@@ -231,11 +186,11 @@ def read_images(path, stated, unfinished=None):
     return tuple(out)
 
 
-def read_edges(path, stated, records):
+def read_edges(path, facts, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
     file, out = path / "edges.csv", []
-    known, edges = {(r.camera, r.file) for r in records}, stated["board"].edges
-    rows = read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
+    known, edges = {(r.camera, r.file) for r in records}, facts["board"].edges
+    rows = stated.read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -253,24 +208,11 @@ def read_edges(path, stated, records):
 
 
 def image_size(file, within=None):
-    """Width and height of a PNG or JPEG image from its header; also notices a cut-off end.
+    """Width and height of a PNG or JPEG image from its header; SessionError if it is missing, cut off, or neither.
 
-    Parameters
-    ----------
-    file : path-like
-    within : path-like, optional
-        The session's folder, where it is a file of a session.
-
-    Returns
-    -------
-    tuple of int
-
-    Raises
-    ------
-    SessionError
-        For a missing, truncated or other file.
+    `within` is the session's folder, where the image is a file of a session.
     """
-    return size_in_header(file, read_bytes(file, within))
+    return size_in_header(file, stated.read_bytes(file, within))
 
 
 def size_in_header(file, data):
@@ -318,15 +260,12 @@ class Sweep:
 
     Attributes
     ----------
-    placement : int
     ranges : ndarray, shape (L, B)
         Metres, in the order of acquisition; NaN where nothing came back or nothing was recorded.
     bearings : ndarray, shape (B,)
         Radians, ascending; 0 right, pi/2 ahead.
-    pitch : ndarray, shape (L,)
-        Radians; positive lifts the view.
-    time_s : ndarray, shape (L,)
-        NaN where unknown.
+    pitch, time_s : ndarray, shape (L,)
+        Radians, positive lifts the view; seconds, NaN where unknown.
     intensities : ndarray, shape (L, B), or None
     """
 
@@ -344,10 +283,8 @@ class Session:
 
     Attributes
     ----------
-    path : Path
     name, licence, source : str
         `source` says where the recording came from.
-    simulated : bool
     board : Board
     lrf : LrfInfo
     T_head_lrf : RigidTransform or None
@@ -387,21 +324,7 @@ class Session:
     telegrams: TelegramLog | None = field(default=None, repr=False)
 
     def sweep(self, placement):
-        """The scan lines of a placement.
-
-        Parameters
-        ----------
-        placement : int
-
-        Returns
-        -------
-        Sweep
-
-        Raises
-        ------
-        SessionError
-            If the placement is not in the session, or has no scan line with a range.
-        """
+        """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
         if placement not in self.placements:
             raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
         rows = self.scans["placement"] == placement
@@ -411,40 +334,17 @@ class Session:
         return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
 
     def images(self, camera=None, placement=None, purpose=None):
-        """The records of images that match all that is given, in the order of images.csv.
-
-        Parameters
-        ----------
-        camera : str, optional
-        placement : int, optional
-        purpose : str, optional
-
-        Returns
-        -------
-        tuple of ImageRecord
-        """
+        """The records of images that match all that is given, in the order of images.csv."""
         wanted = {"camera": camera, "placement": placement, "purpose": purpose}
         wanted = {k: v for k, v in wanted.items() if v is not None}
         return tuple(r for r in self.image_records if all(getattr(r, k) == v for k, v in wanted.items()))
 
     def read_image(self, record):
-        """The pixels of an image.
+        """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width, 3).
 
-        Parameters
-        ----------
-        record : ImageRecord
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3)
-            Blue, green, red.
-
-        Raises
-        ------
-        SessionError
-            If the file cannot be decoded or has another size than the camera.
+        SessionError if the file cannot be decoded or has another size than the camera.
         """
-        camera, data = self.cameras[record.camera], read_bytes(record.file, self.path)
+        camera, data = self.cameras[record.camera], stated.read_bytes(record.file, self.path)
         check_image_size(record.file, size_in_header(record.file, data), camera)
         with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -465,17 +365,13 @@ class Session:
         return tuple(p for p in self.placements if p not in scenes)
 
     def telegram_report(self, placement=None):
-        """What became of the recorded telegrams: counts, CRC failures, special values by reason.
-
-        Parameters
-        ----------
-        placement : int, optional
-            All by default.
+        """What became of the recorded telegrams, of a placement or (by default) of all.
 
         Returns
         -------
         dict
-            See :meth:`lrfcal_lib.session.telegrams.TelegramLog.report`.
+            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
+            'wrong_crc_offsets' : tuple of int.
 
         Raises
         ------
@@ -496,12 +392,7 @@ class Session:
 
 
 def open_session(path):
-    """Open a session and check all of it.
-
-    Parameters
-    ----------
-    path : path-like
-        The session's folder.
+    """Open a session (its folder) and check all of it.
 
     Returns
     -------
@@ -514,32 +405,25 @@ def open_session(path):
         away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
-    data = read_json(path / "session.json", path)
-    if data.get("schema") != SCHEMA:
-        raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
+    data = stated.read_json(path / "session.json", path)
     with naming(path / "session.json"):
-        stated = parse_session(data)
-        unfinished = stated.pop("unfinished")
+        if data.get("schema") != stated.SCHEMA:
+            raise ValueError(f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'")
+        facts = stated.parse_session(data)
+        unfinished = facts.pop("unfinished")
         scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
-    records = read_images(path, stated, unfinished)
-    picks = read_edges(path, stated, records)
-    problems = missing_parts(stated["placements"], scans, records, stated["cameras"], unfinished)
-    problems += () if log is None else (*log.problems, *other_than_stated(scans, stated["lrf"]))
+    records = read_images(path, facts, unfinished)
+    picks = read_edges(path, facts, records)
+    problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)
+    problems += () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
     found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
-    return Session(path=path, **found, **stated)
+    return Session(path=path, **found, **facts)
 
 
 def validate(path):
-    """Everything that is wrong with a session, as sentences.
+    """Everything that is wrong with a session, as sentences; none for a sound one.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    list of str
-        Empty for a sound session. The first entry is what keeps the session from being opened, if anything does.
+    The first is what keeps the session from being opened, if anything does.
     """
     try:
         session = open_session(path)
@@ -558,7 +442,7 @@ def _disorder(session):
     """What two writers, or hands, do to tables: time that runs back within a placement, rows that stand there twice."""
     for name, (columns, group, once) in ORDERED.items():
         file, last, seen = session.path / name, {}, {}
-        rows = read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
+        rows = stated.read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
         for line, row in enumerate(rows, start=2):
             where, what = f"{file} line {line}", tuple(row[key] for key in once)
             if what in seen:

@@ -28,18 +28,9 @@ from lrfcal_lib.model.camera import CameraModel
 
 
 def escape(text):
-    """Anything as HTML that shows it as text; all that becomes HTML comes through here, see also the report's template.
+    """Anything as HTML that shows it as text: no tags, entities, or formulas (MathJax finds no pair of signs).
 
-    Parameters
-    ----------
-    text : object
-        Names and remarks of a session may be somebody else's.
-
-    Returns
-    -------
-    str
-        Without tags and entities, and without formulas: MathJax, which searches pages for them, finds no pair of
-        signs in one piece of text.
+    All that becomes HTML comes through here, see also the report's template: names in a session may be somebody else's.
     """
     return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
 
@@ -97,10 +88,6 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
         Of ``os.open``; any but O_RDONLY writes.
     most : int
         Bytes that are read.
-
-    Returns
-    -------
-    file object
 
     Raises
     ------

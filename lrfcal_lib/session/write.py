@@ -26,19 +26,11 @@ class SessionWriter:
     Parameters
     ----------
     path : path-like
-        Must not exist or be an empty folder.
-    board : Board
-    lrf : LrfInfo
-    cameras : iterable of CameraInfo
-    T_head_lrf : RigidTransform, optional
-    name : str, optional
-        The folder's name by default.
-    platform_sigma : tuple of float, optional
-        How well `T_head_lrf` is known: direction (radians) and offset (metres).
+        Must not exist or be an empty folder; its name is the session's `name` by default.
+    board, lrf, cameras, T_head_lrf, platform_sigma, licence, source, simulated, reference
+        See :class:`lrfcal_lib.session.read.Session`.
     placements : iterable of int
         Placements known beforehand; those of added sweeps and images are added.
-    licence, source, simulated, reference
-        See :class:`lrfcal_lib.session.read.Session`.
 
     Raises
     ------
@@ -123,24 +115,17 @@ class SessionWriter:
             self._write_index()
 
     def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
-        """Append the scan lines of a placement.
+        """Append the scan lines of a placement; SessionError for wrong shapes or units, or other bearings than before.
 
         Parameters
         ----------
-        placement : int
         ranges : array_like, shape (L, B)
             Metres, NaN where nothing came back.
         bearings : array_like, shape (B,)
             Radians, ascending; the same in all sweeps of a session.
         pitch : array_like, shape (L,)
             Radians.
-        time_s : array_like, shape (L,), optional
-        intensities : array_like, shape (L, B), optional
-
-        Raises
-        ------
-        SessionError
-            For wrong shapes, wrong units, or other bearings than before.
+        time_s, intensities : array_like, shapes (L,) and (L, B), optional
         """
         if self.telegrams.exists():
             raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
@@ -165,9 +150,8 @@ class SessionWriter:
             -1 for none: replies that are no scans, scans between the sweeps.
         telegrams : sequence of bytes
             Whole telegrams in the order they came, also damaged ones.
-        pitch : float or array_like, shape (len(telegrams),)
-            Radians.
-        time_s : float or array_like, shape (len(telegrams),)
+        pitch, time_s : float or array_like, shape (len(telegrams),)
+            Radians, seconds.
 
         Raises
         ------
@@ -197,24 +181,10 @@ class SessionWriter:
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
-        """Append an image.
+        """Append an image: a PNG or JPEG file, copied byte for byte, or blue-green-red pixels (h, w, 3).
 
-        Parameters
-        ----------
-        camera : str
-        image : path-like or ndarray of uint8, shape (h, w, 3)
-            A PNG or JPEG file, copied byte for byte, or blue-green-red pixels.
-        placement : int
-            -1 for none.
-        pitch : float
-            Radians.
-        time_s : float
-        purpose : {'board', 'intrinsics', 'scene'}
-
-        Raises
-        ------
-        SessionError
-            For an unknown camera or purpose, or an image of another size than the camera's.
+        The placement is -1 for none, pitch in radians, purpose one of 'board', 'intrinsics', 'scene'. SessionError for
+        an unknown camera or purpose, or an image of another size than the camera's.
         """
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
@@ -234,15 +204,7 @@ def finish(path):
     """Complete a session: one scans.npz out of the sweeps. Also completes a session whose recording was interrupted.
 
     A recording of telegrams is complete as it is; only what a crash cut off at the end of a table is removed.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    SessionError
-        If there is no sweep, or one of them is damaged, or somebody records this session.
+    SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
         with stated.alone(path):
@@ -313,26 +275,13 @@ def append_file(file, content, within):
 
 
 class SessionRecorder(SessionWriter):
-    """A :class:`SessionWriter` for recordings that may be interrupted and go on later.
+    """A :class:`SessionWriter` for recordings that may be interrupted and go on later (`resume`).
 
     While a session is recorded, session.json has the key ``unfinished``: the placement that was begun. The placement
     joins ``placements`` when it is finished, in one renaming of session.json; until then every reader leaves it out.
     Going on, or dropping a placement, marks what was recorded of it: its rows of index.csv lose their placement, its
-    images get the purpose 'dropped'. No telegram and no image is deleted.
-
-    Parameters
-    ----------
-    path : path-like
-        Must not exist or be an empty folder, unless the recording goes on.
-    resume : bool
-        Go on with the recording in `path`, if there is one.
-    **about
-        As of :class:`SessionWriter`.
-
-    Raises
-    ------
-    SessionError
-        If there is a session already (or one that states another board or rig, where it goes on).
+    images get the purpose 'dropped'. No telegram and no image is deleted. SessionError if there is a session already,
+    or one that states another board or rig, where it goes on.
     """
 
     def __init__(self, path, board, lrf, cameras=(), T_head_lrf=None, *, resume=False, **about):
