@@ -1,5 +1,6 @@
 """The promises of the top-level files."""
 
+import importlib
 import os
 import re
 import shutil
@@ -196,3 +197,11 @@ def test_the_lab_opens_any_session_and_as_root(tmp_path, name):
     said = lab(tmp_path, 0, "SESSION=" + name.replace("$", "$$"))
     assert said.strip().endswith(f"LRFCAL_SESSION={tmp_path.resolve() / name}") and "--allow-root" in said
     assert "--allow-root" not in lab(tmp_path, 1000) and lab(tmp_path, 1000).strip().endswith("LRFCAL_SESSION=")
+
+
+def test_the_functions_that_the_readme_names_are_there():
+    names = re.findall(r"^\| `([a-z_.]+)\(", (ROOT / "README.md").read_text(), re.M)
+    assert len(names) == 10
+    for name in names:
+        module, function = name.rsplit(".", 1)
+        assert callable(getattr(importlib.import_module(f"lrfcal_lib.{module}"), function))
