@@ -35,16 +35,6 @@ def line_block(pose, obs):
 
     The sign of the distance is kept, and behind the camera the formula goes on (mirrored), so that a poor start value
     can still find its way. The whitener holds the crossing's covariance, projected, and the line's.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-        ``T_camera_source``.
-    obs : CameraObservations
-
-    Returns
-    -------
-    Block
     """
     lines, model = obs.crossing_lines, obs.model
     rotated = rotate_points(pose, obs.crossing_points)
@@ -96,20 +86,10 @@ def edge_residuals_px(obs, transform, model=None):
 
 
 def plane_residuals_m(obs, transform, board_poses=None):
-    """Signed distances of the board-face points from the planes the camera sees.
+    """Signed distances (m,) of the board-face points from the planes the camera sees under ``T_camera_source``.
 
-    Parameters
-    ----------
-    obs : CameraObservations
-    transform : RigidTransform
-        ``T_camera_source``.
-    board_poses : ndarray, shape (p, 4, 4), optional
-        Other poses than ``obs.board_poses`` (of a joint refinement).
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        Metres, along the board's z; NaN for placements whose board pose the camera does not know.
+    Metres, along the board's z; NaN for placements whose board pose the camera does not know. `board_poses` are other
+    poses than ``obs.board_poses`` (of a joint refinement).
     """
     poses = obs.board_poses if board_poses is None else board_poses
     out = np.full(len(obs.plane_points), np.nan)
@@ -156,19 +136,8 @@ def _slope(x):
 def edge_shift(log_odds, radius, background=0.0):
     """By how far a spot's centre may lie outside an edge and still read the board, and its derivative by `log_odds`.
 
-    Parameters
-    ----------
-    log_odds : float
-        Of the sensor, for a background as far and as bright as the board.
-    radius : array_like
-        Of the spot, metres.
-    background : array_like
-        What the background adds to the log odds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
-
-    Returns
-    -------
-    shift, slope : ndarray
-        Metres; positive where boards look larger.
+    Metres, positive where boards look larger. The log odds are the sensor's, for a background as far and as bright as
+    the board; `background` is what the real one adds: ``-2 ln(d_background / d_board)``, 0 where it is not known.
     """
     x, slope = disc_edge(log_odds + np.asarray(background, float))
     return radius * x, radius * slope
@@ -274,18 +243,9 @@ class JointState:
 class Unknowns:
     """Which columns of the full Jacobian are unknown.
 
-    Attributes
-    ----------
-    cameras, edges : int
-        How many there are.
-    axis, size : bool
-    sensor : tuple of str
-        Of `SENSOR`.
-    sweep : {'none', 'offset', 'offset_stretch'}
-    poses : bool
-        Whether the cameras' poses are unknown.
-    sides : bool
-        Whether every side of every placement has a deviation of its own from the sensor's edge bias.
+    `cameras` and `edges` are their numbers, `sensor` names some of `SENSOR`, `sweep` one of `SWEEPS`; `poses` tells
+    whether the cameras' are unknown, `sides` whether every side of every placement has a deviation of its own from the
+    sensor's edge bias.
     """
 
     cameras: int

@@ -21,16 +21,7 @@ AXIS_WORDS = (
 
 @dataclass(frozen=True)
 class PlatformPrior:
-    """A rough measurement of the axis.
-
-    Attributes
-    ----------
-    T_head_lrf : RigidTransform
-    sigma_direction : float
-        Radians, of each of the two angles.
-    sigma_offset : float
-        Metres, of each of the two offsets.
-    """
+    """A rough measurement of the axis; standard deviations of its two angles (radians) and two offsets (metres)."""
 
     T_head_lrf: RigidTransform
     sigma_direction: float

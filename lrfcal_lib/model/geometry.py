@@ -199,19 +199,10 @@ def _principal(points):
 
 
 def fit_plane(points):
-    """Total least squares plane ``normal . p = distance``.
+    """Total least squares plane ``normal . p = distance`` of points (n, 3), rows with NaN ignored.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        Rows with NaN are ignored. DegenerateGeometry with fewer than three points, or all on one line.
-
-    Returns
-    -------
-    normal : ndarray, shape (3,)
-        Unit vector, away from the origin (``distance >= 0``).
-    distance, rms : float
-        Of the origin, and root mean square of the points from the plane.
+    Returns the unit normal, away from the origin, the origin's distance (>= 0), and the root mean square distance of
+    the points. DegenerateGeometry with fewer than three points, or all on one line.
     """
     points = np.asarray(points, float)
     points = points[np.isfinite(points).all(axis=1)]
@@ -225,19 +216,9 @@ def fit_plane(points):
 
 
 def fit_line(points):
-    """Total least squares line in space.
+    """Total least squares line of points (n, 3): their centre, the unit direction, their rms distance.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        DegenerateGeometry with fewer than two distinct ones.
-
-    Returns
-    -------
-    point, direction : ndarray, shape (3,)
-        Centre of the points, on the line, and unit vector.
-    rms : float
-        Root mean square distance of the points from the line.
+    DegenerateGeometry with fewer than two distinct points.
     """
     points = np.asarray(points, float)
     if len(points) < 2 or np.ptp(points, axis=0).max() == 0:
@@ -305,16 +286,9 @@ def gradient_by_pose(rotated, gradient):
 def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
     """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the change of the variance.
 
-    Parameters
-    ----------
-    rotated, point : ndarray, shape (..., n, 3)
-        ``R p`` and ``R p + t``.
-    gradient : ndarray, shape (..., n, 3)
-        Of a scalar by the moved point: ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``.
-    shift : ndarray, shape (..., n, 3)
-        ``R C R^T`` times a gradient: the direction in which the noise pulls the point.
-    factor : ndarray, shape (..., n)
-        Weighted residual.
+    `rotated` and `point` are ``R p`` and ``R p + t``, `gradient` that of a scalar by the moved point,
+    ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``, `shift` (:func:`moved_noise`) the direction in which the
+    noise pulls the point, `factor` (..., n) the weighted residual.
     """
     spun = cross(shift, gradient)
     if not pinhole:

@@ -222,18 +222,8 @@ def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_ite
 def edge_bias(solution, radius=1.0, background=0.0):
     """By how much boards look larger at every edge, and its standard deviation, in units of `radius`.
 
-    Parameters
-    ----------
-    solution : Solution
-        Of the method 'line_ml'.
-    radius : float
-        Of the spot; 1 gives spot radii.
-    background : float
-        See :func:`lrfcal_lib.fit.residuals.edge_shift`; say the mean over the crossings.
-
-    Returns
-    -------
-    bias, sigma : float or ndarray
+    The solution is one of the method 'line_ml'; a radius of 1 gives spot radii. For `background` see
+    :func:`lrfcal_lib.fit.residuals.edge_shift`; say the mean over the crossings.
     """
     shift, slope = edge_shift(solution.parameters[..., 6], radius, background)
     return shift, np.abs(slope) * solution.sigma[..., 6]

@@ -168,8 +168,13 @@ def start_from_planes(obs, required=True):
     sets = plane_sets(obs, 3 if required else 1)
     if required:
         check_normals(sets, obs.camera)
-    triangles = compress(sets, 1.0)
-    candidates, flat = _plane_candidates(sets, triangles)
+    triangles, p = compress(sets, 1.0), len(sets.placements)
+    (frame, flat), found = common_plane(triangles), []
+    if p >= 3 and not flat:
+        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
+    if p >= 5:
+        found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
+    candidates = np.concatenate(found) if found else _rotation_grid_on_planes(sets, triangles)
 
     def trimmed(candidates):
         """Mean square (m^2) of candidates over more placements than a closed form uses."""
@@ -222,7 +227,15 @@ def closed_form(triangles, boards, solid):
         camera = normal * np.where(offset < 0, -1.0, 1.0)[..., None]
         rotation = np.swapaxes(camera, -1, -2) @ source
     else:
-        rotation = _rotation_from_lines(triangles, normal, offset)
+        rows = triangles[..., [0, 1, 3]]  # z is 0: the normal equations are linear in the first two columns of R, and t
+        square = np.swapaxes(rows, -1, -2) @ rows
+        square = square / square[..., 2:, 2:]
+        outer, p = normal[..., :, None] * normal[..., None, :], square.shape[:-2]
+        left = (square[..., :, None, :, None] * outer[..., None, :, None, :]).reshape(p + (9, 9)).sum(axis=-3)
+        right = (square[..., :, 2:] * (normal * offset[..., None])[..., None, :]).reshape(p + (9,)).sum(axis=-2)
+        found = (np.linalg.pinv(left, rcond=1e-14, hermitian=True) @ right[..., None]).reshape(p[:-1] + (3, 3))
+        first, second = found[..., 0, :], found[..., 1, :]
+        rotation = np.stack([first, second, np.cross(first, second)], axis=-1)
     u, _, vt = np.linalg.svd(rotation)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None, None]
     rotation = np.concatenate([u[..., :2], u[..., 2:] * sign], axis=-1) @ vt  # the nearest proper rotation
@@ -236,33 +249,6 @@ def shifted(rotation, normal, right):
     transposed = np.swapaxes(normal, -1, -2)
     shift = np.linalg.pinv(transposed @ normal, rcond=1e-12) @ (transposed @ right[..., None])
     return np.concatenate([rotation, shift], axis=-1)
-
-
-def _rotation_from_lines(triangles, normal, offset):
-    rows = triangles[..., [0, 1, 3]]
-    square = np.swapaxes(rows, -1, -2) @ rows
-    square = square / square[..., 2:, 2:]
-    outer = normal[..., :, None] * normal[..., None, :]
-    p = square.shape[:-2]
-    left = (square[..., :, None, :, None] * outer[..., None, :, None, :]).reshape(p + (9, 9)).sum(axis=-3)
-    right = (square[..., :, 2:] * (normal * offset[..., None])[..., None, :]).reshape(p + (9,)).sum(axis=-2)
-    found = (np.linalg.pinv(left, rcond=1e-14, hermitian=True) @ right[..., None])[..., 0].reshape(p[:-1] + (3, 3))
-    first, second = found[..., 0, :], found[..., 1, :]
-    return np.stack([first, second, np.cross(first, second)], axis=-1)
-
-
-def _plane_candidates(sets, triangles):
-    """Closed forms of minimal subsets, for planes and for lines; a grid of rotations where there are too few.
-
-    Also whether the points leave one plane at all.
-    """
-    p, (frame, flat) = len(sets.placements), common_plane(triangles)
-    found = []
-    if p >= 3 and not flat:
-        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
-    if p >= 5:
-        found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
-    return np.concatenate(found) if found else _rotation_grid_on_planes(sets, triangles), flat
 
 
 def _subsets(p, size):
