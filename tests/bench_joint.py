@@ -81,7 +81,7 @@ def margins(state, data, unknowns):
     shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"])
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
-    return shift - u, assemble(unknowns, head, parts, board, sensor=np.stack([0 * u, slope, 0 * u], axis=-1))
+    return shift - u, assemble(unknowns, axis=head, parts=parts, board=board, edge_log_odds=slope[..., None])
 
 
 def gaussian_blocks(state, data, unknowns):

@@ -10,6 +10,7 @@ import numpy as np
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import checked, rig_of
+from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_words, scan_quarters
 
 SIZE = (32, 24)
@@ -28,15 +29,6 @@ class Reading:
     bearings: np.ndarray
     time_s: float
     beam_times_s: np.ndarray
-
-
-@dataclass(frozen=True)
-class Frame:
-    """As of the driver."""
-
-    image: np.ndarray
-    time_s: float
-    index: int
 
 
 class Clock:

@@ -6,21 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.evaluate import next_placement
 from lrfcal_lib.evaluate.jointly import range_residuals, view_residuals
-from lrfcal_lib.evaluate.next_placement import (
-    board_grid,
-    candidate_information,
-    direction_words,
-    group_sigma,
-    measure_yield,
-    observability,
-    suggest_placement,
-    visible,
-)
+from lrfcal_lib.evaluate.monte_carlo import joint_truth
 from lrfcal_lib.evaluate.uncertainty import beams_to, information
 from lrfcal_lib.evaluate.verdict import diagnose, verdict
-from lrfcal_lib.fit.residuals import JointState
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import CORNERS, bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
@@ -29,19 +20,12 @@ COARSE = {"distances": (1.0, 2.0), "turns": tuple(np.radians([0, 120, 240])), "e
 VIEW = np.radians([40.0, 140.0])
 
 
-def truth(rig, poses):
-    """The state that observations were drawn from."""
-    count = len(poses)
-    sensor = np.array([rig.range_offset, 0.0, np.log(rig.softness), 0.0, 0.0])
-    cameras, boards = (np.stack([pose_array(T) for T in some]) for some in (rig.cameras.values(), poses))
-    return JointState(
-        pose_array(rig.T_head_lrf), cameras, sensor, np.zeros(3), boards, np.zeros((count, 2)), np.zeros((count, 3))
-    )
-
-
 def solve(rig, poses, rng, **settings):
-    obs = JointObservations(**observe(rig, poses, rng, **settings))
-    return solve_joint(obs, start=truth(rig, poses), required=False)
+    return solved(JointObservations(**observe(rig, poses, rng, **settings)), rig, poses)
+
+
+def solved(obs, rig, poses):
+    return solve_joint(obs, start=joint_truth(obs, rig.T_head_lrf, rig.cameras, poses), required=False)
 
 
 def models_of(rig):
@@ -59,24 +43,24 @@ def good():
 @pytest.fixture(scope="module")
 def suggested(good):
     rig, _, solution = good
-    return suggest_placement(solution, models_of(rig), features=CORNERS)
+    return next_placement.suggest_placement(solution, models_of(rig), features=CORNERS)
 
 
 def with_board(good, pose, seed):
     """By how much one more placement really shrinks the uncertainty, and the sigmas then."""
     rig, poses, solution = good
     found = solve(rig, [*poses, pose], np.random.default_rng(seed))
-    before, after = (group_sigma(s.solution.covariance, s) for s in (solution, found))
+    before, after = (next_placement.group_sigma(s.solution.covariance, s) for s in (solution, found))
     return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()]), after
 
 
 def test_information_of_own_placements_is_predicted(good):
     rig, _, solution = good
-    rate = measure_yield(solution, models_of(rig), CORNERS)
+    rate = next_placement.measure_yield(solution, models_of(rig), CORNERS)
     assert np.allclose(np.degrees([rate.bearing_step, rate.pitch_step]), 0.5, rtol=1e-3)
     assert np.allclose(rate.pixels, rig.sigma_px, rtol=0.02)
     boards, pitches = solution.state.boards, solution.data.view["pitch"][:, :3]
-    forecast = candidate_information(boards, pitches, solution, models_of(rig), rate).sum(axis=0)
+    forecast = next_placement.candidate_information(boards, pitches, solution, models_of(rig), rate).sum(axis=0)
     sigma, wanted = (np.sqrt(np.diag(np.linalg.inv(H))) for H in (forecast, information(solution).sum(axis=0)))
     assert np.allclose(sigma, wanted, rtol=0.15)
 
@@ -104,7 +88,7 @@ def test_the_suggestion_in_words(suggested):
 def test_candidates_stand_where_their_words_say(good):
     head = good[2].T_head_lrf
     angles = np.radians([20.0]), np.radians([10.0]), (0.0,), np.radians([0.0, 30.0])
-    places, boards = board_grid(good[2], (1.5,), *angles)
+    places, boards = next_placement.board_grid(good[2], (1.5,), *angles)
     p = head.inv().apply(boards[:, :, :3] @ [0.105, 0.38 / 3, 0.0] + boards[:, :, 3])
     assert np.allclose(np.linalg.norm(p, axis=1), 1.5)
     assert np.allclose(np.degrees(np.arctan2(-p[:, 0], p[:, 1])), 20)
@@ -118,8 +102,8 @@ def test_candidates_stand_where_their_words_say(good):
 def test_only_poses_that_all_see(good):
     rig, _, solution = good
     angles = np.radians([-60, 0, 20]), (0.0,), (0.0, 2.0), np.radians([0, 35, 70])
-    places, boards = board_grid(solution, (0.3, 1.5), *angles)
-    rows, pitches = visible(boards, solution, models_of(rig), VIEW)
+    places, boards = next_placement.board_grid(solution, (0.3, 1.5), *angles)
+    rows, pitches = next_placement.visible(boards, solution, models_of(rig), VIEW)
     seen = places.iloc[rows]
     assert 0 < len(seen) < len(places)
     assert (seen.distance > 1).all() and (seen.bearing.abs() < 0.5).all() and (seen.lean < 1.1).all()
@@ -132,7 +116,7 @@ def test_only_poses_that_all_see(good):
 def test_cameras_on_the_base_need_no_pitch():
     rng = np.random.default_rng(2)
     rig = bench(rng, mount="platform")
-    found = suggest_placement(solve(rig, board_poses(rng, 6), rng), models_of(rig), places=COARSE)
+    found = next_placement.suggest_placement(solve(rig, board_poses(rng, 6), rng), models_of(rig), places=COARSE)
     assert 0 < found.median_gain < found.gain < 1
     assert found.pitches is None and "images at" not in found.words()
 
@@ -141,15 +125,15 @@ def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
     near = COARSE | {"distances": (0.1,)}
     with pytest.raises(ValueError, match="camera 'right' has no intrinsics"):
-        suggest_placement(solution, {"left": rig.model})
+        next_placement.suggest_placement(solution, {"left": rig.model})
     with pytest.raises(DegenerateGeometry, match="none of .* board poses lies wholly in the view"):
-        suggest_placement(solution, models_of(rig), places=near)
+        next_placement.suggest_placement(solution, models_of(rig), places=near)
     words = verdict(solution, models_of(rig), places=near).sentences()
     assert words[-1].startswith("No placement can be suggested: none of")
 
 
 def test_observability_lists_what_is_known_least_first(good):
-    directions = observability(good[2])
+    directions = next_placement.observability(good[2])
     sigmas = [d.sigma for d in directions]
     assert sigmas == sorted(sigmas, reverse=True) and len(sigmas) == 18  # all but the softness of the edges
     assert 1e-4 < sigmas[0] < 0.05 and all(d.words for d in directions)
@@ -164,7 +148,8 @@ def test_observability_lists_what_is_known_least_first(good):
 )
 def test_directions_in_words(direction, words):
     names = ["offset_in_scan_plane", "range_offset", *(f"{c}_{p}" for c in ("left", "right") for p in POSE_NAMES)]
-    assert direction_words([direction.get(name, 0.0) for name in names], names, ("left", "right")) == words
+    x = [direction.get(name, 0.0) for name in names]
+    assert next_placement.direction_words(x, names, ("left", "right")) == words
 
 
 def test_a_good_recording_is_trusted(good):
@@ -233,14 +218,14 @@ def test_a_motion_that_nothing_determines(good):
     obs = JointObservations(**observe(rig, poses, np.random.default_rng(3)))
     first = obs.view_placement == 0  # the right camera sees the first board only, which no scan hits
     obs = obs.keep(view=first == (obs.view_camera == 1), beam=obs.beam_placement != 0, face=obs.face_placement != 0)
-    solution = solve_joint(obs, start=truth(rig, poses), required=False)
+    solution = solved(obs, rig, poses)
     found = verdict(solution, models_of(rig), suggest=False)
     assert found.answer == "no"
     assert found.sentences()[0].startswith("This calibration cannot be trusted: the data do not determine")
     assert np.isinf(found.errors[2.0]["right_px"]) and np.isfinite(found.errors[2.0]["left_px"])
     assert "no bound in the image of 'right'" in found.sentences()[2]
     assert not np.isnan(solution.solution.sigma).any(), "rounding errors are no information"
-    lost = [d.words for d in observability(solution) if np.isinf(d.sigma)]
+    lost = [d.words for d in next_placement.observability(solution) if np.isinf(d.sigma)]
     assert lost and any("camera 'right'" in words for words in lost)
 
 

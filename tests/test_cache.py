@@ -56,47 +56,41 @@ def test_nothing_is_kept_unless_a_folder_is_named(session, stage, calls, tmp_pat
     assert len(calls) == 2 and list(tmp_path.rglob("*.pickle")) == []
 
 
-def other_argument(session, stage, monkeypatch):
-    stage(session, 2)
-
-
-def other_option(session, stage, monkeypatch):
-    stage(session, 1, joint=True)
-
-
-def other_statement(session, stage, monkeypatch):
-    stage(replace(session, platform_sigma=(0.1, 0.1)), 1)
-
-
-def other_scan(session, stage, monkeypatch):
+def other_scan(session, stage):
     session.scans["ranges"][0, 0] += 0.001
     stage(session, 1)
 
 
-def other_image(session, stage, monkeypatch):
+def other_image(session, stage):
     file = Path(session.image_records[-1].file)
     file.write_bytes(file.read_bytes() + b"\0")
     stage(session, 1)
 
 
-def missing_image(session, stage, monkeypatch):
+def missing_image(session, stage):
     Path(session.image_records[0].file).unlink()
     stage(session, 1)
 
 
-def other_library(session, stage, monkeypatch):
-    monkeypatch.setattr(cache, "_library", lambda: b"another version")
-    stage(session, 1)
+def other_library(session, stage):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "library", lambda: b"another version")
+        stage(session, 1)
 
 
-OTHERS = (other_argument, other_option, other_statement, other_scan, other_image, missing_image, other_library)
+OTHERS = {
+    "argument": lambda session, stage: stage(session, 2),
+    "option": lambda session, stage: stage(session, 1, joint=True),
+    "statement": lambda session, stage: stage(replace(session, platform_sigma=(0.1, 0.1)), 1),
+    "scan": other_scan, "image": other_image, "missing image": missing_image, "library": other_library,
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("other", OTHERS, ids=lambda other: other.__name__)
-def test_what_is_different_is_worked_out_again(folder, session, stage, calls, monkeypatch, other):
+@pytest.mark.parametrize("other", OTHERS)
+def test_what_is_different_is_worked_out_again(folder, session, stage, calls, other):
     session = replace(session, scans={key: values.copy() for key, values in session.scans.items()})
     stage(session, 1)
-    other(session, stage, monkeypatch)
+    OTHERS[other](session, stage)
     assert len(calls) == 2
 
 

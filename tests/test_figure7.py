@@ -44,5 +44,5 @@ def test_drawn_edges_lie_on_the_edges_of_the_board_in_the_drawn_image(ready):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebooks_draw_views_in_their_own_image(path):
     for cell in code_cells(read(path)):
-        if any(f"plots.{name}(" in cell.source for name in ("board_view", "projected_points", "seen_points")):
+        if any(f"recording.{name}(" in cell.source for name in ("board_view", "seen_points")):
             assert "read_image(" not in cell.source, "Prepared.seen gives the view with its image"

@@ -103,10 +103,3 @@ def test_a_plane_needs_more_than_a_line(points):
 def test_a_line_needs_two_points():
     with pytest.raises(g.DegenerateGeometry, match="two distinct points"):
         g.fit_line(np.ones((4, 3)))
-
-
-def test_line_gap_of_crossing_skew_and_parallel_lines():
-    x, y = np.eye(3)[:2]
-    assert g.line_gap(np.zeros(3), x, 5 * x, y) == pytest.approx(0)
-    assert g.line_gap(np.zeros(3), x, [1, 2, 3], y) == pytest.approx(3)
-    assert g.line_gap(np.zeros(3), x, [9, 3, 4], 2 * x) == pytest.approx(5)

@@ -284,11 +284,13 @@ def test_what_the_device_declines_is_said():
         for call, message in (
             (lambda: lms.configure(unit="cm"), r"declines the password of the installation mode \(A0 01\)"),
             (lambda: lms.set_variant(180, 0.5), "LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0"),
-            (lambda: lms.set_baudrate(500000), r"declines 500000 Bd \(A0 02\)"),
         ):
             with pytest.raises(Refused, match=message):
                 call()
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
+    with pytest.raises(Refused, match=r"declines 500000 Bd \(A0 02\)"):
+        opened(device, baudrate=500000)
+    assert device.baudrate == 38400
 
 
 def test_a_configuration_that_is_not_taken_is_said(monkeypatch):
@@ -319,29 +321,34 @@ def test_a_lost_reply_does_not_make_a_second_write(command, call):
 
 def test_a_rate_that_does_not_come_through_is_given_up():
     device = emulated()
+    through, hear = device.port.put, device.hear
+    device.port.put = lambda data: len(data) if device.baudrate == 500000 else through(data)
+
+    def deaf(data):
+        if device.port.rate == 500000:
+            device.memory.baudrate = 38400  # as after it was switched off and on
+        else:
+            hear(data)
+
+    device.hear = deaf
+    with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
+        opened(device, baudrate=500000)
     with opened(device) as lms:
-        through = device.port.put
-        device.port.put = lambda data: len(data) if device.baudrate == 500000 else through(data)
-        with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
-            device.hear = lambda data, hear=device.hear: hear(data) if device.port.rate != 500000 else None
-            device.at(1.2, lambda _: setattr(device.memory, "baudrate", 38400))  # as after it was switched off and on
-            lms.set_baudrate(500000)
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
 
 
 def test_a_rate_that_this_end_cannot_do_changes_nothing(monkeypatch):
     device = emulated()
-    with opened(device) as lms:
 
-        def set_rate(port, rate):
-            if rate == 500000:
-                raise PortError("does not take 500000 Bd")
+    def set_rate(port, rate):
+        if rate == 500000:
+            raise PortError("does not take 500000 Bd")
+        port.baudrate = rate
 
-        monkeypatch.setattr(device.clock.machine, "set_rate", set_rate)
-        asked = len(device.requests)
-        with pytest.raises(PortError, match="does not take 500000 Bd"):
-            lms.set_baudrate(500000)
-        assert len(device.requests) == asked and lms.baudrate == 38400
+    monkeypatch.setattr(device.clock.machine, "set_rate", set_rate)
+    with pytest.raises(PortError, match="does not take 500000 Bd"):
+        opened(device, baudrate=500000)
+    assert device.baudrate == 38400 and device.memory.mode == 0x25
 
 
 # ------------------------------------------------------------------------------------------------- times of scans
@@ -564,7 +571,7 @@ def test_calls_at_the_wrong_time_say_so():
     lms.stop()  # nothing to stop
     lms.start()
     calls = (lms.request, lms.start, lms.reconnect, lms.configure)
-    for call in (*calls, lambda: lms.set_variant(180, 1), lambda: lms.set_baudrate(9600)):
+    for call in (*calls, lambda: lms.set_variant(180, 1)):
         with pytest.raises(DeviceError, match="streams; call stop"):
             call()
     lms.close()

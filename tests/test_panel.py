@@ -45,6 +45,7 @@ def fake(monkeypatch, tmp_path):
         rig.head.emergency_stop = rig.head.stop
         rig.head.pitch = lambda: (rig.head.at, True)
         monkeypatch.setattr(collector, "Rig", opened(rig))
+        monkeypatch.setattr(collector, "advise", lambda session: "put it there")
         return path
 
     return fake
@@ -52,18 +53,14 @@ def fake(monkeypatch, tmp_path):
 
 @pytest.fixture
 def connect(fake, tmp_path):
-    """Makes collectors that are connected to a fake rig; without advice, which a fake rig cannot feed."""
-    made = []
+    """Connects a collector, anew each time, to a fake rig."""
+    with Collector() as made:
 
-    def connect(advice=False, **plan):
-        for one in made:
-            one.close()
-        made.append(Collector(advice=advice))
-        made[-1].connect(fake(**plan), tmp_path / "s")
-        return made[-1]
+        def connect(**plan):
+            made.connect(fake(**plan), tmp_path / "s")
+            return made
 
-    yield connect
-    made[-1].close()
+        yield connect
 
 
 @pytest.fixture
@@ -75,12 +72,6 @@ def in_background(call):
     thread = threading.Thread(target=call, daemon=True)
     thread.start()
     return thread
-
-
-def lose(camera):
-    """Let a camera be lost; its way of giving images, to be given back."""
-    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
-    return newest
 
 
 # -------------------------------------------------------------------------------------------------- recording
@@ -177,12 +168,10 @@ def test_closing_stops_the_head_whatever_happened(connected):
     assert head.stops > stops and not connected.connected and connected.finished == ()
 
 
-def test_advice_is_asked_from_the_third_placement_on(connect, monkeypatch):
-    asked = []
-    monkeypatch.setattr(collector, "advise", lambda session: asked.append(len(session.placements)) or "put it there")
-    made = connect(advice=True, count=9)
+def test_advice_is_asked_from_the_third_placement_on(connect):
+    made = connect(count=9)
     lights = [made.capture() for _ in range(4)]
-    assert made.task().guidance == "put it there" and asked == [3, 4]
+    assert made.task().guidance == "put it there"
     assert [found[-1].name for found in lights] == ["camera left"] * 2 + ["information"] * 2
 
 
@@ -194,17 +183,6 @@ def test_a_look_shows_scan_images_and_where_the_head_is(connected):
     view = connected.look()
     assert view.ranges.shape == view.bearings.shape and list(view.frames) == ["left"] and view.trouble == ""
     assert view.pitch == pytest.approx(0.05) and view.measured
-
-
-def test_a_lost_camera_is_said_and_comes_back(connected):
-    camera = connected.rig.cameras["left"]
-    connected.look()
-    newest = lose(camera)
-    assert "camera left is lost: its plug" in connected.look().trouble and "left" not in connected.view.frames
-    with pytest.raises(LineLost, match="its plug"):
-        connected.capture()
-    camera.newest = newest
-    assert connected.look().trouble == "" and "left" in connected.view.frames
 
 
 def test_a_lost_line_is_looked_for(connected):
@@ -340,7 +318,7 @@ def test_advice_where_nothing_is_determined_yet(monkeypatch):
 
 @pytest.fixture
 def panel(fake, tmp_path):
-    with Panel(fake(), tmp_path / "s", advice=False) as made:
+    with Panel(fake(), tmp_path / "s") as made:
         yield made
 
 
@@ -396,25 +374,24 @@ def test_errors_appear_in_the_panel(panel, tmp_path):
     assert "calibrating failed" in pressed(panel, "calibrate").error.value and "ready" in parts.state.value
 
 
-def test_a_lost_camera_is_said_in_the_panel_until_it_is_back(panel):
+def test_a_lost_camera_is_said_until_it_is_back(panel):
     panel.connect()
     camera, parts = panel.collector.rig.cameras["left"], panel.parts
-    newest = lose(camera)
+    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
     wait_until(lambda: "camera left is lost: its plug" in parts.error.value)
+    assert "left" not in panel.collector.view.frames
+    with pytest.raises(LineLost, match="its plug"):
+        panel.collector.capture()
     camera.newest = newest
-    wait_until(lambda: parts.error.value == "")
+    wait_until(lambda: parts.error.value == "" and "left" in panel.collector.view.frames)
 
 
-def test_what_nobody_expects_is_said_too(panel, monkeypatch, caplog):
+def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypatch, caplog):
     panel.connect()
     monkeypatch.setattr(panel.collector, "move_to", lambda pitch: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         panel.go()
     assert "ZeroDivisionError" in panel.parts.error.value and "failed while" in caplog.text
-
-
-def test_drivers_report_into_the_panel(panel):
-    panel.connect()
     logging.getLogger("lrfcal_lib.drivers").warning("the head does not tell its tilt")
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()

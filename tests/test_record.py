@@ -22,7 +22,7 @@ from lrfcal_lib.acquire import record
 from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan, edge_rise
 from lrfcal_lib.acquire.record import Recording, RecordingError, Terminal, main, record_session
 from lrfcal_lib.drivers import port
-from lrfcal_lib.drivers.port import NoReply, PortError
+from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.drivers.rig import Moved, Scanned
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
@@ -486,39 +486,41 @@ def at_scan(rig, number, action):
     rig.lrf.wait = lambda: (seen.append(1), len(seen) == number and action())
 
 
-def interrupt():
-    raise KeyboardInterrupt
-
-
 def test_a_recording_by_command(run, path):
     code, said, _ = run("", "", count=2)
     assert code == 0 and "placements 1, 2 are safe; 'python -m lrfcal_lib calibrate" in said
     assert run("", resume=True)[0] == 0 and open_session(path).placements == (1, 2, 3)
 
 
-def test_ctrl_c_at_the_prompt(run, rig):
-    said = "stopped by Ctrl-C; placements 1 are safe; --resume goes on from there"
-    assert run("", KeyboardInterrupt())[::2] == (130, said) and rig.head.stops
+def interrupt():
+    raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("scans", range(1, 7))
-def test_ctrl_c_amid_a_sweep(run, rig, path, scans):
-    at_scan(rig, scans, interrupt)
-    code, _, said = run("", "")
-    assert code == 130 and "stopped by Ctrl-C" in said and rig.head.stops >= 1 and not rig.lrf.streaming
-    assert run("", "", "", resume=True)[0] == 0 and validate(path) == []
+def fail():
+    raise DeviceError("the head does not tell its tilt: check its power")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_signals_say_what_is_safe_and_how_to_go_on(run, rig, number):
-    """As `emergency` turns them into an exit, amid the second placement."""
-    port.guard(rig.head)
+DEVICE = "error: the head does not tell its tilt: check its power"
+ENDS = [  # at which scan of three placements of three stops what happens; exit code and what is said
+    *((scan, interrupt, 130, "stopped by Ctrl-C") for scan in range(1, 7)),
+    (0, interrupt, 130, "stopped by Ctrl-C"),  # at the second prompt
+    (5, lambda: signal.raise_signal(signal.SIGTERM), 143, "stopped by SIGTERM"),
+    (5, lambda: signal.raise_signal(signal.SIGHUP), 129, "stopped by SIGHUP"),
+    (1, fail, 2, DEVICE), (6, fail, 2, DEVICE),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("scan", "end", "code", "said"), ENDS)
+def test_what_ends_a_recording_is_one_line_and_another_goes_on(run, rig, path, scan, end, code, said):
+    port.guard(rig.head)  # signals become an exit
     rig.head.emergency_stop = rig.head.stop
-    at_scan(rig, 5, lambda: signal.raise_signal(number))
-    said = f"stopped by {number.name}; placements 1 are safe; --resume goes on from there"
-    assert run("", "", "")[::2] == (128 + number, said) and rig.head.stops
+    at_scan(rig, scan, end)
+    safe = "no placement was finished" if 0 < scan <= 3 else "placements 1 are safe"
+    assert run("", "" if scan else KeyboardInterrupt(), "")[::2] == (
+        code, f"{said}; {safe}; --resume goes on from there")  # fmt: skip
+    assert rig.head.stops >= 1 and not rig.lrf.streaming
     port.release(rig.head)
-    assert run("", "", resume=True)[0] == 0
+    complete(rig, path)
 
 
 @pytest.mark.parametrize("removed", ["", "session.json", "lrf", "lrf/index.csv", "lrf/telegrams.bin"])
@@ -543,16 +545,6 @@ def test_a_session_removed_amid_a_recording_is_not_called_safe(run, rig, path, r
     else:
         assert code == 2 and "was removed or damaged while it was recorded: record again" in err
         assert "are safe" not in out + err
-
-
-@pytest.mark.parametrize("error", [
-    PortError("lrf: no permission for /dev/ttyUSB0: run 'sudo usermod -aG dialout $USER'"),
-    NoReply("the head does not tell its tilt: check its power"),
-])  # fmt: skip
-def test_a_device_that_fails_is_one_line(run, rig, path, error):
-    write(rig, path, count=1)
-    rig.head.fail = error
-    assert run("", "", resume=True)[::2] == (2, f"error: {error}; placements 1 are safe; --resume goes on from there")
 
 
 def test_a_full_disk_is_one_line(run, monkeypatch):

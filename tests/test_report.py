@@ -4,12 +4,14 @@ import json
 import os
 import re
 import select
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pandas as pd
@@ -73,50 +75,39 @@ def finished(session, tmp_path_factory):
 
 def test_a_failing_notebook_is_told_and_the_rest_delivered(finished):
     out, (good, bad) = finished
-    assert good.error == ""
-    assert "ValueError" in bad.error and "board 7 is <missing>" in bad.error
-    assert "\x1b" not in bad.error
+    assert good.error == "" and "ValueError" in bad.error and "board 7 is <missing>" in bad.error
+    assert "\x1b" not in bad.error, "no colours of a terminal"
     assert (out / "00_good.html").is_file() and (out / "01_bad.html").is_file()
     page = (out / "index.html").read_text()
     assert "01_bad failed" in page and "board 7 is &lt;missing&gt;" in page
 
 
-def test_index_needs_no_other_file_to_be_read(finished):
-    out, _ = finished
-    page = (out / "index.html").read_text()
+def test_index_states_what_was_found_and_needs_no_other_file(finished, session):
+    page = (finished[0] / "index.html").read_text()
+    digest = report.hashlib.sha256((session / "session.json").read_bytes()).hexdigest()
+    told = ["A wall", "Walls are flat.", "2.0 m", "Mean range", "One scan line &lt;of many&gt;."]
+    told += [digest, np.__version__, '<td class="number">-2.0</td>', '<td class="number">–</td>']
+    assert [words for words in told if words not in page] == []
+    assert "found before the failure" in page, "a notebook that fails has told what it found until then"
     assert re.findall(r'<img src="(.{22})', page) == ["data:image/png;base64,"]
     assert "<script" not in page and "<link" not in page
 
 
-def test_index_states_what_was_found(finished, session):
-    page = (finished[0] / "index.html").read_text()
-    assert "A wall" in page and "Walls are flat." in page
-    assert "2.0 m" in page and "Mean range" in page
-    assert "found before the failure" in page, "a notebook that fails has told what it found until then"
-    assert "One scan line &lt;of many&gt;." in page
-    assert '<td class="number">-2.0</td>' in page and '<td class="number">–</td>' in page
-    digest = report.hashlib.sha256((session / "session.json").read_bytes()).hexdigest()
-    assert digest in page and np.__version__ in page
+def test_pages_of_notebooks_hide_code_and_hold_their_pictures(finished):
+    page = (finished[0] / "00_good.html").read_text()
+    assert "Walls are" in page and "data:image/png;base64," in page and 'href="index.html"' in page
+    assert "plt.subplots" not in page
 
 
-def test_tables_and_findings_are_kept_as_data(finished):
+def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
     out, _ = finished
     table = pd.read_csv(out / "tables" / "errors.csv")
     assert list(table.columns) == ["edge", "error_mm"]
     assert table.error_mm[0] == -2.0 and np.isnan(table.error_mm[1])
-    found = json.loads((out / "findings.json").read_text())
-    assert [(f["notebook"], f["key"], f["value"]) for f in found] == [
-        ("00_good", "mean_range", 2.0),
-        ("01_bad", "early", "found before the failure"),
-    ]
-    assert not (out / "parts").exists()
-
-
-def test_only_what_a_report_wrote_is_removed(finished):
-    out, _ = finished
-    assert not (out / "figures" / "stale.png").exists()
-    assert (out / "figures" / "ranges.png").is_file()
-    assert (out / "notes.txt").read_text() == "mine"
+    found = [(f["notebook"], f["key"], f["value"]) for f in json.loads((out / "findings.json").read_text())]
+    assert found == [("00_good", "mean_range", 2.0), ("01_bad", "early", "found before the failure")]
+    assert not (out / "parts").exists() and not (out / "figures" / "stale.png").exists()
+    assert (out / "figures" / "ranges.png").is_file() and (out / "notes.txt").read_text() == "mine"
 
 
 @pytest.fixture
@@ -216,13 +207,6 @@ def test_make_takes_a_session_with_a_space():
     assert shown.stdout == '<-m><lrfcal_lib><report><a "b c>'
 
 
-def test_pages_of_notebooks_hide_code_and_hold_their_pictures(finished):
-    page = (finished[0] / "00_good.html").read_text()
-    assert "Walls are" in page and "data:image/png;base64," in page
-    assert "plt.subplots" not in page
-    assert 'href="index.html"' in page
-
-
 def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "NOTEBOOKS", tmp_path)
     write_notebook(tmp_path / "00_good.ipynb", GOOD)
@@ -235,58 +219,45 @@ def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys)
     assert "nowhere" in capsys.readouterr().err
 
 
-def test_without_any_session_it_says_how_to_get_one(tmp_path, monkeypatch):
+def test_the_shipped_session_comes_first_and_without_any_it_says_how_to_get_one(session, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "SHIPPED", session)
+    assert report.default_session() == session
     monkeypatch.setenv("LRFCAL_REAL_DATA", str(tmp_path))
     monkeypatch.setattr(report, "SHIPPED", tmp_path / "none")
     with pytest.raises(SessionError, match="suijingfeng/LaserSeteroCalibration @ f9a70a9.*ZED_STEREO_LASER_SWEEP"):
         report.default_session()
 
 
-def test_the_shipped_session_comes_first(session, monkeypatch):
-    monkeypatch.setattr(report, "SHIPPED", session)
-    assert report.default_session() == session
-
-
-def test_storing_keeps_outputs_of_simulations_only(session, tmp_path, monkeypatch):
+def test_storing_keeps_outputs_of_simulations_only(session, tmp_path):
     path = write_notebook(tmp_path / "00_x.ipynb", GOOD, "print(session.name)")
     assert report.store(path, session) == ""
     assert nbformat.read(path, 4).cells[2].outputs[0].text == "wall\n"
     first = path.read_bytes()
     assert report.store(path, session) == "" and path.read_bytes() == first
-    index = session / "session.json"
-    kept = index.read_text()
-    index.write_text(kept.replace('"simulated": true', '"simulated": false'))
-    try:
-        assert report.store(path, session) == ""
-    finally:
-        index.write_text(kept)
+    recording = shutil.copytree(session, tmp_path / "recording")
+    index = recording / "session.json"
+    index.write_text(index.read_text().replace('"simulated": true', '"simulated": false'))
+    assert report.store(path, recording) == ""
     cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in cells] == [1, 2]
-    assert not any(cell.outputs for cell in cells)
+    assert [cell.execution_count for cell in cells] == [1, 2] and not any(cell.outputs for cell in cells)
 
 
 def test_a_notebook_that_fails_is_not_stored(tmp_path):
     path = write_notebook(tmp_path / "00_x.ipynb", "1 / 0")
     before = path.read_bytes()
-    assert "ZeroDivisionError" in report.store(path, None)
-    assert path.read_bytes() == before
+    assert "ZeroDivisionError" in report.store(path, None) and path.read_bytes() == before
 
 
 def test_outside_a_report_run_nothing_is_written(monkeypatch, tmp_path):
-    import matplotlib.pyplot as plt
-
     monkeypatch.delenv("LRFCAL_REPORT", raising=False)
     monkeypatch.chdir(tmp_path)
     notebook.save(plt.figure(), "empty", "Nothing.")
     html = notebook.table(pd.DataFrame({"a": [0.12345]}), "numbers", digits=2).data
-    assert notebook.report_file("cloud.ply") is None
-    assert list(tmp_path.iterdir()) == []
+    assert notebook.report_file("cloud.ply") is None and list(tmp_path.iterdir()) == []
     assert ">0.12<" in html and "numbers" in html
 
 
 def test_saving_leaves_what_was_placed_by_hand(monkeypatch, tmp_path, recwarn):
-    import matplotlib.pyplot as plt
-
     monkeypatch.setenv("LRFCAL_REPORT", str(tmp_path))
     with plt.rc_context():
         notebook.set_up()
@@ -294,8 +265,7 @@ def test_saving_leaves_what_was_placed_by_hand(monkeypatch, tmp_path, recwarn):
         fig.add_axes([0.1, -0.5, 0.8, 2.0])
         notebook.save(fig, "by_hand", "Axes larger than the figure.")
         fig.canvas.draw()
-    assert (tmp_path / "figures" / "by_hand.png").is_file()
-    assert not fig.get_layout_engine()
+    assert (tmp_path / "figures" / "by_hand.png").is_file() and not fig.get_layout_engine()
     assert not [warning for warning in recwarn.list if "layout" in str(warning.message)]
 
 

@@ -105,27 +105,6 @@ def test_reports_and_recordings_are_ignored_by_git():
     assert done.stdout.split() == ignored
 
 
-@pytest.fixture
-def checkout(tmp_path):
-    """A copy of what set-up needs, with stand-ins for the interpreter and the package managers."""
-    (tmp_path / ".ci").mkdir()
-    for name in ("environment.txt", ".ci/setup"):
-        shutil.copy(ROOT / name, tmp_path / name)
-    return tmp_path
-
-
-def write_command(folder, name, script):
-    folder.mkdir(exist_ok=True)
-    path = folder / name
-    path.write_text("#!/bin/bash\n" + script)
-    path.chmod(0o755)
-
-
-def run_setup(checkout, path, **variables):
-    environment = {"PATH": f"{path}:/usr/bin:/bin", "HOME": str(checkout), **variables}
-    return subprocess.run([".ci/setup"], cwd=checkout, env=environment, capture_output=True, text=True)
-
-
 FAKE_PYTHON = """
 echo "python $*" >>calls
 case "$*" in
@@ -135,27 +114,76 @@ esac
 """
 
 
-def test_setup_keeps_the_environment_until_environment_txt_changes(checkout):
-    write_command(checkout / "bin", "python3", FAKE_PYTHON)
-    calls = checkout / "calls"
-    assert run_setup(checkout, checkout / "bin").returncode == 0
+def write_command(path, script):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("#!/bin/bash\n" + script)
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def run_setup(tmp_path):
+    """Runs .ci/setup in a copy of what it needs, with stand-ins for the interpreter and other commands."""
+    write_command(tmp_path / "bin" / "python3", FAKE_PYTHON)
+    (tmp_path / ".ci").mkdir()
+    for name in ("environment.txt", ".ci/setup"):
+        shutil.copy(ROOT / name, tmp_path / name)
+
+    def run(missing="", **commands):
+        for name, script in commands.items():
+            write_command(tmp_path / "bin" / name.replace("_", "-"), script)
+        environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path), "MISSING": missing}
+        return subprocess.run([".ci/setup"], cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+    return run
+
+
+def test_setup_keeps_the_environment_until_environment_txt_changes(run_setup, tmp_path):
+    calls = tmp_path / "calls"
+    assert run_setup().returncode == 0
     assert calls.read_text().count("-m venv") == 1 and "-r environment.txt" in calls.read_text()
     calls.write_text("")
-    assert run_setup(checkout, checkout / "bin").returncode == 0
+    assert run_setup().returncode == 0
     assert "venv" not in calls.read_text() and "pip" not in calls.read_text()
-    with open(checkout / "environment.txt", "a") as file:
+    with open(tmp_path / "environment.txt", "a") as file:
         file.write("# changed\n")
-    run_setup(checkout, checkout / "bin")
+    run_setup()
     assert calls.read_text().count("-m venv") == 1
+
+
+OLD = 'case "$*" in *version_info*) exit 1 ;; -V) echo Python 3.9.2 ;; esac'
+NO_VENV = 'case "$*" in *ensurepip*) exit 1 ;; *python%d*) echo python3.12-venv ;; esac'
+TOLD = {
+    "read-only": ({"touch": "exit 1"}, 1, "{} cannot be written: copy the repository to a folder"),
+    "old python": ({"python3": OLD}, 1, "Python 3.11 or newer is needed, Python 3.9.2 was found"),
+    "no venv": ({"python3": NO_VENV, "id": "echo 1000"}, 1, "sudo apt-get install -y python3.12-venv"),
+    "no libraries": ({"missing": "libusb-1.0-0", "id": "echo 1000"}, 0, "sudo apt-get install -y libusb-1.0-0"),
+}
+
+
+@pytest.mark.parametrize("case", TOLD)
+def test_setup_says_what_to_do(run_setup, tmp_path, case):
+    commands, status, words = TOLD[case]
+    done = run_setup(**commands)
+    assert done.returncode == status and words.format(tmp_path) in done.stderr
+    assert status == 0 or not (tmp_path / ".venv").exists()
+
+
+def test_setup_that_failed_is_done_again(run_setup, tmp_path):
+    assert run_setup(python3=FAKE_PYTHON + 'case "$*" in *pip*) exit 3 ;; esac').returncode != 0
+    assert not (tmp_path / ".venv" / "stamp").exists()
+
+
+def test_setup_installs_missing_libraries_as_root(run_setup, tmp_path):
+    assert run_setup("libusb-1.0-0", id="echo 0", apt_get='echo "apt-get $*" >>calls').returncode == 0
+    assert re.search(r"apt-get install .*libusb-1.0-0", (tmp_path / "calls").read_text())
 
 
 def lab(tmp_path, uid, *arguments):
     """What `make lab` calls, with a set-up and a JupyterLab that only tell."""
-    for name, script in ((".ci/setup", ""), (".venv/bin/jupyter", 'echo "$* LRFCAL_SESSION=$LRFCAL_SESSION"')):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        write_command((tmp_path / name).parent, Path(name).name, script)
+    write_command(tmp_path / ".ci" / "setup", "")
+    write_command(tmp_path / ".venv" / "bin" / "jupyter", 'echo "$* LRFCAL_SESSION=$LRFCAL_SESSION"')
+    write_command(tmp_path / "bin" / "id", f"echo {uid}")
     (tmp_path / "notebooks").mkdir(exist_ok=True)
-    write_command(tmp_path / "bin", "id", f"echo {uid}")
     shutil.copy(ROOT / "Makefile", tmp_path)
     environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path)}
     call = ["make", "-s", "lab", *arguments]
@@ -168,50 +196,3 @@ def test_the_lab_opens_any_session_and_as_root(tmp_path, name):
     said = lab(tmp_path, 0, "SESSION=" + name.replace("$", "$$"))
     assert said.strip().endswith(f"LRFCAL_SESSION={tmp_path.resolve() / name}") and "--allow-root" in said
     assert "--allow-root" not in lab(tmp_path, 1000) and lab(tmp_path, 1000).strip().endswith("LRFCAL_SESSION=")
-
-
-def test_setup_says_of_a_read_only_checkout_what_to_do(checkout):
-    write_command(checkout / "bin", "python3", FAKE_PYTHON)
-    write_command(checkout / "bin", "touch", "exit 1")
-    done = run_setup(checkout, checkout / "bin")
-    assert done.returncode == 1 and f"{checkout} cannot be written: copy the repository to a folder" in done.stderr
-    assert not (checkout / ".venv").exists()
-
-
-def test_setup_that_failed_is_done_again(checkout):
-    write_command(checkout / "bin", "python3", FAKE_PYTHON + 'case "$*" in *pip*) exit 3 ;; esac')
-    assert run_setup(checkout, checkout / "bin").returncode != 0
-    assert not (checkout / ".venv" / "stamp").exists()
-
-
-def test_setup_installs_missing_libraries_as_root(checkout):
-    write_command(checkout / "bin", "python3", FAKE_PYTHON)
-    write_command(checkout / "bin", "id", "echo 0")
-    write_command(checkout / "bin", "apt-get", 'echo "apt-get $*" >>calls')
-    done = run_setup(checkout, checkout / "bin", MISSING="libusb-1.0-0")
-    assert done.returncode == 0
-    assert re.search(r"apt-get install .*libusb-1.0-0", (checkout / "calls").read_text())
-
-
-def test_setup_tells_the_command_to_everyone_else_and_goes_on(checkout):
-    write_command(checkout / "bin", "python3", FAKE_PYTHON)
-    write_command(checkout / "bin", "id", "echo 1000")
-    done = run_setup(checkout, checkout / "bin", MISSING="libusb-1.0-0")
-    assert done.returncode == 0
-    assert "sudo apt-get install -y libusb-1.0-0" in done.stderr
-
-
-def test_setup_refuses_an_old_python(checkout):
-    write_command(checkout / "bin", "python3", 'case "$*" in *version_info*) exit 1 ;; -V) echo Python 3.9.2 ;; esac')
-    done = run_setup(checkout, checkout / "bin")
-    assert done.returncode == 1
-    assert "Python 3.11 or newer is needed, Python 3.9.2 was found" in done.stderr
-
-
-def test_setup_names_the_package_of_a_missing_venv(checkout):
-    script = 'case "$*" in *ensurepip*) exit 1 ;; *python%d*) echo python3.12-venv ;; esac'
-    write_command(checkout / "bin", "python3", script)
-    write_command(checkout / "bin", "id", "echo 1000")
-    done = run_setup(checkout, checkout / "bin")
-    assert done.returncode == 1
-    assert "sudo apt-get install -y python3.12-venv" in done.stderr

@@ -1,6 +1,7 @@
 """A session of telegrams gives the sweeps that were sent, and tells about every telegram it could not use."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -222,64 +223,54 @@ def test_a_row_cut_off_by_a_crash_is_left_out_until_finish_removes_it(path):
     assert file.read_text() == whole[: whole[:-1].rindex("\n") + 1]
 
 
-def set_cell(row, column, value):
-    return lambda rows: rows[row].__setitem__(column, value)
+def cell(row, column, value):
+    """Another value in index.csv."""
+    return lambda path: edit_index(path, lambda rows: rows[row].__setitem__(column, value))
 
 
-MISMATCHES = {
-    r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore": set_cell(3, 1, "853"),
-    r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes": set_cell(2, 2, "6"),
-    r"index\.csv: line 2, offset -1, length 42": set_cell(1, 1, ""),
-    r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing": set_cell(2, 4, ""),
-    r"index\.csv: .*invalid literal.*'x'": set_cell(2, 1, "x"),
-    r"index\.csv: no telegram in the index, 6538 bytes": lambda rows: rows.__delitem__(slice(1, None)),
-    r"a pitch is .* rad: degrees": set_cell(2, 4, "400"),
-}
+def data(change):
+    """Other bytes in telegrams.bin."""
+    return lambda path: telegrams(path).write_bytes(change(telegrams(path).read_bytes()))
 
 
-@pytest.mark.parametrize("message", MISMATCHES)
-def test_an_index_that_does_not_fit_is_refused(path, message):
-    edit_index(path, MISMATCHES[message])
+def again(*batches, **options):
+    """Another recording in its place."""
+
+    def change(path):
+        shutil.rmtree(path)
+        record(path, *batches, **options)
+
+    return change
+
+
+def no_rows(path):
+    edit_index(path, lambda rows: rows.__delitem__(slice(1, None)))
+
+
+HALF = np.ones((4, 361))
+DAMAGE = [
+    (cell(3, 1, "853"), r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore"),
+    (cell(2, 2, "6"), r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes"),
+    (cell(1, 1, ""), r"index\.csv: line 2, offset -1, length 42"),
+    (cell(2, 4, ""), r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing"),
+    (cell(2, 1, "x"), r"index\.csv: .*invalid literal.*'x'"),
+    (no_rows, r"index\.csv: no telegram in the index, 6538 bytes"),
+    (cell(2, 4, "400"), r"a pitch is .* rad: degrees"),
+    (data(lambda raw: raw[:2000]), "line 5, offset 1666, .* telegrams.bin has 2000 bytes: restore it, or remove"),
+    (data(lambda raw: b"\x06" + raw), "9 of 9 telegrams have a wrong CRC.*not of one recording"),
+    (again((1, scans(room()), 0.0), (2, scans(HALF), 0.0)), "scans of 361, 401 values are mixed"),
+    (again((1, scans(HALF), 0.0), (2, interlaced(np.ones(721)), 0.0)), "scans of 180, 181, 361 values are mixed"),
+    (again((1, scans(room(beams=50)), 0.0)), r"telegrams\.bin: a whole scan has .* values, got 50"),
+    (again((1, scans(HALF), 0.0), first=configuration(0x3F)), r"telegrams\.bin: measuring mode 0x3f is none of"),
+    (again((-1, scans(room()), 0.0)), "no telegram with a scan belongs to a placement"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE)
+def test_what_does_not_fit_is_refused(path, damage, message):
+    damage(path)
     with pytest.raises(SessionError, match=message):
         open_session(path)
-
-
-def test_data_that_do_not_fit_the_index_are_refused(path):
-    data = telegrams(path).read_bytes()
-    telegrams(path).write_bytes(data[:2000])
-    message = r"line 5, offset 1666, length 812, but telegrams.bin has 2000 bytes: restore it, or remove the rows from"
-    with pytest.raises(SessionError, match=message):
-        open_session(path)
-    telegrams(path).write_bytes(b"\x06" + data)
-    with pytest.raises(SessionError, match="9 of 9 telegrams have a wrong CRC.*not of one recording"):
-        open_session(path)
-
-
-def test_mixed_variants_are_refused(tmp_path):
-    record(tmp_path / "s", (1, scans(room()), 0.0), (2, scans(room(beams=361)), 0.0))
-    with pytest.raises(SessionError, match="scans of 361, 401 values are mixed"):
-        open_session(tmp_path / "s")
-    record(tmp_path / "t", (1, scans(room(beams=361)), 0.0), (2, interlaced(np.ones(721)), 0.0))
-    with pytest.raises(SessionError, match="scans of 180, 181, 361 values are mixed"):
-        open_session(tmp_path / "t")
-
-
-def test_scans_of_a_sub_range_are_refused(tmp_path):
-    record(tmp_path / "s", (1, scans(room(beams=50)), 0.0))
-    with pytest.raises(SessionError, match=r"telegrams\.bin: a whole scan has .* values, got 50"):
-        open_session(tmp_path / "s")
-
-
-def test_modes_without_ranges_are_refused(tmp_path):
-    record(tmp_path / "s", (1, scans(room()), 0.0), first=configuration(0x3F))
-    with pytest.raises(SessionError, match=r"telegrams\.bin: measuring mode 0x3f is none of"):
-        open_session(tmp_path / "s")
-
-
-def test_a_recording_without_scans_is_refused(tmp_path):
-    record(tmp_path / "s", (-1, scans(room()), 0.0))
-    with pytest.raises(SessionError, match="no telegram with a scan belongs to a placement"):
-        open_session(tmp_path / "s")
 
 
 def test_the_writer_refuses_what_it_could_not_read_again(tmp_path):

@@ -168,11 +168,6 @@ class Collector:
     All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
     at any time. What needs a rig raises DeviceError without one.
 
-    Parameters
-    ----------
-    advice : bool
-        Look after every placement what the next one should add.
-
     Attributes
     ----------
     view : View
@@ -189,8 +184,8 @@ class Collector:
     finished = property(lambda self: () if self.recording is None else self.recording.finished,
                         doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
 
-    def __init__(self, *, advice=True):
-        self.advice, self.rig, self.recording = advice, None, None
+    def __init__(self):
+        self.rig, self.recording = None, None
         self.view, self.lights, self._told = View(), {}, ""
         self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
 
@@ -367,8 +362,8 @@ class Collector:
                     raise Interrupted(f"stopped: placement {number} does not count, record it again") from error
         progress(1.0, "checking what was recorded")
         scenes = {placement.number for placement in self.recording.plan if placement.purpose == "scene"}
-        advice = self._advise if self.advice and len({*self.finished} - scenes) >= ADVICE_FROM else None
-        self.lights[number] = self.recording.check(number, advice)
+        enough = len({*self.finished} - scenes) >= ADVICE_FROM
+        self.lights[number] = self.recording.check(number, self._advise if enough else None)
         return self.lights[number]
 
     def _note(self, event, progress):

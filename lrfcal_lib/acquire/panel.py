@@ -356,8 +356,6 @@ class Panel:
         Rig file, or an emulated rig: 'practice' (seconds a placement), 'sim_quick', 'sim_lms221'.
     session : path-like, optional
         Folder of the session; a new one in ``~/lrfcal_sessions`` by default.
-    advice : bool
-        Look after every placement what the next one should add.
 
     Examples
     --------
@@ -365,9 +363,9 @@ class Panel:
     >>> panel.show()  # doctest: +SKIP
     """
 
-    def __init__(self, rig="practice", session=None, *, advice=True):
+    def __init__(self, rig="practice", session=None):
         session = session or Path.home() / "lrfcal_sessions" / time.strftime("%Y-%m-%d_%H%M%S")
-        self.collector, self.parts = Collector(advice=advice), Parts(str(rig), str(session))
+        self.collector, self.parts = Collector(), Parts(str(rig), str(session))
         self.notes, self._worker = Notes(self.parts.notes), ThreadPoolExecutor(1, thread_name_prefix="panel")
         self.job, self._live, self._quit, self._sweep = None, None, threading.Event(), None
         for name in BUTTONS:

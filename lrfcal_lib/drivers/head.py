@@ -1,77 +1,68 @@
 """The pitch axis of a Pelco-D head: settings, moves, sweeps and readings, with whatever the head answers."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging
 import math
 import threading
-from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, StrictBool
 
 from lrfcal_lib.drivers import pelco_d, port
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.pelco_d import FASTEST, HeadLine
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
-from lrfcal_lib.drivers.stated import FLAG, check, either, kinds, listed, number, one_of, stated, whole
+from lrfcal_lib.drivers.stated import Angle, Stated, number, several, whole
+from lrfcal_lib.session.stated import refused
 
 LOG = logging.getLogger(__name__)
-PERHAPS = one_of("auto", True, False)
-ANGLE, SPEED, SECONDS = number(-180, 180, "deg"), number(0.01, 360, "deg/s"), number(0, 60, "s")
-NEAR = number(1e-4, 45, "deg")
+Perhaps = Literal["auto", True, False]
+Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01, 360, "deg/s")
+ORDER = "the lower one comes first"
+ASSUMED = 4.0, 4.0  # deg/s
 
 
-@dataclass(frozen=True)
-class HeadSettings:
+class HeadSettings(Stated):
     """Settings of a Pelco-D head; ValueError for values that no head can have.
 
     Nothing is published about the Ya An YA3050, so all defaults are assumptions.
     """
 
-    address: int = stated(whole(0, 255), 1)  # the usual factory setting of the DIP switches
-    baudrate: int = stated(whole(50, 4_000_000), 2400)  # the most common default; 9600 is the next
+    address: whole(0, 255) = 1  # the usual factory setting of the DIP switches
+    baudrate: whole(50, 4_000_000) = 2400  # the most common default; 9600 is the next
     # Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not state
     # it means true: a silent head may as well be one with another address or rate.
-    feedback: str | bool = stated(PERHAPS, "auto")
+    feedback: Perhaps = "auto"
     # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
-    absolute: str | bool = stated(PERHAPS, "auto")
+    absolute: Perhaps = "auto"
     # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed; true makes a missing
     # one an error (the adapter is dead), false makes one a warning.
-    echo: str | bool = stated(PERHAPS, "auto")
+    echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
-    pitch_limits_deg: tuple[float, float] = stated(listed(ANGLE, 2), (-60.0, 60.0))
-    position_zero_deg: float = stated(number(-360, 360, "deg"), 0.0)  # elevation that the head tells at pitch 0
-    invert: bool = stated(FLAG, False)  # it hangs upside down or counts the other way: its "up" lowers the view
-    tilt_speed: int = stated(whole(0, FASTEST), 0x20)  # speed byte, 0 is very slow
-    # At `tilt_speed`, both ways or (up, down). None: 4 is assumed, as of constant-speed heads, until it was calibrated
-    # or learnt, and the log says so.
-    degrees_per_second: float | tuple[float, float] | None = stated(either(SPEED, listed(SPEED, 2)), None)
+    pitch_limits_deg: Annotated[several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)] = (-60.0, 60.0)
+    position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
+    invert: StrictBool = False  # it hangs upside down or counts the other way: its "up" lowers the view
+    tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
+    # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed heads, until it was
+    # calibrated or learnt, and the log says so.
+    degrees_per_second: Annotated[
+        several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
+    ] = None
     # From the motion frame to the movement, less what it runs on after the stop; calibrated together with the speed.
-    start_delay_s: float = stated(number(-10, 10, "s"), 0.0)
-    start_pitch_deg: float = stated(ANGLE, 0.0)  # where a head without feedback stands at first: levelled by hand
-    tolerance_deg: float = stated(NEAR, 0.1)  # readings that differ by less are the same: cheap encoders jitter
-    arrival_deg: float = stated(NEAR, 0.5)  # a move that ends this near has arrived; its settled pitch counts
-    settle_s: float = stated(SECONDS, 0.3)  # the head rests when its readings stay the same for this long
-    stall_s: float = stated(SECONDS, 1.5)  # rest elsewhere for this long: it does not get to where it was sent
-    poll_s: float = stated(SECONDS, 0.1)  # between queries while it moves
-    reply_s: float = stated(number(1e-3, 10, "s"), 0.35)  # until a reply begins; 1 is needed by slow heads
-    gap_s: float = stated(number(0, 10, "s"), 0.05)  # silence between frames, and time for an acknowledgement
-    retries: int = stated(whole(0, 20), 3)  # queries repeated when no reply came
-    sends: int = stated(whole(1, 20), 1)  # motion frames in a row: 2 on weak lines; stops are sent twice in any case
-    repeat_s: float | None = stated(number(1e-3, 60, "s"), None)  # below 1 for heads that stop by themselves without
-    reconnect_s: float = stated(number(0, 3600, "s"), 3.0)  # a call waits this long for a vanished port to come back
-
-    def __post_init__(self):
-        check(vars(self), kinds(HeadSettings), "head")
-        low, high = self.pitch_limits_deg
-        if low >= high:
-            raise ValueError(f"head.pitch_limits_deg is {low:g} to {high:g}: the lower one comes first")
-
-    @property
-    def speeds_deg(self):
-        """Degrees per second (up, down) at `tilt_speed`; 4 where none is stated."""
-        speed = 4.0 if self.degrees_per_second is None else self.degrees_per_second
-        return tuple(speed) if isinstance(speed, tuple | list) else (speed, speed)
+    start_delay_s: number(-10, 10, "s") = 0.0
+    start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
+    tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
+    arrival_deg: Near = 0.5  # a move that ends this near has arrived; its settled pitch counts
+    settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
+    stall_s: Seconds = 1.5  # rest elsewhere for this long: it does not get to where it was sent
+    poll_s: Seconds = 0.1  # between queries while it moves
+    reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
+    gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
+    retries: whole(0, 20) = 3  # queries repeated when no reply came
+    sends: whole(1, 20) = 1  # motion frames in a row: 2 on weak lines; stops are sent twice in any case
+    repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
+    reconnect_s: number(0, 3600, "s") = 3.0  # a call waits this long for a vanished port to come back
 
     def elevation(self, pitch):
         """What the head calls a pitch, rad."""
@@ -117,7 +108,8 @@ class Motion:
         self.line, self.settings, self._log, self._clock, self._now = line, settings, log, clock, line.host.now
         self.abort, self.feedback, self.rows, self._misses = line.host.event(), False, [], 0
         self.calibrated, self._delay = settings.degrees_per_second is not None, settings.start_delay_s
-        self._speeds = {settings.tilt_speed: dict(zip((1, -1), map(math.radians, settings.speeds_deg), strict=True))}
+        up, down = settings.degrees_per_second or ASSUMED
+        self._speeds = {settings.tilt_speed: {1: math.radians(up), -1: math.radians(down)}}
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
         self._obeys = False if settings.absolute is False else None  # set-tilt; None until it was tried
         self._dead, self._going, self._frame, self._repeated = set(), None, b"", 0.0
@@ -436,7 +428,7 @@ def drawn_to_readings(rows):
     return track
 
 
-class PanTilt:
+class PanTilt(port.Closed):
     """A head on a serial line; a context manager. It is stopped on every way out, Ctrl-C and SIGTERM included.
 
     Parameters
@@ -494,21 +486,15 @@ class PanTilt:
         self.has_feedback = self.motion.feedback = reading is not None
         if not self.has_feedback:
             self.motion.know(start)
-            self._log.warning("the head does not tell its tilt: timed moves at %s deg/s (%s), from %.2f deg; "
-                              "its pitch is not measured", "/".join(f"{v:g}" for v in settings.speeds_deg),
-                              "stated" if self.motion.calibrated else "assumed, calibrate it",
-                              settings.start_pitch_deg)  # fmt: skip
+            how = "stated" if self.motion.calibrated else "assumed, calibrate it"
+            self._log.warning("the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
+                              "its pitch is not measured", *(settings.degrees_per_second or ASSUMED),
+                              how, settings.start_pitch_deg)  # fmt: skip
 
     def _silence(self):
         echo = "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
         return (f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the wires A and B, "
                 f"address {self.settings.address} and {self.settings.baudrate} Bd, or state feedback false")
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def close(self):
         """Stop the head and close the port; a second call does nothing."""

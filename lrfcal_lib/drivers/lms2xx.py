@@ -8,7 +8,7 @@ import math
 from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx_link import POINTS, RATES, Assembler, Link, ScanClock, ScanReader
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
 from lrfcal_lib.session.lms2xx_codec import (
     MODES,
     SCAN,
@@ -29,7 +29,7 @@ CONFIGURED = ("unit", "measuring_mode", "realtime_indices")
 COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
 
 
-class LMS2xx:
+class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
     Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
@@ -76,8 +76,8 @@ class LMS2xx:
 
     def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=LOG,
                  host=REAL, **configuration):  # fmt: skip
-        if baudrate is not None:
-            _code_of(baudrate)
+        if baudrate not in (None, *RATES):
+            raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
         self.port, self._password, self._host, self._log = str(port), bytes(password), host, log
@@ -93,12 +93,6 @@ class LMS2xx:
         except BaseException:
             self._release()
             raise
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
 
     def close(self):
         """Stop streaming, close the port; never raises for a device that is gone."""
@@ -225,27 +219,12 @@ class LMS2xx:
 
         self.configuration = self._told(wire.CONFIGURATION, parse)
 
-    def set_baudrate(self, rate):
-        """Change the rate of both ends to 9600, 19200, 38400 or 500000; flash is not written.
-
-        Raises
-        ------
-        PortError
-            If the line of this machine cannot; nothing has changed.
-        Refused, NoReply
-            If the device declines, or does not come through at the new rate; the old one holds again.
-        """
-        _code_of(rate)
-        self._idle()
-        if rate != self.baudrate:
-            self._set_rate(rate)
-            self._prepare()
-
     def _set_rate(self, rate):
+        """Change the rate of both ends; flash is not written. Where it does not come through the old one holds."""
         old = self.baudrate
         self._link.set_rate(rate)  # before the device is told: raises where this end cannot
         self._link.set_rate(old)
-        self._mode(bytes([_code_of(rate)]), f"{rate} Bd")
+        self._mode(bytes([RATES[rate]]), f"{rate} Bd")
         self._link.set_rate(rate)
         try:
             self._link.ask(wire.TYPE)
@@ -345,9 +324,8 @@ class LMS2xx:
     def request(self, timeout=None):
         """One scan, a Reading, within so many seconds; by default what three tries need."""
         self._idle()
-        if timeout is None:
-            timeout = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
-        end = self._host.now() + timeout
+        patience = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
+        end = self._host.now() + (patience if timeout is None else timeout)
         for _ in range(wire.TRIES):
             left = max(0.0, end - self._host.now())
             arrival = self._opened().ask(wire.VALUES, ALL_VALUES, limit_s=left)
@@ -446,10 +424,3 @@ class LMS2xx:
         self._link.ask(wire.MODE, wire.ON_REQUEST)
         self._link.hush()
         self._prepare()
-
-
-def _code_of(rate):
-    """Data of command 20 that sets a rate."""
-    if rate not in RATES:
-        raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {rate}")
-    return RATES[rate]

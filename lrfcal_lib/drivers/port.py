@@ -46,6 +46,16 @@ class OutOfRange(DeviceError, ValueError):
     """A device was asked for more than it can do, such as a pitch beyond the limits of its head."""
 
 
+class Closed:
+    """Something that is closed at the end of a with statement."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
 _moving_things = weakref.WeakSet()
 _before = {}
 

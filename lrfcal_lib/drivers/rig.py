@@ -13,7 +13,7 @@ import numpy as np
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx import CONFIGURED, LMS2xx
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, ask
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, ask
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.drivers.video import Camera
 from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of
@@ -81,7 +81,7 @@ def host_clock():
     return lambda: zero + time.monotonic()
 
 
-class Rig:
+class Rig(Closed):
     """The devices of a RigFile, all with the same host clock, s; a context manager that stops the head and closes them.
 
     :meth:`open` opens them.
@@ -135,12 +135,6 @@ class Rig:
             rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
             rig._closing = stack.pop_all()
         return rig
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def close(self):
         """Stop the head and close all devices; a second call does nothing."""

@@ -20,7 +20,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError
 
 LOG = logging.getLogger(__name__)
 END = b"\xff\xd9"  # of a JPEG file; inside of its image data it cannot occur
@@ -245,7 +245,7 @@ class Frame:
     index: int
 
 
-class Camera:
+class Camera(Closed):
     """A camera, set to what is asked for; what came of it is read back. A context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
@@ -293,12 +293,6 @@ class Camera:
         if self._source.live:
             self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
             self._thread.start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def newest(self, after=None, timeout=5.0):
         """The newest frame within so many seconds, grabbed later than `after` by the host's clock if that is given.

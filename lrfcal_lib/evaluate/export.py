@@ -20,6 +20,7 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
 
 SCHEMA = 1
+AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
 FRAMES = (
     "destination first: p_camera = T_camera_source p_source; metres, radians; "
@@ -28,32 +29,15 @@ FRAMES = (
 
 
 def calibration_record(calibration, method, judged=None):
-    """Everything a calibration says, ready for JSON.
+    """Everything that a Calibration says about the results of a method, ready for JSON.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    method : str
-        The method whose results are handed over; 'joint' brings its own platform, range offset and pitch terms.
-    judged : Verdict, optional
-        On these results, where :func:`lrfcal_lib.evaluate.verdict.judge` was asked already.
-
-    Returns
-    -------
-    dict
-        Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for
-        each camera its pose, intrinsics, covariance, and residual statistics; with the joint estimate also what it says
-        about the sensor.
+    Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for each
+    camera its pose, intrinsics, covariance, and residual statistics. 'joint' brings its own platform, range offset and
+    pitch terms, and what it says about the sensor. `judged` is the Verdict on these results, where ``judge`` was asked
+    already.
     """
-    prepared, session = calibration.prepared, calibration.prepared.session
-    variant = "joint" if method == "joint" else "half_step"
-    cameras = {
-        camera: _camera(prepared.models[camera], calibration.observations[camera, variant], solution)
-        | (_joint_fit(calibration.joint, camera) if method == "joint" else {})
-        for (camera, name), solution in calibration.solutions.items()
-        if name == method
-    }
-    axis = calibration.platform.axis_with(method)
+    session, platform = calibration.prepared.session, calibration.platform
+    axis, every = platform.axis_with(method), calibration.solutions.items()
     record = {
         "schema": SCHEMA,
         "lrfcal": __version__,
@@ -62,60 +46,43 @@ def calibration_record(calibration, method, judged=None):
         "conventions": FRAMES,
         "method": method,
         "verdict": (judged or judge(calibration, method, suggest=False)).record(),
-        "platform": _transform(calibration.platform.transform(axis))
-        | {
-            "maps": "lrf to head",
-            "axis_covariance": calibration.platform.parameters()[axis][1].tolist(),
-            "axis_covariance_of": AXIS_PARAMETERS,
-        },
-        "cameras": cameras,
+        "platform": {
+            **_transform(platform.transform(axis)), "maps": "lrf to head",
+            "axis_covariance": platform.parameters()[axis][1].tolist(), "axis_covariance_of": AXIS_PARAMETERS,
+        },  # fmt: skip
+        "cameras": {c: _camera(calibration, c, method, found) for (c, name), found in every if name == method},
     }
-    return record | ({"sensor": _sensor(calibration.joint.solution)} if method == "joint" else {})
+    if method == "joint":  # what it says about range finder and pitch, and what it left out in words
+        joint = calibration.joint.solution
+        sigma = dict(zip(joint.solution.names, joint.solution.trusted_sigma.tolist(), strict=True))
+        sensor = {name: {"value": joint.sensor[name], "sigma": sigma[name]} for name in joint.sensor if name in sigma}
+        record["sensor"] = sensor | {"noise": joint.noise, "excluded": list(joint.excluded.values())}
+    return record
 
 
-def _sensor(solution):
-    """What the joint estimate says about range finder and pitch, and what it left out in words."""
-    sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
-    named = {name: {"value": solution.sensor[name], "sigma": sigma[name]} for name in solution.sensor if name in sigma}
-    return named | {"noise": solution.noise, "excluded": list(solution.excluded.values())}
-
-
-AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
-
-
-def _joint_fit(joint, camera):
-    """Residuals as the joint estimate has them: without the edge bias, from the boards where it puts them."""
-    return {"edge_rms_px": rms(edge_misses_px(joint, camera)), "plane_rms_mm": joint_fit(joint)["plane_rms_mm"]}
-
-
-def _camera(model, obs, solution):
-    edge = edge_residuals_px(obs, solution.transform, solution.model)
+def _camera(calibration, camera, method, solution):
+    """Pose, intrinsics and residuals of a camera; of the joint estimate without the edge bias, from its own boards."""
+    obs = calibration.observations[camera, "joint" if method == "joint" else "half_step"]
+    edge, model = edge_residuals_px(obs, solution.transform, solution.model), calibration.prepared.models[camera]
+    misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution))}
+    if method == "joint":
+        edge_px = rms(edge_misses_px(calibration.joint, camera))
+        misfit = {"edge_rms_px": edge_px, "plane_rms_mm": joint_fit(calibration.joint)["plane_rms_mm"]}
+    model = solution.model or model
+    lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), model.parameters.tolist(), strict=True))
     return {
-        "maps": f"{obs.source} to {obs.camera}",
-        **_transform(solution.transform),
+        "maps": f"{obs.source} to {obs.camera}", **_transform(solution.transform),
         "sigma": dict(zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)),
         "covariance": solution.trusted[:6, :6].tolist(),
-        "intrinsics": _intrinsics(solution.model or model),
-        "converged": bool(solution.converged),
-        "unobservable": list(solution.unobservable),
-        "edge_rms_px": rms(edge),
-        "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution)),
-        "n_crossings": len(edge),
+        "intrinsics": {"width": model.width, "height": model.height, **lens}, "converged": bool(solution.converged),
+        "unobservable": list(solution.unobservable), **misfit, "n_crossings": len(edge),
         "placements": obs.all_placements.tolist(),
-    }
+    }  # fmt: skip
 
 
 def _transform(transform):
-    return {
-        "matrix": transform.as_matrix().tolist(),
-        "rotvec_rad": transform.rotation.as_rotvec().tolist(),
-        "translation_m": transform.translation.tolist(),
-    }
-
-
-def _intrinsics(model):
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    return {"width": model.width, "height": model.height} | dict(zip(names, model.parameters.tolist(), strict=True))
+    pose = {"rotvec_rad": transform.rotation.as_rotvec().tolist(), "translation_m": transform.translation.tolist()}
+    return {"matrix": transform.as_matrix().tolist(), **pose}
 
 
 def file_hashes(session):
@@ -129,46 +96,29 @@ def file_hashes(session):
 
 
 def write_calibration(path, record):
-    """Write a calibration as JSON; NaN becomes null.
+    """Write a :func:`calibration_record` as JSON; NaN becomes null."""
 
-    Parameters
-    ----------
-    path : path-like
-    record : dict
-        Of :func:`calibration_record`.
-    """
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(v) for key, v in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_plain(record), indent=1, allow_nan=False) + "\n")
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    path.write_text(json.dumps(plain(record), indent=1, allow_nan=False) + "\n")
 
 
 def calibrate_session(path, out=None):
     """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and ``cloud.ply``.
 
-    Parameters
-    ----------
-    path : path-like
-        Folder of the session.
-    out : path-like, optional
-        ``reports/<name>`` under the current folder when left out.
-
-    Returns
-    -------
-    int
-        0, or 3 where the verdict is 'no' (also when no camera could be calibrated and nothing is written).
+    They go to `out`, ``reports/<name>`` under the current folder when left out. Returns 0, or 3 where the verdict is
+    'no' (also when no camera could be calibrated and nothing is written).
     """
-    found = calibrate(open_session(path))
+    found, scale = calibrate(open_session(path)), np.repeat([np.rad2deg(1.0), 1000.0], 3)
     folder = Path(out or Path("reports") / Path(path).resolve().name)
     for (camera, method), solution in found.solutions.items():
-        scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
         values, sigma = scale * solution.parameters[:6], scale * solution.trusted_sigma[:6]
         turn, shift = (f"{values[i].round(2)} +- {sigma[i].round(2)}" for i in (slice(0, 3), slice(3, 6)))
         print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
@@ -177,8 +127,8 @@ def calibrate_session(path, out=None):
     judged = judge(found)
     print(*judged.sentences(), sep="\n")
     if judged.errors:  # otherwise nothing can be handed over
-        method = handed_over(found)
-        write_calibration(folder / "calibration.json", calibration_record(found, method, judged))
-        write_ply(folder / "cloud.ply", color_cloud(found, method))
-        print(f"written: {folder / 'calibration.json'}, {folder / 'cloud.ply'}")
+        method, file, cloud = handed_over(found), folder / "calibration.json", folder / "cloud.ply"
+        write_calibration(file, calibration_record(found, method, judged))
+        write_ply(cloud, color_cloud(found, method))
+        print(f"written: {file}, {cloud}")
     return UNTRUSTED if judged.answer == NO else 0

@@ -14,29 +14,18 @@ from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import edge_shift, flip_sigma, named_blocks
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    apply_pose,
-    gradient_by_pose,
-    polar_to_points,
-    pose_array,
-    pose_transform,
-    rotate_points,
-)
 from lrfcal_lib.solvers.joint import UNSEEN
 
 FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # upright ahead of the LRF, print towards it
 LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
 PLACES = {
-    "distances": (1.0, 1.5, 2.0, 2.5, 3.0),
-    "bearings": tuple(np.radians([-20, -10, 0, 10, 20])),
-    "elevations": tuple(np.radians([-12, 0, 12])),
-    "turns": tuple(np.radians(np.arange(0, 360, 60))),
+    "distances": (1.0, 1.5, 2.0, 2.5, 3.0), "bearings": tuple(np.radians([-20, -10, 0, 10, 20])),
+    "elevations": tuple(np.radians([-12, 0, 12])), "turns": tuple(np.radians(np.arange(0, 360, 60))),
     "leans": tuple(np.radians([0, 35])),
-}
+}  # fmt: skip
 FIELD_OF_VIEW = (np.radians(40), np.radians(140))
 PITCH_LIMITS = (np.radians(-30), np.radians(30))
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
@@ -49,11 +38,9 @@ CHUNK = 400  # placements at a time: memory
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 LARGE, MOST = 0.5, 3  # of a direction, components above this share of the largest are named, and so many of them
 OTHERS = {
-    "range_offset": "the range offset",
-    "edge_log_odds": "the edge bias",
-    "pitch_scale": "the scale of the pitch",
+    "range_offset": "the range offset", "edge_log_odds": "the edge bias", "pitch_scale": "the scale of the pitch",
     "pitch_by_direction": "the pitch offset by sweep direction",
-}
+}  # fmt: skip
 
 
 def outline(solution):
@@ -91,7 +78,7 @@ def board_grid(solution, distances, bearings, elevations, turns, leans):
 def visible(boards, solution, models, field_of_view):
     """Which boards lie wholly in the view of LRF and cameras, (m,), and the pitch angles of their images, (m, k)."""
     corners = np.column_stack([outline(solution), np.zeros(len(solution.data.lines))])
-    points, normals = apply_pose(boards, corners), boards[:, :, 2]
+    points, normals = geometry.apply_pose(boards, corners), boards[:, :, 2]
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
     inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
     inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
@@ -100,12 +87,12 @@ def visible(boards, solution, models, field_of_view):
     seen = np.ones((len(LATTICE), len(rows)), bool)
     for number, name in enumerate(solution.transforms):
         pose, model = camera_poses(solution, number, LATTICE), models[name]
-        p, size = apply_pose(pose[:, None], points[rows]), np.array([model.width, model.height])
+        p, size = geometry.apply_pose(pose[:, None], points[rows]), np.array([model.width, model.height])
         uv, border = project(p, model), MARGIN * size
         # far outside the image the lens model folds back: only rays near the image count
         tangent = np.abs(p[..., :2] / np.where(p[..., 2:] > 0, p[..., 2:], np.nan))
         inside = (uv > border) & (uv < size - border) & (tangent < 0.65 * size / [model.fx, model.fy])
-        seen &= np.all(inside.all(axis=-1) & _facing(p, rotate_points(pose, normals[rows])), axis=2)
+        seen &= np.all(inside.all(axis=-1) & _facing(p, geometry.rotate_points(pose, normals[rows])), axis=2)
     rows, seen = rows[seen.any(axis=0)], seen[:, seen.any(axis=0)]
     low, high = LATTICE[np.argmax(seen, axis=0)], LATTICE[len(LATTICE) - 1 - np.argmax(seen[::-1], axis=0)]
     share = np.linspace(0, 1, IMAGES) if any(solution.data.on_head) else np.array([0.5])
@@ -123,7 +110,7 @@ def camera_poses(solution, number, pitch):
     if not solution.data.on_head[number]:
         return np.broadcast_to(pose, (len(pitch), 3, 4))
     back = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(-pitch, [1.0, 0.0, 0.0])))
-    return pose_array(pose_transform(pose) * solution.T_head_lrf.inv() * back)
+    return geometry.pose_array(geometry.pose_transform(pose) * solution.T_head_lrf.inv() * back)
 
 
 @dataclass(frozen=True)
@@ -166,26 +153,21 @@ def measure_yield(solution, models, features=None):
     `features`, shape (k, 3), is what the cameras see of the board (its pattern), metres; all over it when left out.
     """
     face, beam, boards = solution.data.face, solution.data.beam, solution.state.boards
-    used, edges = beam["used"], range(len(solution.data.lines))
-    rows = used.any(axis=1)
-    radius = np.nanmedian(np.where(used, beam["radius"], np.nan)[rows], axis=1)
-    distance, spot = np.linalg.norm(boards[rows, :, 3], axis=1), (0.0, 0.005)
+    used, distance = beam["used"], np.linalg.norm(boards[:, :, 3], axis=1)
+    spot, rows = np.array([0.0, 0.005]), used.any(axis=1)
     if rows.any():
-        grows = np.ptp(distance) >= 0.1 and np.ptp(radius) >= 1e-6
-        spot = np.polyfit(distance, radius, 1) if grows else (0.0, np.median(radius))
-    first = Yield(
-        bearing_step=_step(solution, "bearing"),
-        pitch_step=_step(solution, "pitch"),
-        spot=np.array(spot),
-        background=float(np.median(beam["background"][used])) if used.any() else 0.0,
-        faces=int(face["used"].sum(axis=1).max(initial=0)),
-        cells=max(int((used & (beam["edge"] == e)).sum(axis=1).max(initial=0)) for e in edges),
-        features=_inner(solution, 8) if features is None else np.asarray(features, float),
-    )
+        radius = np.nanmedian(np.where(used, beam["radius"], np.nan)[rows], axis=1)
+        grows = np.ptp(distance[rows]) >= 0.1 and np.ptp(radius) >= 1e-6
+        spot = np.polyfit(distance[rows], radius, 1) if grows else np.array([0.0, np.median(radius)])
+    cells = [(used & (beam["edge"] == e)).sum(axis=1).max(initial=0) for e in range(len(solution.data.lines))]
+    features = _inner(solution, 8) if features is None else np.asarray(features, float)
+    background, faces = np.median(beam["background"][used]) if used.any() else 0.0, face["used"].sum(axis=1)
+    steps = _step(solution, "bearing"), _step(solution, "pitch")
+    first = Yield(*steps, spot, background, faces.max(initial=0), max(cells), features)
     bare = replace(solution.state, sweeps=0 * solution.state.sweeps, sides=0 * solution.state.sides)
     expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, first)), solution.unknowns)
     found = _edge_information(solution.state, solution.data, solution.unknowns)
-    face_share = _share(face["used"].sum(axis=1), np.sum(_faces(boards, solution, first)["used"] ** 2, axis=1))
+    face_share = _share(faces, np.sum(_faces(boards, solution, first)["used"] ** 2, axis=1))
     pixels = _pixels(solution, models, first.features)
     return replace(first, face_share=face_share, edge_share=_share(found, expected), pixels=pixels)
 
@@ -216,9 +198,9 @@ def _pixels(solution, models, features):
 
 def _view_covariance(pose, features, model):
     """Covariance of board poses (n, 4, 4) in a camera from features of the board, 1 px each, shape (n, 6, 6)."""
-    turned = rotate_points(pose[:, :3], features)
+    turned = geometry.rotate_points(pose[:, :3], features)
     by_point = project_jacobians(turned + pose[:, None, :3, 3], model)[0]
-    J = gradient_by_pose(turned[..., None, :], by_point)
+    J = geometry.gradient_by_pose(turned[..., None, :], by_point)
     return np.linalg.inv(np.einsum("nkai,nkaj->nij", J, J))
 
 
@@ -236,7 +218,7 @@ def _inner(solution, number):
 
 def _sampled(boards, local, solution, rate):
     """Beams to points of boards: bearing, pitch, range, direction (board frame), beams per square metre across it."""
-    points = apply_pose(boards, local)
+    points = geometry.apply_pose(boards, local)
     bearing, pitch, distance = beams_to(points, solution.T_head_lrf)
     ray = ((points - solution.T_head_lrf.translation) @ boards[:, :, :3]) / distance[..., None]
     solid_angle = rate.bearing_step * rate.pitch_step * np.maximum(np.sin(bearing), 0.1)
@@ -252,7 +234,7 @@ def _faces(boards, solution, rate):
     used = np.sqrt(number * np.minimum(rate.face_share, rate.faces / number.sum(axis=1, keepdims=True)))
     sigma = solution.data.face["sigma"][solution.data.face["used"]]
     sigma = np.full(bearing.shape, np.median(sigma) if len(sigma) else 1.0)
-    rays = polar_to_points(1.0, bearing)
+    rays = geometry.polar_to_points(1.0, bearing)
     return {"range": distance, "bearing": bearing, "pitch": pitch, "sigma": sigma, "ray": rays, "used": used}
 
 
@@ -262,9 +244,8 @@ def _beams(boards, solution, rate):
     along = np.roll(corners, -1, axis=0) - corners
     length, edge = np.linalg.norm(along, axis=1), np.repeat(np.arange(len(lines)), len(ALONG))
     local = (corners[:, None] + ALONG[:, None] * along[:, None]).reshape(-1, 2)
-    local, direction, normal = (
-        np.column_stack([v, np.zeros(len(edge))]) for v in (local, (along / length[:, None])[edge], lines[edge, :2])
-    )
+    flat = local, (along / length[:, None])[edge], lines[edge, :2]
+    local, direction, normal = (np.column_stack([v, np.zeros(len(edge))]) for v in flat)
     bearing, _, distance, ray, density = _sampled(boards, local, solution, rate)
     across = np.linalg.norm(np.cross(ray, direction), axis=-1)
     radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
@@ -278,21 +259,15 @@ def _beams(boards, solution, rate):
     number = number * sigma * (Z_NODES[1] - Z_NODES[0]) * kept
     outside = (shift[..., None] - Z_NODES * sigma[..., None]) * (across / np.abs(ray[..., 2]))[..., None]
     points = local[:, None] + outside[..., None] * normal[:, None]
-    bearing, pitch, _ = beams_to(apply_pose(boards, points.reshape(n, -1, 3)), solution.T_head_lrf)
+    bearing, pitch, _ = beams_to(geometry.apply_pose(boards, points.reshape(n, -1, 3)), solution.T_head_lrf)
     chance = np.stack([norm.cdf(Z_NODES), norm.cdf(-Z_NODES)])[:, None]
-    group = {  # shapes (n, 2, points, nodes): first the hits
-        "bearing": bearing.reshape(n, 1, -1, len(Z_NODES)),
-        "pitch": pitch.reshape(n, 1, -1, len(Z_NODES)),
-        "edge": edge[:, None],
-        "radius": radius[:, None, :, None],
-        "step": step[:, None, :, None],
-        "background": rate.background,
-        "hit": np.array([True, False])[:, None, None],
-        "used": number[:, None, :, None] * chance,
-    }
-    shape = group["used"].shape
-    group = {name: np.broadcast_to(value, shape).reshape(n, -1) for name, value in group.items()}
-    return group | {"ray": polar_to_points(1.0, group["bearing"])}
+    number = number[:, None, :, None] * chance  # (n, 2, points, nodes): first the hits
+    bearing, pitch = (v.reshape(n, 1, -1, len(Z_NODES)) for v in (bearing, pitch))
+    group = {"bearing": bearing, "pitch": pitch, "edge": edge[:, None], "background": rate.background, "used": number}
+    group |= {"radius": radius[:, None, :, None], "step": step[:, None, :, None]}
+    group["hit"] = np.array([True, False])[:, None, None]
+    group = {name: np.broadcast_to(value, number.shape).reshape(n, -1) for name, value in group.items()}
+    return group | {"ray": geometry.polar_to_points(1.0, group["bearing"])}
 
 
 def _views(boards, pitches, solution, models, rate):
@@ -300,7 +275,7 @@ def _views(boards, pitches, solution, models, rate):
     parts = []
     for number, name in enumerate(solution.transforms):
         for pitch in (pitches if solution.data.on_head[number] else pitches[:, :1]).T:
-            pose = pose_transform(camera_poses(solution, number, pitch)) * pose_transform(boards)
+            pose = geometry.pose_transform(camera_poses(solution, number, pitch)) * geometry.pose_transform(boards)
             covariance = _view_covariance(pose.as_matrix(), rate.features, models[name])
             covariance = covariance * np.outer(rate.pixels, rate.pixels)
             camera = np.full(len(pitch), number)
@@ -348,11 +323,7 @@ def candidate_information(boards, pitches, solution, models, rate):
 class Direction:
     """A combination of unknowns that is known more or less well by itself.
 
-    Attributes
-    ----------
-    words : str
-    sigma : float
-        Standard deviation, metres at a distance of 2 m; inf where it is not observed.
+    `sigma` is its standard deviation, metres at a distance of 2 m; inf where it is not observed.
     """
 
     words: str
@@ -369,16 +340,9 @@ def scales_of(solution, names):
 
 
 def observability(solution):
-    """Singular values and directions of the scaled information.
+    """Directions of the scaled information of a JointSolution, the least known first: list of Direction.
 
-    Parameters
-    ----------
-    solution : JointSolution
-
-    Returns
-    -------
-    list of Direction
-        The least known first. Softness of the edges and sizes of the board are eliminated.
+    Softness of the edges and sizes of the board are eliminated.
     """
     names = np.array(solution.solution.names)
     index = [i for i, n in enumerate(names) if n != "edge_log_softness" and not n.startswith("size_")]
@@ -386,10 +350,9 @@ def observability(solution):
     H = marginal(information(solution).sum(axis=0), index) * scales[:, None] * scales
     values, vectors = np.linalg.eigh(H)
     least, cameras = max(1e-13 * values[-1], UNSEEN**-2), tuple(solution.transforms)
-    return [
-        Direction(direction_words(x, names[index], cameras), float(v**-0.5) if v > least else np.inf)
-        for v, x in zip(values, vectors.T, strict=True)
-    ]
+    sigmas = np.where(values > least, np.maximum(values, least) ** -0.5, np.inf)
+    words = [direction_words(x, names[index], cameras) for x in vectors.T]
+    return [Direction(*pair) for pair in zip(words, sigmas.tolist(), strict=True)]
 
 
 def direction_words(direction, names, cameras):
@@ -397,7 +360,7 @@ def direction_words(direction, names, cameras):
     value = dict(zip(names, np.asarray(direction) / np.max(np.abs(direction)), strict=True))
     single = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | OTHERS
     words = [(abs(value[n]), w) for n, w in single.items() if n in value]
-    for kind, part in (("rotation about", POSE_NAMES[:3]), ("shift along", POSE_NAMES[3:])):
+    for kind, part in (("rotation about", geometry.POSE_NAMES[:3]), ("shift along", geometry.POSE_NAMES[3:])):
         found = {f"camera '{c}'": np.array([value[f"{c}_{p}"] for p in part]) for c in cameras}
         mean = np.mean([*found.values()], axis=0) if found else 0.0
         if len(found) > 1 and all(np.linalg.norm(v - mean) < 0.3 * np.linalg.norm(mean) for v in found.values()):
@@ -475,7 +438,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     ----------
     solution : JointSolution
     models : dict of str to CameraModel
-        Of every camera of the solution.
+        Of every camera of the solution; a ValueError where one is missing.
     field_of_view : tuple of float
         Bearings that the LRF measures, radians.
     features : ndarray, shape (k, 3), optional
@@ -483,14 +446,8 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     places : dict of str to sequence of float, optional
         Replaces entries of `PLACES`.
 
-    Returns
-    -------
-    Suggestion
-
     Raises
     ------
-    ValueError
-        For a camera without a model.
     DegenerateGeometry
         When no pose of the grid is seen by all.
     """
@@ -501,7 +458,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     rows, pitches = visible(boards, solution, models, field_of_view)
     if len(rows) == 0:
         low, high = np.degrees(PITCH_LIMITS)
-        raise DegenerateGeometry(
+        raise geometry.DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all cameras at a pitch from "
             f"{low:.0f} to {high:.0f} deg: give other distances, wider limits, or check the calibration"
         )
@@ -513,15 +470,10 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     before, after = (group_sigma(C, solution) for C in covariances)
     total, totals = (np.sqrt(sum(sigma**2 for sigma in groups.values())) for groups in (before, after))
     best, gains = int(np.argmin(totals)), 1 - totals / total
-    return Suggestion(
-        T_platform_board=pose_transform(boards[rows[best]]),
-        place=grid.iloc[rows[best]],
-        pitches=pitches[best] if any(solution.data.on_head) else None,
-        before=before,
-        after={name: sigma[best] for name, sigma in after.items()},
-        gain=gains[best],
-        median_gain=np.median(gains),
-    )
+    T_platform_board, place = geometry.pose_transform(boards[rows[best]]), grid.iloc[rows[best]]
+    pitches = pitches[best] if any(solution.data.on_head) else None
+    after = {name: sigma[best] for name, sigma in after.items()}
+    return Suggestion(T_platform_board, place, pitches, before, after, gains[best], np.median(gains))
 
 
 def group_sigma(covariance, solution):

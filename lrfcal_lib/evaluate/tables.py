@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -13,18 +15,34 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
 from lrfcal_lib.calibrate.pipeline import left_out_residuals as jointly_left_out
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
+from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    axis_difference,
-    axis_of,
-    lrf_to_platform,
-    paper_parameters,
-    transform_difference,
-)
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
 from lrfcal_lib.solvers import METHODS, solve_camera
+
+# Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
+PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
+USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
+UNITS = {  # of parameters, and the factor from radians and metres
+    r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
+    r"offset_.*|size_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
+    r"[fc][xy]": ("px", 1.0),
+}  # fmt: skip
+
+
+def unit_of(parameter):
+    """Unit and factor in which a parameter is shown."""
+    return next((unit for names, unit in UNITS.items() if re.fullmatch(names, parameter)), ("1", 1.0))
+
+
+def rms(values):
+    """Root mean square of the finite values; NaN where there are none."""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 @dataclass(frozen=True)
@@ -51,184 +69,97 @@ class Truth:
 
 
 def read_truth(session):
-    """The truth of a session, None for a recording.
-
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    Truth or None
-
-    Raises
-    ------
-    SessionError
-        If ``truth.json`` is damaged.
-    """
+    """The :class:`Truth` of a session, None for a recording; a SessionError if ``truth.json`` is damaged."""
     file = session.path / "truth.json"
     if not os.path.lexists(file):
         return None
     data = read_json(file, session.path)
     with naming(f"{file} (simulate the session again)"):
+        cameras = data["cameras"].items()
+        cameras = {c: e["T_camera_lrf"] if "T_camera_lrf" in e else e["T_camera_platform"] for c, e in cameras}
         return Truth(
             transform_from_json(data["T_head_lrf"]),
-            {name: _camera(entry) for name, entry in data["cameras"].items()},
+            {name: transform_from_json(pose) for name, pose in cameras.items()},
             board_from_json(data["board"]),
             {int(n): transform_from_json(entry["T_platform_board"]) for n, entry in data["boards"].items()},
             {int(n): np.asarray(entry["pitch_rad"], float) for n, entry in data["sweeps"].items()},
         )
 
 
-def _camera(entry):
-    return transform_from_json(entry["T_camera_lrf"] if "T_camera_lrf" in entry else entry["T_camera_platform"])
-
-
 def camera_errors(solution, truth, camera):
-    """Rotation (degrees) and translation error (millimetres) of a camera, NaN without truth."""
+    """Rotation (degrees) and translation error (millimetres) of a camera, by column; none without truth."""
     if truth is None:
         return {}
-    angle, distance = transform_difference(solution.transform, truth.cameras[camera])
+    angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
     return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
 
 
 def axis_errors(T_head_lrf, truth):
-    """Direction (degrees) and offset error (millimetres) of a tilt axis, NaN without truth."""
-    if truth is None:
-        return np.nan, np.nan
-    angle, offset = axis_difference(axis_of(T_head_lrf), axis_of(truth.T_head_lrf))
+    """Direction (degrees) and offset error (millimetres) of a tilt axis."""
+    angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), geometry.axis_of(truth.T_head_lrf))
     return np.rad2deg(angle), 1000 * offset
 
 
 def edge_point_table(prepared, truth):
     """Bias of each rule for the edge point against the true edge, across the edge within the board's plane.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    truth : Truth
-
-    Returns
-    -------
-    DataFrame
-        variant, edge, n, bias_mm (positive outside the board), sd_mm.
+    Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
     """
-    rows = []
+    rows, lines = [], dict(zip(truth.board.edges, truth.board.lines(), strict=True))
     for variant in VARIANTS:
-        misses = {edge: [] for edge in truth.board.edges}
+        misses = {edge: [np.zeros(0)] for edge in lines}
         for placement, names in prepared.names.items():
             found = prepared.edges[variant][placement]
+            p_platform = geometry.lrf_to_platform(found.points, truth.pitch[placement][found.line], truth.T_head_lrf)
+            p_board = truth.boards[placement].inv().apply(p_platform)
             for side, edge in names.items():
-                misses[edge].append(_miss(found, found.side == side, edge, truth, placement))
+                misses[edge].append(p_board[found.side == side, :2] @ lines[edge][:2] + lines[edge][2])
         for edge, parts in misses.items():
-            miss = 1000 * np.concatenate([*parts, np.zeros(0)])
-            bias, spread = (miss.mean(), miss.std(ddof=1)) if len(miss) > 1 else (np.nan, np.nan)
-            rows.append((variant, edge, len(miss), bias, spread))
+            miss = pd.Series(1000 * np.concatenate(parts))
+            rows.append((variant, edge, len(miss), miss.mean() if len(miss) > 1 else np.nan, miss.std()))
     return pd.DataFrame(rows, columns=["variant", "edge", "n", "bias_mm", "sd_mm"])
-
-
-def _miss(found, rows, edge, truth, placement):
-    """Signed distances of edge points from the true edge, metres."""
-    pitch = truth.pitch[placement][found.line[rows]]
-    p_platform = lrf_to_platform(found.points[rows], pitch, truth.T_head_lrf)
-    p_board = truth.boards[placement].inv().apply(p_platform)
-    line = truth.board.lines()[truth.board.edges.index(edge)]
-    return p_board[:, :2] @ line[:2] + line[2]
-
-
-# Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
-PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
-AXIS = ("axis_out_of_scan_plane", "axis_in_scan_plane", "offset_in_scan_plane", "offset_across_scan_plane")
-INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
-USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
-
-
-def rms(values):
-    """Root mean square of the finite values; NaN where there are none."""
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 def placements_table(prepared, observations):
     """Every placement of the board: what is usable of it, and why not.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    observations : dict of (str, str) to CameraObservations
-        By camera and variant.
-
-    Returns
-    -------
-    DataFrame
-        placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>`` a camera: the number of
-        edges of the board that a scan crosses and the camera sees.
+    Columns placement, used, reason, n_scan_lines, n_points, then one column ``edges_<camera>`` a camera: the number of
+    edges of the board that a scan crosses and the camera sees. `observations` by camera and variant.
     """
-    rows = []
+    rows, own = [], {camera: observations[camera, "half_step"] for camera in prepared.views}
     for placement in prepared.session.board_placements:
-        scan = prepared.scans.get(placement)
+        mask = prepared.scans[placement].mask if placement in prepared.scans else np.zeros((0, 0), bool)
+        notes = []
+        for camera, views in prepared.views.items():
+            view = views.get(placement)
+            if view is None or view.reason:
+                notes.append(f"{camera}: {'no image' if view is None else view.reason}")
+            else:
+                notes += [f"{camera} {edge}: {why}" for edge, why in view.rejected]
         row = {
-            "placement": placement,
-            "used": False,
-            "reason": prepared.problems.get(placement, ""),
-            "n_scan_lines": 0 if scan is None else int(scan.mask.any(axis=1).sum()),
-            "n_points": 0 if scan is None else int(scan.mask.sum()),
-        }
-        for camera in prepared.views:
-            obs = observations[camera, "half_step"]
-            row[f"edges_{camera}"] = len(set(obs.crossing_edge[obs.crossing_placement == placement]))
-            row["used"] |= placement in obs.all_placements
-        row["reason"] = row["reason"] or _why_not(prepared, placement)
-        rows.append(row)
+            "placement": placement, "used": any(placement in obs.all_placements for obs in own.values()),
+            "reason": prepared.problems.get(placement) or "; ".join(notes), "n_scan_lines": int(mask.any(axis=1).sum()),
+            "n_points": int(mask.sum()),
+        }  # fmt: skip
+        crossed = {c: np.unique(obs.crossing_edge[obs.crossing_placement == placement]) for c, obs in own.items()}
+        rows.append(row | {f"edges_{camera}": len(edges) for camera, edges in crossed.items()})
     return pd.DataFrame(rows)
 
 
-def _why_not(prepared, placement):
-    """What the cameras could not use of a placement."""
-    notes = []
-    for camera, views in prepared.views.items():
-        view = views.get(placement)
-        if view is None:
-            notes.append(f"{camera}: no image")
-        elif view.reason:
-            notes.append(f"{camera}: {view.reason}")
-        else:
-            notes += [f"{camera} {edge}: {why}" for edge, why in view.rejected]
-    return "; ".join(notes)
-
-
 def poses_under(obs, model):
-    """The board poses a camera sees under other intrinsics.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-    model : CameraModel or None
-        None leaves the poses as they are.
-
-    Returns
-    -------
-    ndarray, shape (p, 4, 4)
-        Unchanged where the pattern was not seen.
-    """
+    """The board poses (p, 4, 4) that a camera sees under other intrinsics; as they are where no pattern was seen."""
     if model is None or len(obs.pattern_points) == 0:
         return obs.board_poses
     moved = obs.board_poses.copy()
-    for row, pixels in enumerate(obs.pattern_pixels):
+    for pose, pixels in zip(moved, obs.pattern_pixels, strict=True):
         good = np.isfinite(pixels).all(axis=1)
         if good.sum() >= 6:
-            moved[row] = _refit(obs.board_poses[row], obs.pattern_points[good], pixels[good], model)
+            start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
+            seen = obs.pattern_points[good], pixels[good], model.matrix, model.distortion
+            _, rotvec, shift = cv2.solvePnP(*seen, *start, useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE)
+            turn = Rotation.from_rotvec(rotvec[:, 0])
+            pose[:] = RigidTransform.from_components(shift[:, 0], turn).as_matrix()
     return moved
-
-
-def _refit(pose, points, pixels, model):
-    start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
-    flags = {"useExtrinsicGuess": True, "flags": cv2.SOLVEPNP_ITERATIVE}
-    _, rotvec, shift = cv2.solvePnP(
-        points, np.ascontiguousarray(pixels), model.matrix, model.distortion, *start, **flags
-    )
-    return RigidTransform.from_components(shift[:, 0], Rotation.from_rotvec(rotvec[:, 0])).as_matrix()
 
 
 def plane_residuals_of(obs, solution):
@@ -237,23 +168,11 @@ def plane_residuals_of(obs, solution):
 
 
 def left_out_residuals(obs, judge, method, full):
-    """Residuals of every placement under a calibration from all the others.
+    """Residuals of every placement under a calibration from all the others: edge_px (n,), plane_m (m,).
 
-    Parameters
-    ----------
-    obs : CameraObservations
-        What the method works on.
-    judge : CameraObservations
-        What it is judged on; the same placements.
-    method : str
-    full : Solution
-        The calibration from all placements; the start of each solve.
-
-    Returns
-    -------
-    edge_px : ndarray, shape (n_crossings of `judge`,)
-    plane_m : ndarray, shape (n_plane_points of `judge`,)
-        NaN where the remaining placements do not determine the camera.
+    The `method` of METHODS works on `obs` and is judged on `judge`, CameraObservations of the same placements; `full`
+    is the calibration from all of them, the start of each solve. NaN where the remaining placements do not determine
+    the camera.
     """
     edge_px = np.full(len(judge.crossing_points), np.nan)
     plane_m = np.full(len(judge.plane_points), np.nan)
@@ -261,7 +180,7 @@ def left_out_residuals(obs, judge, method, full):
         try:
             rest = obs.select(obs.all_placements[obs.all_placements != placement])
             solution = solve_camera(rest, method, full.transform)
-        except DegenerateGeometry:
+        except geometry.DegenerateGeometry:
             continue
         held = judge.select([placement])
         edge_px[judge.crossing_placement == placement] = edge_residuals_px(held, solution.transform, solution.model)
@@ -269,7 +188,7 @@ def left_out_residuals(obs, judge, method, full):
     return edge_px, plane_m
 
 
-def method_comparison(observations, solutions, left_out=True, truth=None, joint=None):
+def method_comparison(observations, solutions, truth=None, joint=None):
     """Every method judged on the same crossings and face points, and on placements it has not seen.
 
     Parameters
@@ -279,8 +198,6 @@ def method_comparison(observations, solutions, left_out=True, truth=None, joint=
         lines (not where the sweep enters or leaves the board, which hangs on the pitch) and the face points.
     solutions : dict of (str, str) to Solution
         By camera and method.
-    left_out : bool
-        Also leave out one placement after another (one more solve for each).
     truth : Truth, optional
         Of a simulated session.
     joint : JointCalibration, optional
@@ -295,46 +212,30 @@ def method_comparison(observations, solutions, left_out=True, truth=None, joint=
     """
     rows = []
     for (camera, name), solution in solutions.items():
-        variant, uses = ("joint", "plane") if name == "joint" else (METHODS[name].variant, METHODS[name].uses)
-        own, judge = observations[camera, variant], _judge(observations, camera, name)
-        edge = edge_residuals_px(judge, solution.transform, solution.model)
-        held_edge, held_plane = np.zeros(0), np.zeros(0)
-        if left_out and name == "joint" and joint is not None:
-            held_edge, held_plane = jointly_left_out(joint, camera)
-        elif left_out and name != "joint":
+        if name == "joint":
+            own = observations[camera, "joint"]
+            judge, used = own.along(), own.placements
+            held_edge, held_plane = ([], []) if joint is None else jointly_left_out(joint, camera)
+        else:
+            own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
+            used = getattr(own, USED[METHODS[name].uses])
             held_edge, held_plane = left_out_residuals(own, judge, name, solution)
-        row = {"camera": camera, "method": name, "n_placements": len(np.unique(getattr(own, USED[uses])))}
-        row["edge_median_px"] = float(np.median(np.abs(edge))) if len(edge) else np.nan
-        row["edge_rms_px"] = rms(edge)
-        row["plane_rms_mm"] = 1000 * rms(plane_residuals_of(judge, solution))
-        row["left_out_edge_rms_px"], row["left_out_plane_rms_mm"] = rms(held_edge), 1000 * rms(held_plane)
+        edge = edge_residuals_px(judge, solution.transform, solution.model)
+        row = {
+            "camera": camera, "method": name, "n_placements": len(np.unique(used)),
+            "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan, "edge_rms_px": rms(edge),
+            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)), "left_out_edge_rms_px": rms(held_edge),
+            "left_out_plane_rms_mm": 1000 * rms(held_plane),
+        }  # fmt: skip
         rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
 
 
-def _judge(observations, camera, name):
-    """The points that methods are judged on; the joint estimate has its own platform."""
-    return observations[camera, "joint" if name == "joint" else "half_step"].along()
-
-
 def best_method(comparison, among=("line", "zhang_pless")):
-    """The method to hand over: the smallest product of its edge and plane errors on left-out placements.
+    """The method of a :func:`method_comparison` to hand over: least product of its left-out edge and plane errors.
 
-    Parameters
-    ----------
-    comparison : DataFrame
-        Of :func:`method_comparison`.
-    among : sequence of str
-        A method that fits its own feature and fails on the other one (lines bent by a wide laser spot, say) loses.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    ValueError
-        If none of them was judged on left-out placements, or there is none.
+    A method that fits its own feature and fails on the other one (lines bent by a wide laser spot, say) loses. A
+    ValueError where none of them was judged on left-out placements.
 
     Notes
     -----
@@ -352,21 +253,9 @@ def best_method(comparison, among=("line", "zhang_pless")):
 
 
 def handed_over(calibration):
-    """The method whose result goes into ``calibration.json`` and colours the cloud.
+    """The method of a Calibration whose result goes into ``calibration.json`` and colours the cloud.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
-    Returns
-    -------
-    str
-        'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
-
-    Raises
-    ------
-    ValueError
-        If no method was judged on left-out placements.
+    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
     """
     joint = calibration.joint
     if joint is not None and joint.solution.converged and not joint.solution.unobservable:
@@ -374,179 +263,111 @@ def handed_over(calibration):
     return best_method(method_comparison(calibration.observations, calibration.solutions))
 
 
-def camera_calibration_table(solutions):
-    """Parameters of every calibration with their standard deviations.
-
-    Parameters
-    ----------
-    solutions : dict of (str, str) to Solution
-        By camera and method.
-
-    Returns
-    -------
-    DataFrame
-        camera, method, parameter, unit, value, sigma. sigma is the larger of the propagated noise and the spread over
-        placements.
-    """
+def _parameter_table(keys, found):
+    """A row a parameter, in its unit; `found` has names, values and sigmas by a tuple of keys."""
     rows = []
-    for (camera, method), solution in solutions.items():
-        sigma = solution.trusted_sigma
-        for name, value, spread in zip(solution.names, solution.parameters, sigma, strict=True):
+    for key, columns in found.items():
+        for name, value, sigma in zip(*columns, strict=True):
             unit, factor = unit_of(name)
-            rows.append((camera, method, name, unit, factor * value, factor * spread))
-    return pd.DataFrame(rows, columns=["camera", "method", "parameter", "unit", "value", "sigma"])
+            rows.append((*key, name, unit, factor * value, factor * sigma))
+    return pd.DataFrame(rows, columns=[*keys, "parameter", "unit", "value", "sigma"])
+
+
+def camera_calibration_table(solutions):
+    """Parameters of every calibration (Solutions by camera and method) with their standard deviations.
+
+    Columns camera, method, parameter, unit, value, sigma: the larger of propagated noise and spread over placements.
+    """
+    found = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
+    return _parameter_table(["camera", "method"], found)
 
 
 def platform_calibration_table(platform, truth=None):
-    """The tilt axis by every method with its standard deviations, and the paper's own parameters.
+    """The tilt axis by every method (PlatformCalibration) with its sigmas, and the paper's own parameters.
 
-    Parameters
-    ----------
-    platform : PlatformCalibration
-    truth : Truth, optional
-        Of a simulated session.
-
-    Returns
-    -------
-    DataFrame
-        method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and axis_offset_error_mm of the
-        method. The four numbers of the axis are its angles out of and within the scan
-        plane and its offsets within and across it; phi and t_y are the same axis in the paper's chart.
+    Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and axis_offset_error_mm of
+    the method. The four numbers of the axis are its angles out of and within the scan plane and its offsets within and
+    across it; phi and t_y are the same axis in the paper's chart.
     """
-    factors = np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1000.0, 1000.0])
-    rows = []
+    names, found = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y"), {}
     for method, (values, covariance) in platform.parameters().items():
-        for name, value, sigma in zip(AXIS, factors * values, factors * np.sqrt(np.diag(covariance)), strict=True):
-            rows.append((method, name, "deg" if name.startswith("axis") else "mm", value, sigma))
-        phi, ty = paper_parameters(platform.transform(method))
-        for name, value in zip(("phi_x", "phi_y", "phi_z"), np.rad2deg(phi), strict=True):
-            rows.append((method, name, "deg", value, np.nan))
-        rows.append((method, "t_y", "mm", 1000 * ty, np.nan))
-    table = pd.DataFrame(rows, columns=["method", "parameter", "unit", "value", "sigma"])
-    if truth is None:
-        return table
-    errors = {method: axis_errors(platform.transform(method), truth) for method in platform.parameters()}
-    direction, offset = (table.method.map({m: e[i] for m, e in errors.items()}) for i in (0, 1))
-    return table.assign(axis_direction_error_deg=direction, axis_offset_error_mm=offset)
+        phi, ty = geometry.paper_parameters(platform.transform(method))
+        sigma = np.append(np.sqrt(np.diag(covariance)), np.full(4, np.nan))
+        found[method,] = names, [*values, *phi, ty], sigma
+    table = _parameter_table(["method"], found)
+    if truth is not None:
+        errors = {method: axis_errors(platform.transform(method), truth) for (method,) in found}
+        table[["axis_direction_error_deg", "axis_offset_error_mm"]] = [errors[method] for method in table.method]
+    return table
 
 
 def sweeps_table(session):
-    """What was recorded at every placement.
+    """What a session recorded at every placement.
 
-    Parameters
-    ----------
-    session : Session
-
-    Returns
-    -------
-    DataFrame
-        placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg, pitch_step_deg (median),
-        direction (+1 up, -1 down, 0 neither), n_images.
+    Columns placement, n_scan_lines, n_returns, invalid_percent, pitch_from_deg, pitch_to_deg, pitch_step_deg (median),
+    direction (+1 up, -1 down, 0 neither), n_images.
     """
     rows = []
     for placement in session.placements:
         sweep = session.sweep(placement)
-        pitch = np.rad2deg(sweep.pitch)
-        valid = np.isfinite(sweep.ranges)
-        row = {"placement": placement, "n_scan_lines": len(pitch), "n_returns": int(valid.sum())}
-        row |= {"invalid_percent": 100 * (1 - valid.mean()), "pitch_from_deg": pitch[0], "pitch_to_deg": pitch[-1]}
-        row["pitch_step_deg"] = float(np.median(np.abs(np.diff(pitch)))) if len(pitch) > 1 else 0.0
-        row |= {"direction": session.sweep_direction(placement), "n_images": len(session.images(placement=placement))}
-        rows.append(row)
+        pitch, valid = np.rad2deg(sweep.pitch), np.isfinite(sweep.ranges)
+        rows.append({
+            "placement": placement, "n_scan_lines": len(pitch), "n_returns": int(valid.sum()),
+            "invalid_percent": 100 * (1 - valid.mean()), "pitch_from_deg": pitch[0], "pitch_to_deg": pitch[-1],
+            "pitch_step_deg": float(np.median(np.abs(np.diff(pitch)))) if len(pitch) > 1 else 0.0,
+            "direction": session.sweep_direction(placement), "n_images": len(session.images(placement=placement)),
+        })  # fmt: skip
     return pd.DataFrame(rows)
 
 
 def scans_table(prepared):
-    """The board in every sweep: noise, rejected points, and the sides that scans cross.
+    """The board in every sweep (Prepared): noise, rejected points, and the sides that scans cross.
 
-    Parameters
-    ----------
-    prepared : Prepared
-
-    Returns
-    -------
-    DataFrame
-        placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan lines), sides_across (where the
-        sweep enters or leaves the board).
+    Columns placement, n_points, sigma_range_mm, jump_points, sides_along (crossed by scan lines), sides_across (where
+    the sweep enters or leaves the board).
     """
     rows = []
     for placement, board in prepared.scans.items():
-        along = {s.side for s in prepared.edges["half_step"][placement].sides}
         swept = prepared.swept["half_step"].get(placement)
+        along = {s.side for s in prepared.edges["half_step"][placement].sides}
         across = set() if swept is None else {s.side for s in swept.sides} - along
-        row = {"placement": placement, "n_points": int(board.mask.sum()), "sigma_range_mm": 1000 * board.sigma_range}
-        rows.append(
-            row | {"jump_points": int(board.n_jump_points), "sides_along": len(along), "sides_across": len(across)}
-        )
-    return pd.DataFrame(rows)
+        noise, points, jumps = 1000 * board.sigma_range, int(board.mask.sum()), int(board.n_jump_points)
+        rows.append((placement, points, noise, jumps, len(along), len(across)))
+    columns = ["placement", "n_points", "sigma_range_mm", "jump_points", "sides_along", "sides_across"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def intrinsics_table(models):
-    """Intrinsics of every camera with their standard deviations.
+    """Intrinsics of every camera (CameraModels by name) with their standard deviations.
 
-    Parameters
-    ----------
-    models : dict of str to CameraModel
-
-    Returns
-    -------
-    DataFrame
-        camera, parameter, unit, value, sigma (NaN where the session states the intrinsics).
+    Columns camera, parameter, unit, value, sigma (NaN where the session states the intrinsics).
     """
-    rows = []
-    for camera, model in models.items():
-        sigma = np.full(9, np.nan) if model.covariance is None else np.sqrt(np.diag(model.covariance))
-        for name, value, spread in zip(INTRINSICS, model.parameters, sigma, strict=True):
-            rows.append((camera, name, unit_of(name)[0], value, spread))
-    return pd.DataFrame(rows, columns=["camera", "parameter", "unit", "value", "sigma"])
+    unknown = np.full((9, 9), np.nan)
+    sigmas = {c: np.sqrt(np.diag(unknown if m.covariance is None else m.covariance)) for c, m in models.items()}
+    return _parameter_table(["camera"], {(c,): (INTRINSICS, m.parameters, sigmas[c]) for c, m in models.items()})
 
 
 def outline_table(outline):
-    """Edge lengths of a board as the images show them.
+    """Edge lengths of a board (:class:`lrfcal_lib.preprocess.survey.Outline`) as the images show them.
 
-    Parameters
-    ----------
-    outline : Outline
-
-    Returns
-    -------
-    DataFrame
-        edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
+    Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
     """
     rows = [(n, 1000 * v, 1000 * outline.length_sd[n], outline.n_lengths[n]) for n, v in outline.lengths.items()]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 
 def pitch_models_table(errors):
-    """Which errors of the recorded pitch the data ask for.
+    """Which errors of the recorded pitch (PitchErrors) the data ask for.
 
-    Parameters
-    ----------
-    errors : PitchErrors
-
-    Returns
-    -------
-    DataFrame
-        model, n_parameters, plane_rms_mm, F, p_value (against the model before).
+    Columns model, n_parameters, plane_rms_mm, F, p_value (against the model before).
     """
-    rows = [
-        (m.name, m.n_parameters, 1000 * np.mean(list(m.rms.values())), m.F, m.p_value) for m in errors.models.values()
-    ]
+    models = errors.models.values()
+    rows = [(m.name, m.n_parameters, 1000 * np.mean(list(m.rms.values())), m.F, m.p_value) for m in models]
     return pd.DataFrame(rows, columns=["model", "n_parameters", "plane_rms_mm", "F", "p_value"])
 
 
 def pitch_errors_table(errors):
-    """Offset of the recorded pitch of every sweep.
-
-    Parameters
-    ----------
-    errors : PitchErrors
-
-    Returns
-    -------
-    DataFrame
-        placement, direction, offset_deg, sigma_deg.
-    """
+    """Offset of the recorded pitch of every sweep (PitchErrors): placement, direction, offset_deg, sigma_deg."""
     each = errors.models["sweep"]
     offset, sigma = np.rad2deg(each.offset), np.rad2deg(each.offset_sigma)
     columns = {"placement": errors.placements, "direction": errors.direction, "offset_deg": offset, "sigma_deg": sigma}
@@ -554,67 +375,37 @@ def pitch_errors_table(errors):
 
 
 def axis_knowledge_table(platform):
-    """Who knows each number of the tilt axis better: the data, or the rough measurement.
+    """Who knows each number of the tilt axis better: the data (solution 'line_3d'), or the rough measurement.
 
-    Parameters
-    ----------
-    platform : PlatformCalibration
-        With a ``line_3d`` solution.
-
-    Returns
-    -------
-    DataFrame
-        parameter, unit, sigma_data, sigma_rough, better.
+    Columns parameter, unit, sigma_data, sigma_rough, better.
     """
-    found = np.sqrt(np.diag(platform.parameters()["line_3d"][1]))
-    rows = []
-    for name, data, rough in zip(AXIS, found, np.repeat(platform.stated_sigma, 2), strict=True):
-        unit, factor = ("deg", np.rad2deg(1.0)) if name.startswith("axis") else ("mm", 1000.0)
-        rows.append((name, unit, factor * data, factor * rough, "data" if data < rough else "rough measurement"))
-    return pd.DataFrame(rows, columns=["parameter", "unit", "sigma_data", "sigma_rough", "better"])
-
-
-def unit_of(parameter):
-    """Unit and factor in which a parameter is shown."""
-    if parameter[0] == "r":
-        return "deg", np.rad2deg(1.0)
-    if parameter[0] == "t":
-        return "mm", 1000.0
-    return ("px", 1.0) if parameter in ("fx", "fy", "cx", "cy") else ("1", 1.0)
+    data, rough = np.sqrt(np.diag(platform.parameters()["line_3d"][1])), np.repeat(platform.stated_sigma, 2)
+    units, factors = zip(*map(unit_of, AXIS_NAMES), strict=True)
+    return pd.DataFrame({
+        "parameter": AXIS_NAMES, "unit": units, "sigma_data": factors * data, "sigma_rough": factors * rough,
+        "better": np.where(data < rough, "data", "rough measurement"),
+    })  # fmt: skip
 
 
 def stereo_check(solutions, cameras, T_second_first):
-    """What the cameras, each calibrated on its own, say about each other, against the chessboard.
+    """What two cameras, each calibrated on its own, say about each other, against the chessboard in both images.
 
-    Parameters
-    ----------
-    solutions : dict of (str, str) to Solution
-    cameras : (str, str)
-        First and second camera.
-    T_second_first : RigidTransform
-        From the chessboard in both images.
-
-    Returns
-    -------
-    DataFrame
-        method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both calibrations use the same
-        LRF points, so the check cannot see an error of the cloud.
+    Columns method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both calibrations use the
+    same LRF points, so the check cannot see an error of the cloud.
     """
-    first, second = cameras
+    (first, second), rows = cameras, []
     baseline = np.linalg.norm(T_second_first.translation)
-    rows = []
     for method in (*METHODS, "joint"):
-        if (first, method) not in solutions or (second, method) not in solutions:
-            continue
-        found = solutions[second, method].transform * solutions[first, method].transform.inv()
-        angle, distance = transform_difference(found, T_second_first)
-        length = np.linalg.norm(found.translation)
-        row = {"method": method, "baseline_mm": 1000 * length, "baseline_error_mm": 1000 * (length - baseline)}
-        rows.append(row | {"translation_error_mm": 1000 * distance, "rotation_error_deg": np.rad2deg(angle)})
-    return pd.DataFrame(rows)
+        if (first, method) in solutions and (second, method) in solutions:
+            found = solutions[second, method].transform * solutions[first, method].transform.inv()
+            angle, distance = geometry.transform_difference(found, T_second_first)
+            length = np.linalg.norm(found.translation)
+            rows.append((method, 1000 * length, 1000 * (length - baseline), 1000 * distance, np.rad2deg(angle)))
+    columns = ["method", "baseline_mm", "baseline_error_mm", "translation_error_mm", "rotation_error_deg"]
+    return pd.DataFrame(rows, columns=columns)
 
 
-def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
+def edge_lengths(prepared, T_head_lrf=None, joint=None):
     """Edges of the board measured in the cloud of every placement, beside the paper's own row.
 
     Parameters
@@ -622,9 +413,6 @@ def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
     prepared : Prepared
     T_head_lrf : RigidTransform, optional
         For the least-squares variants; the session's own platform when left out.
-    edge_model_of : callable, optional
-        ``edge_model_of(placement) -> EdgeModel``, from a calibration that has not seen the placement. Adds the variant
-        'likelihood', which does not know the board's size.
     joint : JointCalibration, optional
         With its estimates without each placement. Adds 'likelihood' from its edge model, and 'fused': image edges on
         the plane of the cloud. Neither knows the board's size, and neither calibration has seen the placement.
@@ -637,69 +425,46 @@ def edge_lengths(prepared, T_head_lrf=None, edge_model_of=None, joint=None):
         ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines), 'image'
         where images show them ('fused').
     """
-    ways = {v: lambda placement, v=v: outline_of(prepared, placement, v, T_head_lrf) for v in VARIANTS}
-    if joint is not None:
-        edge_model_of = joint.edge_model
-        ways["fused"] = lambda placement: fused_outline_of(joint, placement)
-    if edge_model_of is not None:
-        ways["likelihood"] = lambda placement: likely_outline_of(prepared, placement, edge_model_of(placement))
-    rows = []
-    for variant, measure in ways.items():
+
+    def measure(placement, variant):
+        if variant == "fused":
+            return fused_outline_of(joint, placement)
+        if variant == "likelihood":
+            return likely_outline_of(prepared, placement, joint.edge_model(placement))
+        return outline_of(prepared, placement, variant, T_head_lrf)
+
+    known, edges, rows = {} if prepared.board.corners is None else prepared.board.lengths(), prepared.board.edges, []
+    for variant in (*VARIANTS, *(() if joint is None else ("fused", "likelihood"))):
         for placement in prepared.session.board_placements:
-            rows += _placement_lengths(prepared, placement, variant, measure)
-    rows += [("paper", np.nan, name, "scan", "last_beam", *PAPER_EDGES_MM[name]) for name in PAPER_EDGES_MM]
+            lengths, across = {}, frozenset()
+            if placement in prepared.names:
+                with suppress(geometry.DegenerateGeometry):
+                    measured, across = measure(placement, variant)
+                    lengths = measured.lengths
+            views = [views[placement] for views in prepared.views.values() if placement in views]
+            for name in (name for name in known if any(view.edge(name) is not None for view in views)):
+                length = lengths.get(name, np.nan)
+                ends = ends_of(edges, name, across) if np.isfinite(length) else "not measured"
+                row = prepared.session.name, placement, name, ends, variant
+                rows.append((*row, 1000 * known[name], 1000 * length))
+    rows += [("paper", np.nan, name, "scan", "last_beam", *lengths) for name, lengths in PAPER_EDGES_MM.items()]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
-
-
-def _placement_lengths(prepared, placement, variant, measure):
-    """Rows of one placement: every edge that a camera sees, NaN where the cloud does not show both its ends."""
-    try:
-        measured, across = measure(placement) if placement in prepared.names else (None, frozenset())
-    except DegenerateGeometry:
-        measured, across = None, frozenset()
-    rows = []
-    known = {} if prepared.board.corners is None else prepared.board.lengths()
-    for name, true in known.items():
-        length = np.nan if measured is None else measured.lengths.get(name, np.nan)
-        ends = "not measured"
-        if np.isfinite(length):
-            ends = ends_of(prepared.board.edges, name, across)
-        if _seen_in_image(prepared, placement, name):
-            rows.append((prepared.session.name, placement, name, ends, variant, 1000 * true, 1000 * length))
-    return rows
 
 
 def ends_of(edges, name, across):
     """What decides the ends of an edge: its neighbours in the image, beams, or the recorded pitch."""
     if across is None:
         return "image"
-    return "pitch" if _neighbours(edges, name) & across else "scan"
-
-
-def _neighbours(edges, name):
     i = edges.index(name)
-    return {edges[i - 1], edges[(i + 1) % len(edges)]}
-
-
-def _seen_in_image(prepared, placement, name):
-    views = [views.get(placement) for views in prepared.views.values()]
-    return any(view is not None and view.edge(name) is not None for view in views)
+    return "pitch" if {edges[i - 1], edges[(i + 1) % len(edges)]} & across else "scan"
 
 
 def edge_summary(table):
-    """Mean absolute, median and signed mean error of an edge-length table.
+    """Errors of an :func:`edge_lengths` table, of measured edges only.
 
-    Parameters
-    ----------
-    table : DataFrame
-        Of :func:`edge_lengths`.
-
-    Returns
-    -------
-    DataFrame
-        source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm. Measured edges only.
+    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm.
     """
     table = table[table.measured_mm.notna()]
     groups = table.assign(size=table.error_mm.abs()).groupby(["source", "ends", "variant"], sort=False)

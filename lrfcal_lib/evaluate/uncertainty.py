@@ -7,7 +7,7 @@ harms nobody, so a point measured at that very pitch does not depend on the tilt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,8 +32,8 @@ class Chain:
     head : ndarray, shape (3, 4)
         ``T_head_lrf``.
     camera : ndarray, shape (3, 4), or None
-        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform``; None for points of the cloud.
-    mount : {'head', 'platform'}
+        ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the cloud.
+    on_head : bool
     covariances : tuple of ndarray, shape (13, 13)
         Of `COLUMNS` (increments ``[w, v]`` of the transforms; metres; fraction; radians). Where there are several, the
         one that gives more counts, quantity by quantity.
@@ -45,14 +45,10 @@ class Chain:
 
     head: np.ndarray
     camera: np.ndarray | None
-    mount: str
+    on_head: bool
     covariances: tuple
     unseen: np.ndarray
     sweep_sigma: tuple = (0.0, 0.0)
-
-    @property
-    def on_head(self):
-        return self.mount == "head"
 
 
 @dataclass(frozen=True)
@@ -84,10 +80,9 @@ class SigmaMap:
 
     def rms(self):
         """Root mean square over what scans reach, shape (d,); inf where they reach nothing."""
-        seen = np.isfinite(self.sigma) | np.isinf(self.sigma)
-        total = np.sum(np.where(seen, self.sigma, 0.0) ** 2, axis=(1, 2))
-        number = seen.sum(axis=(1, 2))
-        return np.where(number > 0, np.sqrt(total / np.maximum(number, 1)), np.inf)
+        number = np.sum(~np.isnan(self.sigma), axis=(1, 2))
+        mean = np.nansum(self.sigma**2, axis=(1, 2)) / np.maximum(number, 1)
+        return np.where(number > 0, np.sqrt(mean), np.inf)
 
 
 def information(solution):
@@ -112,52 +107,30 @@ def unseen_motions(solution, index):
     return null_space(own, np.ones(len(index)), UNSEEN)[0] * scales[index]
 
 
-def chain_of(solution, camera=None, clustered=True):
-    """The chain of a joint solution.
-
-    Parameters
-    ----------
-    solution : JointSolution
-    camera : str, optional
-        None for points of the cloud.
-    clustered : bool
-        Also consider the scatter over placements, which contains errors of the model, where it is known.
-
-    Returns
-    -------
-    Chain
-
-    Raises
-    ------
-    ValueError
-        If there is no such camera.
-    """
+def chain_of(solution, camera=None):
+    """The chain of a joint solution to a camera, or to points of the cloud; a ValueError if there is no such camera."""
     if camera is not None and camera not in solution.transforms:
         raise ValueError(f"cameras are {', '.join(solution.transforms) or 'none'}; got '{camera}'")
-    found = solution.solution
-    prefix = "" if camera is None else f"{camera}_"
+    found, unknowns, sweep = solution.solution, solution.unknowns, solution.data.sweep_sigma
+    prefix, number = ("", 0) if camera is None else (f"{camera}_", list(solution.transforms).index(camera))
     wanted = [*AXIS_NAMES, *(prefix + name for name in POSE_NAMES), *COLUMNS[10:]]
-    index = [found.names.index(name) if name in found.names else -1 for name in wanted]
-    both = [found.covariance, found.trusted if clustered else None]
-    covariances = tuple(_spread_out(C, index) for C in both if C is not None)
-    number = list(solution.transforms).index(camera) if camera else 0
-    on_head = camera is None or solution.data.on_head[number]
-    pose = pose_array(solution.transforms[camera]) if camera else None
-    sweep = solution.data.sweep_sigma if solution.unknowns.sweep != "none" else (0.0, 0.0)
-    sweep = (sweep[0], sweep[1] * (solution.unknowns.sweep == "offset_stretch"))
-    known = np.array(index) >= 0
-    motions = unseen_motions(solution, np.array(index)[known])
+    index = np.array([found.names.index(name) if name in found.names else -1 for name in wanted])
+    covariances = []
+    for covariance in (found.covariance, found.trusted):
+        wide = np.zeros((len(found.names) + 1,) * 2)  # zero for what is known; what has no bound is among `unseen`
+        wide[:-1, :-1] = np.where(np.isfinite(covariance), covariance, 0.0)
+        covariances.append(wide[np.ix_(index, index)])
+    motions = unseen_motions(solution, index[index >= 0])
     unseen = np.zeros((len(motions), len(wanted)))
-    unseen[:, known] = motions
-    head = pose_array(solution.T_head_lrf)
-    return Chain(head, pose, "head" if on_head else "platform", covariances, unseen, sweep)
-
-
-def _spread_out(covariance, index):
-    """Covariance of `COLUMNS` from one of other unknowns; zero for what is known (index -1)."""
-    wide = np.zeros((len(covariance) + 1,) * 2)
-    wide[:-1, :-1] = np.where(np.isfinite(covariance), covariance, 0.0)  # what has no bound is among the unseen motions
-    return wide[np.ix_(index, index)]
+    unseen[:, index >= 0] = motions
+    return Chain(
+        head=pose_array(solution.T_head_lrf),
+        camera=None if camera is None else pose_array(solution.transforms[camera]),
+        on_head=camera is None or bool(solution.data.on_head[number]),
+        covariances=tuple(covariances),
+        unseen=unseen,
+        sweep_sigma=(sweep[0] * (unknowns.sweep != "none"), sweep[1] * (unknowns.sweep == "offset_stretch")),
+    )
 
 
 def carried(chain, bearing, pitch, distance, image_pitch=0.0):
@@ -169,16 +142,14 @@ def carried(chain, bearing, pitch, distance, image_pitch=0.0):
     bearing, pitch, distance : array_like, shape (...)
         Radians, radians, and metres from the mirror.
     image_pitch : float
-        Radians; only for mount 'head'.
+        Radians; only for a camera on the head.
 
     Returns
     -------
     points : ndarray, shape (..., 3)
         Camera frame; without a camera the LRF frame of a scan at `image_pitch`. Metres.
-    jacobian : ndarray, shape (..., 3, 13)
-        By `COLUMNS`.
-    by_pitch : ndarray, shape (..., 3)
-        By the pitch of the beam.
+    jacobian, by_pitch : ndarray, shapes (..., 3, 13) and (..., 3)
+        By `COLUMNS`, and by the pitch of the beam.
     """
     bearing, pitch, distance = np.broadcast_arrays(*(np.asarray(a, float) for a in (bearing, pitch, distance)))
     R, t = chain.head[:, :3], chain.head[:, 3]
@@ -203,18 +174,7 @@ def carried(chain, bearing, pitch, distance, image_pitch=0.0):
 
 
 def spread(chain, jacobian):
-    """Root mean square error of quantities with the given Jacobian.
-
-    Parameters
-    ----------
-    chain : Chain
-    jacobian : ndarray, shape (..., m, 13)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Root of the trace of the covariance; inf where an undetermined motion matters.
-    """
+    """Root mean square error of quantities with a Jacobian (..., m, 13); inf where an undetermined motion matters."""
     variances = [np.einsum("...ik,kl,...il->...", jacobian, C, jacobian) for C in chain.covariances]
     out = np.sqrt(np.maximum(np.max(variances, axis=0), 0.0))
     pull = np.linalg.norm(np.einsum("...ik,mk->...mi", jacobian, chain.unseen), axis=-1)
@@ -222,34 +182,10 @@ def spread(chain, jacobian):
     return np.where(np.any(pull > SEEN * size, axis=-1), np.inf, out)
 
 
-def _parts(chain, jacobian):
-    parts = {}
-    for name, columns in PARTS.items():
-        only = np.zeros_like(jacobian)
-        only[..., columns] = jacobian[..., columns]
-        parts[name] = spread(chain, only)
-    return parts
-
-
-def _sweep(chain, by_pitch, turn, cancels):
-    """What the pitch error that every sweep has of its own does."""
-    offset = 0.0 if cancels else chain.sweep_sigma[0]
-    return np.hypot(offset, chain.sweep_sigma[1] * turn) * np.linalg.norm(by_pitch, axis=-1)
-
-
 def beams_to(points, T_head_lrf):
-    """Bearing, pitch and range at which scans of a pitching LRF reach points.
+    """Bearing, pitch (radians) and range (metres) at which scans of a pitching LRF reach points of the platform frame.
 
-    Parameters
-    ----------
-    points : ndarray, shape (..., 3)
-        Platform frame, metres.
-    T_head_lrf : RigidTransform
-
-    Returns
-    -------
-    bearing, pitch, distance : ndarray, shape (...)
-        Radians, radians, metres; NaN where the scan plane never gets there.
+    Shapes (...) for points (..., 3); NaN where the scan plane never gets there.
     """
     points = np.asarray(points, float)
     R, t = T_head_lrf.rotation.as_matrix(), T_head_lrf.translation
@@ -263,25 +199,36 @@ def beams_to(points, T_head_lrf):
     return np.arctan2(p[..., 1], p[..., 0]), pitch, np.linalg.norm(p, axis=-1)
 
 
-def _beams_of_pixels(chain, model, uv, distance, image_pitch):
-    """Beams of a given length that end on the rays of pixels."""
+def beams_of_pixels(chain, model, uv, distance, image_pitch):
+    """Bearing and pitch of beams of a given length that end on the rays of pixels, shape (..., 2)."""
     normal = (undistort(uv, model) - [model.cx, model.cy]) / [model.fx, model.fy]
     ray = np.concatenate([normal, np.ones_like(normal[..., :1])], axis=-1)
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    R, t = chain.camera[:, :3], chain.camera[:, 3]
-    head, depth = pose_transform(chain.head), np.full(ray.shape[:-1], float(distance))
+    depth = distance * np.ones(ray.shape[:-1])
     for _ in range(ROUNDS):
-        x = (depth[..., None] * ray - t) @ R
+        x = (depth[..., None] * ray - chain.camera[:, 3]) @ chain.camera[:, :3]
         if chain.on_head:
             x = x @ chain.head[:, :3].T + chain.head[:, 3]
-        bearing, pitch, reached = beams_to(x, head)
+        bearing, pitch, reached = beams_to(x, pose_transform(chain.head))
         depth = depth + distance - reached
     return bearing, pitch + (image_pitch if chain.on_head else 0.0)
 
 
-def projection_sigma(
-    solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, pitches=None, clustered=True
-):
+def _sigma_map(chain, axes, jacobian, by_pitch, turn, offset):
+    """Standard deviations from Jacobians (d, r, c, m, 13) and by the pitch (d, r, c, m) of beams `turn` off the middle.
+
+    `offset` says whether the offset that the pitch of every sweep has of its own matters.
+    """
+    parts = {}
+    for name, columns in PARTS.items():
+        only = np.zeros_like(jacobian)
+        only[..., columns] = jacobian[..., columns]
+        parts[name] = spread(chain, only)
+    sweep = np.hypot(offset * chain.sweep_sigma[0], chain.sweep_sigma[1] * turn) * np.linalg.norm(by_pitch, axis=-1)
+    return SigmaMap(*axes, np.hypot(spread(chain, jacobian), sweep), parts | {"sweep": sweep})
+
+
+def projection_sigma(solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, pitches=None):
     """How far off the pixel of an LRF point may be, over the image.
 
     Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head the tilt axis matters
@@ -302,34 +249,26 @@ def projection_sigma(
     pitches : tuple of float, optional
         First and last pitch of the sweeps, radians: pixels that they do not reach stay NaN. A sweep's own stretch acts
         about their middle (cameras on the base).
-    clustered : bool
-        See :func:`chain_of`.
 
     Returns
     -------
     SigmaMap
         Pixels.
     """
-    chain = solution if isinstance(solution, Chain) else chain_of(solution, camera, clustered)
-    distances = _positive(distances)
-    u = (np.arange(grid[0]) + 0.5) * model.width / grid[0] - 0.5
-    v = (np.arange(grid[1]) + 0.5) * model.height / grid[1] - 0.5
-    uv = np.stack(np.meshgrid(u, v), axis=-1)
-    sigma, parts = [], []
+    chain, distances = _asked(solution, camera, distances)
+    u, v = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(grid, (model.width, model.height), strict=True))
+    away = distances[:, None, None]
+    bearing, pitch = beams_of_pixels(chain, model, np.stack(np.meshgrid(u, v), axis=-1), away, image_pitch)
+    points, J, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
+    P = project_jacobians(points, model)[0]
     low, high = (-np.inf, np.inf) if pitches is None else pitches
-    middle = image_pitch if chain.on_head or pitches is None else np.mean(pitches)
-    for distance in distances:
-        bearing, pitch = _beams_of_pixels(chain, model, uv, distance, image_pitch)
-        points, J, by_pitch = carried(chain, bearing, pitch, distance, image_pitch)
-        P = project_jacobians(points, model)[0]
-        by_pitch = (P @ by_pitch[..., None])[..., 0]
-        parts.append(_parts(chain, P @ J) | {"sweep": _sweep(chain, by_pitch, pitch - middle, chain.on_head)})
-        lost = ~((pitch >= low) & (pitch <= high))
-        sigma.append(np.where(lost, np.nan, np.hypot(spread(chain, P @ np.nan_to_num(J)), parts[-1]["sweep"])))
-    return SigmaMap(u, v, distances, np.array(sigma), {k: np.array([p[k] for p in parts]) for k in parts[0]})
+    turn = pitch - (image_pitch if chain.on_head or pitches is None else np.mean(pitches))
+    by_pitch = (P @ by_pitch[..., None])[..., 0]
+    found = _sigma_map(chain, (u, v, distances), P @ J, by_pitch, turn, not chain.on_head)
+    return replace(found, sigma=np.where((pitch >= low) & (pitch <= high), found.sigma, np.nan))
 
 
-def point_sigma(solution, bearings, pitches, distances, *, sigma_range=None, reference=0.0, clustered=True):
+def point_sigma(solution, bearings, pitches, distances, *, reference=0.0):
     """How far off a reconstructed point may be, over the field of view.
 
     Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors of single sweeps do:
@@ -340,12 +279,8 @@ def point_sigma(solution, bearings, pitches, distances, *, sigma_range=None, ref
     solution : JointSolution or Chain
     bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
         Radians, radians, metres.
-    sigma_range : float, optional
-        Noise of one range, metres; as the solution has it when left out.
     reference : float
         Radians.
-    clustered : bool
-        See :func:`chain_of`.
 
     Returns
     -------
@@ -353,17 +288,12 @@ def point_sigma(solution, bearings, pitches, distances, *, sigma_range=None, ref
         Metres. `sigma` is the calibration's part, common to all points near each other; ``parts['range noise']`` is
         that of every single point.
     """
-    chain = solution if isinstance(solution, Chain) else chain_of(solution, None, clustered)
+    chain, distances = _asked(solution, None, distances)
     bearings, pitches = np.atleast_1d(bearings).astype(float), np.atleast_1d(pitches).astype(float)
-    distances = _positive(distances)
-    noise = range_noise(solution) if sigma_range is None else sigma_range
-    _, J, by_pitch = carried(
-        chain, bearings, pitches[:, None], np.broadcast_to(distances[:, None, None], (len(distances), 1, 1)), reference
-    )
-    turn = np.broadcast_to((pitches - reference)[:, None], J.shape[:-2])
-    parts = _parts(chain, J) | {"sweep": _sweep(chain, by_pitch, turn, False)}
-    sigma = np.hypot(spread(chain, J), parts["sweep"])
-    return SigmaMap(bearings, pitches, distances, sigma, parts | {"range noise": np.full(sigma.shape, noise)})
+    _, J, by_pitch = carried(chain, bearings, pitches[:, None], distances[:, None, None], reference)
+    found = _sigma_map(chain, (bearings, pitches, distances), J, by_pitch, (pitches - reference)[:, None], True)
+    noise = np.full(found.sigma.shape, range_noise(solution))
+    return replace(found, parts=found.parts | {"range noise": noise})
 
 
 def range_noise(solution):
@@ -373,8 +303,9 @@ def range_noise(solution):
     return float(np.median(solution.data.face["sigma"][solution.data.face["used"]]) * solution.data.face_scale)
 
 
-def _positive(distances):
+def _asked(solution, camera, distances):
+    """The chain of a solution (or the Chain given) and distances as an array."""
     distances = np.atleast_1d(np.asarray(distances, float))
     if not (np.isfinite(distances).all() and distances.min() > 0):
         raise ValueError(f"distances must be positive, metres; got {distances.tolist()}")
-    return distances
+    return solution if isinstance(solution, Chain) else chain_of(solution, camera), distances

@@ -15,6 +15,8 @@ from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 
 YES, CARE, NO = "yes", "with care", "no"
+FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
+         NO: "This calibration cannot be trusted"}  # fmt: skip
 DISTANCES = (1.0, 2.0, 5.0)  # metres
 FEWEST, FEW = 3, 6  # placements
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
@@ -88,24 +90,13 @@ class Verdict:
 
     def record(self):
         """Answer, reasons and expected errors, ready for JSON."""
-        errors = {f"{distance:g}": values for distance, values in self.errors.items()}
-        reasons = [vars(reason) for reason in self.reasons]
+        reasons, errors = [vars(reason) for reason in self.reasons], {f"{d:g}": e for d, e in self.errors.items()}
         return {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
 
     def sentences(self):
-        """For the first page: the warning before anything else, the errors, what to record next.
-
-        Returns
-        -------
-        list of str
-        """
-        first = {
-            YES: "This calibration can be trusted.",
-            CARE: "Use this calibration with care: ",
-            NO: "This calibration cannot be trusted: ",
-        }[self.answer]
-        words = [r.words for r in self.reasons]
-        out = [first + ("; ".join(words) + "." if words else "")]
+        """For the first page: the warning before anything else, the errors, what to record next."""
+        why = "; ".join(reason.words for reason in self.reasons)
+        out = [f"{FIRST[self.answer]}: {why}." if why else f"{FIRST[self.answer]}."]
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
         out += self.notes
         if self.errors:
@@ -129,7 +120,7 @@ def _error_words(errors):
 
 
 def verdict(solution, models, *, suggest=True, **options):
-    """Judge a joint estimate.
+    """Judge a joint estimate: a :class:`Verdict`.
 
     Parameters
     ----------
@@ -140,10 +131,6 @@ def verdict(solution, models, *, suggest=True, **options):
         Also look for the next placement.
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
-
-    Returns
-    -------
-    Verdict
     """
     groups, suggestion, problem = (solution.data.face, solution.data.beam), None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
@@ -186,20 +173,11 @@ def _answered(found, reasons):
 
 
 def judge(calibration, method=None, **options):
-    """Judge what a calibration hands over, by itself and by what became of the recording.
+    """Judge what a calibration hands over, by itself and by what became of the recording: a :class:`Verdict`.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    method : str, optional
-        Whose camera poses are handed over; as :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out.
-    **options
-        Of :func:`verdict`; what the LRF sees and the board's features are known.
-
-    Returns
-    -------
-    Verdict
-        'no' without errors where nothing is handed over.
+    'no' without errors where nothing is handed over. `method` is that whose camera poses are handed over, as
+    :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out; options of :func:`verdict` (what the LRF sees and
+    the board's features are known).
     """
     prepared, joint = calibration.prepared, calibration.joint
     # also where the joint estimate is not handed over: a wrong size may be why
@@ -240,18 +218,18 @@ def _without_joint(calibration, method):
     fewest = min(len(calibration.observations[camera, "half_step"].all_placements) for camera in solved)
     if fewest < FEW:
         reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
-    for camera in (c for c in prepared.views if c not in solved):
-        words = f"camera '{camera}' is not handed over ({problems.get((camera, method), 'no result')})"
-        reasons.append(Reason(CARE, "cameras", words))
+    lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
+    reasons += [Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})") for c, why in lost.items()]
     # the range offset of the cloud may be what the maker admits
     platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
     head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
-    chains = {None: Chain(head, None, "head", (sigma,), *rest)}
+    chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
         sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
-        chains[camera] = Chain(head, pose_array(found.transform), session.cameras[camera].mount, (sigma,), *rest)
+        on_head = session.cameras[camera].mount == "head"
+        chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
     noise = np.median([board.sigma_range for board in prepared.scans.values()])
     return replace(_expected(chains, prepared.models, pitch, noise, reasons), sweep_mm=0.0)
@@ -297,28 +275,14 @@ def _left_out(calibration, method):
 
 
 def diagnose(solution):
-    """Weaknesses of a joint estimate and of the recording behind it.
-
-    Parameters
-    ----------
-    solution : JointSolution
-
-    Returns
-    -------
-    list of Reason
-    """
+    """Weaknesses of a JointSolution and of the recording behind it: list of Reason."""
     iterations, view = solution.solution.iterations, solution.data.view
-    seen = {
-        name: int(np.any(view["used"] & (view["camera"] == number), axis=1).sum())
-        for number, name in enumerate(solution.transforms)
-    }
+    seen = [np.any(view["used"] & (view["camera"] == i), axis=1).sum() for i in range(len(solution.transforms))]
+    seen = list(zip(seen, solution.transforms, strict=True))
     own = [words for words in solution.warnings if not words.startswith(SAID)]
     findings = [
         (not solution.converged, NO, "convergence", f"the estimate has not converged after {iterations} iterations"),
-        *(
-            (count < FEWEST, CARE, "cameras", f"camera '{name}' sees the board in {count} placements only")
-            for name, count in seen.items()
-        ),
+        *((n < FEWEST, CARE, "cameras", f"camera '{c}' sees the board in {n} placements only") for n, c in seen),
         (solution.unobservable, NO, "unobservable", f"the data do not determine {'; '.join(solution.unobservable)}"),
         *_of_placements(solution),
         *_of_residuals(solution),

@@ -139,18 +139,10 @@ def _frozen_cost(blocks, roots, axes):
 def eliminate(hessian, gradient, shared, rcond=1e-13):
     """Schur complement: what each placement says about the shared unknowns once its own are eliminated.
 
-    Parameters
-    ----------
-    hessian, gradient : ndarray, shapes (p, k, k) and (p, k)
-        The first `shared` = c unknowns are common to all placements.
-    rcond : float or None
-        Smaller eigenvalues of the placements' own blocks are no information; None where the blocks are regular.
-
-    Returns
-    -------
-    reduced, right : ndarray, shapes (p, c, c) and (p, c)
-    back : ndarray, shape (p, k - c, c + 1)
-        A step x of the shared unknowns goes with ``-(back[..., c] + back[..., :c] x)`` of a placement's own.
+    The first `shared` = c unknowns of the normal equations (p, k, k), (p, k) are common to all placements; eigenvalues
+    of the placements' own blocks below `rcond` are no information (None: the blocks are regular). Returned are the
+    reduced equations (p, c, c), (p, c) and ``back`` (p, k - c, c + 1): a step x of the shared unknowns goes with
+    ``-(back[..., c] + back[..., :c] x)`` of a placement's own.
     """
     c = shared
     known = np.concatenate([hessian[:, c:, :c], gradient[:, c:, None]], axis=-1)
@@ -270,15 +262,12 @@ def solve(
         ``direction (k,) -> str``; the names with the largest components by default.
     groups : array_like, shape (n,), optional
         Placement of every residual, for `covariance_placements` (with `shared` the leading axis is the placement).
-    freedom : float, optional
-        Degrees of freedom of chi-square; number of residuals minus unknowns by default.
+    freedom, n_observations : optional
+        Degrees of freedom of chi-square, and number of observations; by default those of the residuals.
     required : bool
         Raise when something stays unobservable (single problems only).
-    n_observations : int, optional
-    chi2_rest : float or ndarray
-        Chi-square that no unknown can change (compressed away), added for the inflation.
-    earlier : sequence of ndarray
-        Cost histories of earlier rounds, put before this one's.
+    chi2_rest, earlier
+        Chi-square that no unknown can change (compressed away), and cost histories of earlier rounds.
 
     Returns
     -------
@@ -309,7 +298,8 @@ def solve(
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
         freedom = r.size // chi2.size - own
-    inflation = _inflation(chi2, freedom)
+    too_large = (freedom > 0) & (chi2 > chi2_distribution.ppf(0.999, max(freedom, 1)))
+    inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = read(state)
     return Solution(
         transform, parameters, tuple(names), converged,
@@ -321,13 +311,6 @@ def solve(
         unobservable=lost, method=method, n_observations=n_observations or r.shape[-1], chi2=chi2, inflation=inflation,
         state=state,
     )  # fmt: skip
-
-
-def _inflation(chi2, freedom):
-    """Chi-square per degree of freedom where it is above the 99.9 % limit of the stated noise, otherwise 1."""
-    if freedom <= 0:
-        return np.ones_like(chi2)
-    return np.where(chi2 > chi2_distribution.ppf(0.999, freedom), chi2 / freedom, 1.0)
 
 
 def _by_placement(r, J, weights, groups, shared):
@@ -343,12 +326,10 @@ def _by_placement(r, J, weights, groups, shared):
 
 
 def null_space(hessian, scales, limit=1.0):
-    """Directions that normal equations do not determine.
+    """Directions that normal equations (k, k) of whitened residuals do not determine.
 
     Parameters
     ----------
-    hessian : ndarray, shape (k, k)
-        Of whitened residuals.
     scales : array_like, shape (k,)
         What counts as a change by one: 1 rad, 1 m, 1000 px, ...
     limit : float
@@ -403,20 +384,11 @@ def name_words(direction, names, share=0.05):
 
 
 def placement_covariance(hessians, scores):
-    """First-order jackknife over placements (CR3), from what each placement adds to the normal equations.
+    """First-order jackknife over g placements (CR3), from what each adds to the normal equations.
 
-    Parameters
-    ----------
-    hessians : ndarray, shape (..., g, k, k)
-    scores : ndarray, shape (..., g, k)
-        ``J^T r`` of each placement at the solution.
-
-    Returns
-    -------
-    covariance : ndarray, shape (..., k, k), or None
-        None with fewer than three placements, or where the others do not determine the estimate.
-    shifts : ndarray, shape (..., g, k), or None
-        Change of the estimate when that placement is left out.
+    `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the changes (..., g, k) of
+    the estimate when that placement is left out; None with fewer than three placements, or where the others do not
+    determine the estimate.
     """
     groups = hessians.shape[-3]
     total = np.sum(hessians, axis=-3, keepdims=True)

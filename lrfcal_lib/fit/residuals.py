@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
@@ -18,6 +18,7 @@ from lrfcal_lib.model.geometry import (
     gradient_by_pose,
     hat,
     head_from_axis,
+    log_rotation,
     move_pose,
     moved_noise,
     noise_correction,
@@ -25,6 +26,7 @@ from lrfcal_lib.model.geometry import (
     pose_parameters,
     pose_transform,
     rotate_points,
+    tilt,
 )
 
 
@@ -123,18 +125,7 @@ _X = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]  # dense where the share
 
 
 def disc_share(x):
-    """Share of a unit disc that lies inside a straight edge.
-
-    Parameters
-    ----------
-    x : array_like
-        Signed distance of the disc's centre from the edge in radii, positive outside.
-
-    Returns
-    -------
-    ndarray
-        1 for x <= -1, 0 for x >= 1.
-    """
+    """Share of a unit disc inside a straight edge `x` radii inside of its centre: 1 for x <= -1, 0 for x >= 1."""
     x = np.clip(np.asarray(x, float), -1.0, 1.0)
     return (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
 
@@ -143,19 +134,10 @@ _LOG_ODDS = np.log(disc_share(_X)) - np.log(disc_share(-_X))
 
 
 def disc_edge(log_odds):
-    """Where an edge cuts a unit disc so that its inner share has given log odds; inverts :func:`disc_share`.
+    """Where an edge cuts a unit disc so that its inner share has log odds ``ln(share / (1 - share))``.
 
-    Parameters
-    ----------
-    log_odds : array_like
-        ``ln(share / (1 - share))``.
-
-    Returns
-    -------
-    x : ndarray
-        Distance of the disc's centre from the edge in radii, positive outside; between -1 and 1.
-    slope : ndarray
-        ``dx / dlog_odds`` (negative).
+    Inverts :func:`disc_share`; returns the distance x of the disc's centre from the edge in radii, positive outside,
+    between -1 and 1, and ``dx / dlog_odds`` (negative).
     """
     log_odds = np.asarray(log_odds, float)
     x = np.interp(-log_odds, -_LOG_ODDS, _X)
@@ -172,7 +154,7 @@ def _slope(x):
 
 
 def edge_shift(log_odds, radius, background=0.0):
-    """By how much a spot's centre may lie outside an edge and still read the board.
+    """By how far a spot's centre may lie outside an edge and still read the board, and its derivative by `log_odds`.
 
     Parameters
     ----------
@@ -185,31 +167,17 @@ def edge_shift(log_odds, radius, background=0.0):
 
     Returns
     -------
-    shift : ndarray
+    shift, slope : ndarray
         Metres; positive where boards look larger.
-    slope : ndarray
-        Its derivative by `log_odds`.
     """
     x, slope = disc_edge(log_odds + np.asarray(background, float))
     return radius * x, radius * slope
 
 
 def flip_sigma(softness, radius, step):
-    """Standard deviation of where readings flip, with a floor: beams a step apart cannot show a sharper edge.
+    """Standard deviation of where readings flip (metres), and ``d ln sigma / d ln softness``, 0 (all floor) to 1.
 
-    Parameters
-    ----------
-    softness : array_like
-        Standard deviation in spot radii.
-    radius, step : array_like
-        Of the spot, and between neighbouring beams at the board, metres.
-
-    Returns
-    -------
-    sigma : ndarray
-        Metres.
-    share : ndarray
-        ``d ln sigma / d ln softness``, between 0 (all floor) and 1.
+    `softness` is in spot radii. Beams a step apart (metres, at the board) cannot show a sharper edge than a floor.
     """
     soft = softness * np.asarray(radius, float)
     sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
@@ -217,14 +185,13 @@ def flip_sigma(softness, radius, step):
 
 
 def beam_terms(margin, sigma, hit, lapse=0.0):
-    """Negative log likelihood of single beams near an edge.
+    """Negative log likelihood of single beams near an edge, a probit: ``P(hit) = Phi(margin / sigma)``.
 
     Parameters
     ----------
-    margin : ndarray
-        How far inside the place where readings flip the beam's centre lies, metres (shift - distance from the edge).
-    sigma : array_like
-        Standard deviation of where a reading flips, metres.
+    margin, sigma : array_like
+        How far inside the place where readings flip the beam's centre lies (shift - distance from the edge), and the
+        standard deviation of that place, metres.
     hit : ndarray of bool
         Whether the board was read.
     lapse : float
@@ -232,15 +199,9 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
 
     Returns
     -------
-    cost, score, information : ndarray
-        Negative log likelihood, its derivative by the margin, and the observed information on the margin (never
-        negative; with `lapse` that of the majorising function of an EM step).
-    by_log_sigma : ndarray
-        Derivative of the cost by ``ln sigma``.
-
-    Notes
-    -----
-    ``P(hit) = Phi(margin / sigma)``, a probit.
+    cost, score, information, by_log_sigma : ndarray
+        Negative log likelihood, its derivative by the margin, the observed information on the margin (never negative;
+        with `lapse` that of the majorising function of an EM step), and the cost's derivative by ``ln sigma``.
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
@@ -254,26 +215,11 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
 
 
 def interval_terms(inner, outer, sigma):
-    """Negative log likelihood that readings flip between two neighbouring beams.
+    """Negative log likelihood that readings flip between two beams: ``P = Phi(inner / sigma) - Phi(outer / sigma)``.
 
-    Parameters
-    ----------
-    inner, outer : ndarray
-        Margins (see :func:`beam_terms`) of the last beam on the board and the first beam off it, metres;
-        ``inner > outer``.
-    sigma : array_like
-        Standard deviation of what both have in common (where the edge is), metres.
-
-    Returns
-    -------
-    cost, score, information : ndarray
-        Negative log likelihood, and its derivatives by a shift of both margins; the information is the observed one.
-    by_log_sigma : ndarray
-        Derivative of the cost by ``ln sigma``.
-
-    Notes
-    -----
-    ``P = Phi(inner / sigma) - Phi(outer / sigma)``: a uniform distribution over the interval, blurred.
+    A uniform distribution over the interval, blurred; `inner` and `outer` are the margins (see :func:`beam_terms`) of
+    the last beam on the board and the first one off it. Returned are cost, score and observed information by a shift
+    of both margins, and the derivative of the cost by ``ln sigma``, as by :func:`beam_terms`.
     """
     a, b = np.asarray(outer, float) / sigma, np.asarray(inner, float) / sigma
     flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
@@ -302,16 +248,13 @@ class JointState:
 
     Attributes
     ----------
-    head : ndarray, shape (3, 4)
-        ``T_head_lrf``.
-    cameras : ndarray, shape (c, 3, 4)
-        ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+    head, cameras, boards : ndarray, shapes (3, 4), (c, 3, 4), (p, 3, 4)
+        ``T_head_lrf``, ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform'),
+        ``T_platform_board``.
     sensor : ndarray, shape (5,)
         In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
     size : ndarray, shape (e,)
         By how much each edge lies outside the stated one, metres.
-    boards : ndarray, shape (p, 3, 4)
-        ``T_platform_board``.
     sweeps : ndarray, shape (p, 2)
         Offset (radians) and stretch of the recorded pitch of each sweep.
     sides : ndarray, shape (p, e)
@@ -360,15 +303,24 @@ class Unknowns:
         poses, size = [self.poses] * 6 * self.cameras, [self.size] * self.edges
         return np.array([self.axis] * 4 + poses + [name in self.sensor for name in SENSOR] + size)
 
+    @cached_property
+    def columns(self):
+        """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's own."""
+        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
+        widths |= {name: int(name in self.sensor) for name in SENSOR} | {"size": self.edges * self.size, "board": 6}
+        widths |= {"sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
+        ends = np.cumsum(list(widths.values())).tolist()
+        return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
+
     @property
     def shared(self):
         """Number of unknowns common to all placements."""
-        return int(self.mask.sum())
+        return self.columns["board"].start
 
     @property
     def own(self):
         """Number of unknowns of one placement."""
-        return 6 + SWEEPS[self.sweep] + self.edges * self.sides
+        return self.columns["sides"].stop - self.shared
 
     def names(self, cameras, edges):
         """Names of the shared unknowns."""
@@ -381,29 +333,14 @@ class Unknowns:
 class JointData:
     """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
 
-    Attributes
-    ----------
-    face, beam, view : dict of str to ndarray
-        Fields of a group of :class:`lrfcal_lib.model.observations.JointObservations`, with `used` and ``ray``
-        (LRF frame) or, for views, ``whitener`` (p, v, 6, 6).
-    lines : ndarray, shape (e, 3)
-    middle, direction : ndarray, shape (p,)
-    on_head : ndarray of bool, shape (c,)
-    face_scale, view_scale : float, and ndarray, shape (c,)
-        Factors on the stated standard deviations.
-    sigma_pitch : float
-        Standard deviation of the recorded pitch of a single image, radians: what a head at rest is off by.
-    face_share, beam_share : float
-        Independent errors per observation: below one where neighbours repeat each other's errors.
-    lapse : float
-        See :func:`lrfcal_lib.fit.residuals.beam_terms`.
-    sweep_sigma : tuple of float
-        Standard deviation of the sweeps' own offset (radians) and stretch.
-    side_sigma : float
-        Scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom: most
-        backgrounds are alike, some are dark).
-    prior : PlatformPrior or None
-        The stated platform; it yields where the data contradict it.
+    `face`, `beam` and `view` hold the fields of that group of JointObservations, with ``ray`` (LRF frame) or, for
+    views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and `direction` (p,) the sweeps'. Then
+    come factors on the stated standard deviations of ranges and of each camera's views, the standard deviation of the
+    recorded pitch of a single image (what a head at rest is off by, radians), shares of independent errors per
+    observation (below one where neighbours repeat each other's errors), `lapse` (see :func:`beam_terms`), what is
+    expected of the sweeps' own offset (radians) and stretch, the scale of the sides' deviations of the log odds
+    (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are dark), and the stated
+    platform, which yields where the data contradict it.
     """
 
     face: dict
@@ -430,33 +367,18 @@ def pad(group, count, width=1):
     Rows of a placement keep their order; zeros stand behind them, and `used` marks what is no padding. n is `width` at
     least.
     """
-    place = group["placement"]
-    order = np.argsort(place, kind="stable")
-    number = np.bincount(place, minlength=count)
-    width = int(number.max(initial=width))
-    slot = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
-    out = {}
+    order, number = np.argsort(group["placement"], kind="stable"), np.bincount(group["placement"], minlength=count)
+    used = np.arange(number.max(initial=width)) < number[:, None]
+    out = {"used": used}
     for key, value in group.items():
         if key != "placement":
-            filled = np.zeros((count, width) + value.shape[1:], value.dtype)
-            filled[place[order], slot] = value[order]
-            out[key] = filled
-    used = np.zeros((count, width), bool)
-    used[place[order], slot] = True
-    return out | {"used": used}
+            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
+            out[key][used] = value[order]
+    return out
 
 
 def gather(obs):
-    """Observations as padded arrays.
-
-    Parameters
-    ----------
-    obs : JointObservations
-
-    Returns
-    -------
-    JointData
-    """
+    """JointObservations as padded arrays, a JointData."""
     count = len(obs.placements)
     face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
     for group in (face, beam):
@@ -480,47 +402,34 @@ def true_pitch(state, data, pitch):
     return corrected, np.stack([pitch, turn, np.ones_like(pitch), away], axis=-1)
 
 
-def tilted(vectors, pitch, sign=1.0):
-    """``Rx(sign pitch) v`` of vectors (p, n, 3) or (3,) at angles (p, n)."""
-    c, s = np.cos(pitch), sign * np.sin(pitch)
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    return np.stack([x + 0 * c, c * y - s * z, s * y + c * z], axis=-1)
-
-
 def rays(state, data, group):
     """Origins and directions (p, n, 3) of the beams of a group in the platform frame, pitch and its derivatives."""
     pitch, by_parts = true_pitch(state, data, group["pitch"])
     d_head = group["ray"] @ state.head[:, :3].T
-    return tilted(state.head[:, 3], pitch), tilted(d_head, pitch), d_head, pitch, by_parts
+    return tilt(state.head[:, 3], pitch), tilt(d_head, pitch), d_head, pitch, by_parts
 
 
 def ray_columns(by_o, by_d, ray):
     """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and direction."""
     o, d, d_head, pitch, by_parts = ray
-    back_o, back_d = tilted(by_o, pitch, -1.0), tilted(by_d, pitch, -1.0)
+    back_o, back_d = tilt(by_o, -pitch), tilt(by_d, -pitch)
     head = np.concatenate([cross(d_head, back_d), back_o], axis=-1)[..., AXIS_COLUMNS]
     turn = (cross(o, by_o) + cross(d, by_d))[..., :1]
     return head, turn * by_parts
 
 
-def assemble(unknowns, head, parts, board, *, cameras=None, sensor=None, size=None, sides=None):
-    """Columns side by side, only those that are unknown: shared ones first, then the placement's own.
+def assemble(unknowns, **derivatives):
+    """Jacobian from derivatives (p, n, width) by the parts of :attr:`Unknowns.columns`; zeros by those not given.
 
-    `sensor` are the columns of the first three of `SENSOR` (None for zeros), `parts` those of the pitch: scale and
-    offset by direction are shared, offset and stretch of the sweep its own.
+    `parts` are those by the pitch: scale and offset by direction are shared, offset and stretch of the sweep its own.
     """
-    sensors = [None if sensor is None else sensor[..., i] for i in range(3)] + [parts[..., 0], parts[..., 1]]
-    pieces = [(head, 4)] * unknowns.axis + [(cameras, 6 * unknowns.cameras)] * unknowns.poses
-    pieces += [(sensors[SENSOR.index(name)], 1) for name in SENSOR if name in unknowns.sensor]
-    pieces += [(size, unknowns.edges)] * unknowns.size + [(board, 6)]
-    count = SWEEPS[unknowns.sweep]
-    pieces += [(parts[..., 2 : 2 + count], count)] + [(sides, unknowns.edges)] * unknowns.sides
-    out, at = np.zeros(head.shape[:-1] + (unknowns.shared + unknowns.own,)), 0
-    for piece, width in pieces:
-        if piece is not None:
-            out[..., at : at + width] = piece if piece.ndim == out.ndim else piece[..., None]
-        at += width
-    return out
+    parts = derivatives.pop("parts")
+    derivatives |= {"pitch_scale": parts[..., :1], "pitch_by_direction": parts[..., 1:2], "sweep": parts[..., 2:]}
+    J = np.zeros(parts.shape[:-1] + (unknowns.shared + unknowns.own,))
+    for name, where in unknowns.columns.items():
+        if name in derivatives:
+            J[..., where] = derivatives[name][..., : where.stop - where.start]
+    return J
 
 
 def face_block(state, data, unknowns):
@@ -536,24 +445,18 @@ def face_block(state, data, unknowns):
     head, parts = ray_columns(-by_q, -r * by_q, ray)
     by_normal = (origin - o - r * d) / along
     board = np.concatenate([cross(np.broadcast_to(normal, by_normal.shape), by_normal), by_q], axis=-1)
-    sensor = np.zeros(r.shape[:2] + (3,))
-    sensor[..., 0] = 1.0
-    J = assemble(unknowns, head, parts, board, sensor=sensor)
+    J = assemble(unknowns, axis=head, parts=parts, board=board, range_offset=np.ones_like(r))
     residuals = r[..., 0] + state.sensor[0] - group["range"]
     sigma = np.where(group["used"], group["sigma"], 1.0) * data.face_scale
     return Block(residuals * group["used"], J, group["used"] * np.sqrt(data.face_share) / sigma)
 
 
 def edge_distance(state, data, group, ray):
-    """Signed distance (p, n) of rays from their edges, positive outside, and its gradients by o, d and edge direction.
+    """Signed distance u (p, n) of rays from their edges, positive outside, and what it hangs on, (p, n, 3).
 
-    Returns
-    -------
-    u : ndarray, shape (p, n)
-    by_o, by_d, by_t : ndarray, shape (p, n, 3)
-        The gradient by the edge's point is ``-by_o``.
-    a, t, n : ndarray, shape (p, n, 3)
-        Point (relative to the board's origin), direction and outward normal of the edge, platform frame.
+    The gradients by_o, by_d, by_t by origin, direction, and the edge's direction (that by the edge's point is
+    ``-by_o``), then a, t, n: point (relative to the board's origin), direction and outward normal of the edge, platform
+    frame.
     """
     o, d = ray[:2]
     rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
@@ -585,30 +488,16 @@ def beam_block(state, data, unknowns):
     cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
-    sensor = np.stack([0 * u, slope, -margin * share_soft], axis=-1)
     size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
     np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
     np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
-    J = assemble(unknowns, head, parts, board, sensor=sensor, size=size, sides=sides)
+    sensor = {"edge_log_odds": slope[..., None], "edge_log_softness": (-margin * share_soft)[..., None]}
+    J = assemble(unknowns, axis=head, parts=parts, board=board, size=size, sides=sides, **sensor)
     share = data.beam_share * group["used"]
     root = np.sqrt(information)
     alive = root * sigma > 1e-7
     residuals = np.divide(score, root, out=np.zeros_like(score), where=alive)
     return Block(residuals, (root * alive)[..., None] * J, np.sqrt(share), cost=cost * share)
-
-
-def view_chain(state, data):
-    """Rotations and translations that make up the predicted ``T_camera_board`` of every view."""
-    camera = state.cameras[data.view["camera"]]
-    on_head = data.on_head[data.view["camera"]]
-    pitch, by_parts = true_pitch(state, data, np.where(on_head, data.view["pitch"], 0.0))
-    pitch = np.where(on_head, pitch, 0.0)
-    head = np.where(on_head[..., None, None], state.head, np.eye(3, 4))
-    A = camera[..., :3] @ np.swapaxes(head[..., :3], -1, -2)
-    board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
-    y = tilted(board[..., 3], pitch, -1.0)
-    back = tilted(np.broadcast_to(np.eye(3), pitch.shape + (3, 3)), pitch[..., None], -1.0)  # rows Rx(-pitch) e_i
-    return camera, head, A, A @ np.swapaxes(back, -1, -2), board, y, on_head, by_parts
 
 
 def inverse_left_jacobian(w):
@@ -622,54 +511,64 @@ def inverse_left_jacobian(w):
 
 def view_block(state, data, unknowns):
     """Predicted against measured poses of the board in the cameras: rotation vectors and translations."""
-    camera, head, A, B, board, y, on_head, by_parts = view_chain(state, data)
-    R, t = B @ board[..., :3], (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
-    pose = data.view["pose"]
-    w = Rotation.from_matrix(R @ np.swapaxes(pose[..., :3, :3], -1, -2)).as_rotvec()
+    view, on_head = data.view, data.on_head[data.view["camera"]]
+    camera, pose, moved = state.cameras[view["camera"]], view["pose"], on_head[..., None, None]
+    pitch, by_parts = true_pitch(state, data, np.where(on_head, view["pitch"], 0.0))
+    pitch, head = np.where(on_head, pitch, 0.0), np.where(moved, state.head, np.eye(3, 4))
+    board = np.broadcast_to(state.boards[:, None], pitch.shape + (3, 4))
+    # T_camera_board = T_camera_lrf T_head_lrf^-1 Rx(-pitch) T_platform_board for a camera on the head
+    A = camera[..., :3] @ np.swapaxes(head[..., :3], -1, -2)
+    B = A @ np.swapaxes(tilt(np.eye(3), -pitch[..., None]), -1, -2)
+    y = tilt(board[..., 3], -pitch)
+    t = (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
+    w = log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
     left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
 
     def rows(turn, shift):
         return np.concatenate([left @ turn, shift], axis=-2)
 
-    moved = on_head[..., None, None]
-    by_head = np.concatenate([rows(-A, A @ hat(y - head[..., 3])), rows(zero, -A)], axis=-1)
+    axis = np.concatenate([rows(-A, A @ hat(y - head[..., 3])), rows(zero, -A)], axis=-1)[..., AXIS_COLUMNS] * moved
     turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
     by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
     own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
     cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
-    np.put_along_axis(cameras, data.view["camera"][..., None, None, None], own[..., None, :], axis=-2)
+    np.put_along_axis(cameras, view["camera"][..., None, None, None], own[..., None, :], axis=-2)
     cameras = cameras.reshape(cameras.shape[:3] + (-1,))
-    parts = turn * by_parts[..., None, :]
-    J = assemble(unknowns, by_head[..., AXIS_COLUMNS] * moved, parts, by_board, cameras=cameras)
-    p, v = residuals.shape[:2]
+    J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
+    p, v = pitch.shape
     return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
 
 
 def view_whitener(data, by_pitch):
     """Inverse Cholesky factors of the views' covariances, with what the error of the recorded pitch adds to them."""
-    if data.sigma_pitch == 0:
-        return data.view["whitener"] / data.view_scale[data.view["camera"]][..., None, None]
     scale = data.view_scale[data.view["camera"]][..., None, None]
+    if data.sigma_pitch == 0:
+        return data.view["whitener"] / scale
     covariance = scale**2 * data.view["covariance"]
     covariance = covariance + data.sigma_pitch**2 * by_pitch[..., :, None] * by_pitch[..., None, :]
     return np.linalg.inv(np.linalg.cholesky(covariance)) * data.view["used"][..., None, None]
 
 
+def own_jacobian(unknowns, p, name):
+    """Jacobian of the own unknowns of p placements by themselves."""
+    where = unknowns.columns[name]
+    J = np.zeros((p, where.stop - where.start, unknowns.shared + unknowns.own))
+    J[..., where] = np.eye(where.stop - where.start)
+    return J
+
+
 def sweep_block(state, data, unknowns):
     """What is expected of the sweeps' own errors of the pitch."""
-    count, first = SWEEPS[unknowns.sweep], unknowns.shared + 6
-    J = np.zeros((len(state.sweeps), count, unknowns.shared + unknowns.own))
-    J[:, range(count), range(first, first + count)] = 1.0
-    whitener = np.broadcast_to(1 / np.array(data.sweep_sigma[:count]), (len(J), count))
-    return Block(state.sweeps[:, :count], J, whitener)
+    values = state.sweeps[:, : SWEEPS[unknowns.sweep]]
+    whitener = np.broadcast_to(1 / np.array(data.sweep_sigma[: values.shape[1]]), values.shape)
+    return Block(values, own_jacobian(unknowns, len(values), "sweep"), whitener)
 
 
 def side_block(state, data, unknowns):
     """What is expected of the sides' deviations from the sensor's edge bias: Student's t, as a likelihood."""
     x, spread = state.sides, SIDE_FREEDOM * data.side_sigma**2
-    J = np.zeros(x.shape + (unknowns.shared + unknowns.own,))
-    J[:, range(x.shape[1]), range(J.shape[-1] - x.shape[1], J.shape[-1])] = 1.0
+    J = own_jacobian(unknowns, len(x), "sides")
     root = np.sqrt((SIDE_FREEDOM + 1) / (spread + x**2))
     cost = 0.5 * (SIDE_FREEDOM + 1) * np.log1p(x**2 / spread)
     return Block(root * x, root[..., None] * J, np.ones_like(x), cost=cost)
@@ -689,12 +588,9 @@ def prior_block(state, data, unknowns):
 
 def usual_block(state, unknowns, name):
     """A weak expectation of one of `USUAL`, for data that do not show it; every placement holds a part."""
-    p, c = len(state.boards), unknowns.cameras
-    (usual, spread), number = USUAL[name], SENSOR.index(name)
-    full = np.zeros(len(unknowns.mask))
-    full[4 + 6 * c + number] = 1.0
+    (usual, spread), number, p = USUAL[name], SENSOR.index(name), len(state.boards)
     J = np.zeros((p, 1, unknowns.shared + unknowns.own))
-    J[:, 0, : unknowns.shared] = full[unknowns.mask]
+    J[..., unknowns.columns[name]] = 1.0
     away = (state.sensor[number] - usual) / (spread * np.sqrt(p))
     # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with the softness squared:
     # without this curvature steps overshoot twofold
@@ -704,19 +600,7 @@ def usual_block(state, unknowns, name):
 
 
 def joint_blocks(state, data, unknowns):
-    """All residuals of the joint estimate.
-
-    Parameters
-    ----------
-    state : JointState
-    data : JointData
-    unknowns : Unknowns
-
-    Returns
-    -------
-    list of Block
-        Of :func:`named_blocks`.
-    """
+    """All residuals of the joint estimate, a list of Block."""
     return list(named_blocks(state, data, unknowns).values())
 
 
@@ -735,19 +619,7 @@ def named_blocks(state, data, unknowns):
 
 
 def move_state(state, step, unknowns):
-    """Retraction of the joint estimate.
-
-    Parameters
-    ----------
-    state : JointState
-    step : tuple of ndarray
-        Shared increments (c,) and those of each placement (p, l).
-    unknowns : Unknowns
-
-    Returns
-    -------
-    JointState
-    """
+    """Retraction of the joint estimate: shared increments (c,) and those of each placement (p, l)."""
     full = np.zeros(len(unknowns.mask))
     full[unknowns.mask] = step[0]
     c = len(state.cameras)
@@ -772,13 +644,10 @@ def move_state(state, step, unknowns):
 
 
 def chart_parameters(head):
-    """The axis as angles out of and within the scan plane, and minus y, z of its foot, shape (4,)."""
+    """The axis of ``T_head_lrf`` (3, 4): angles out of and within the scan plane, and minus y, z of its foot, (4,)."""
     axis = axis_of(pose_transform(head))
-    return np.r_[
-        np.arctan2(axis.direction[2], axis.direction[0]),
-        np.arctan2(-axis.direction[1], axis.direction[0]),
-        -axis.foot[1:],
-    ]
+    x, y, z = axis.direction
+    return np.r_[np.arctan2(z, x), np.arctan2(-y, x), -axis.foot[1:]]
 
 
 def prior_terms(head, prior):
@@ -791,11 +660,8 @@ def prior_terms(head, prior):
     along, arm = turn[:, 0], np.array([0.0, head[1, 3], head[2, 3]])
     r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]
     J = np.zeros((4, 4))
-    for column, w in enumerate(np.eye(3)[1:]):
-        spun = -turn @ np.cross(w, [1.0, 0.0, 0.0])
-        J[:2, column] = spun[2], -spun[1]
-        J[2:, column] = -(turn @ np.cross(w, arm))[1:]
-    J[2:, 2:] = turn[1:, 1:]
+    by_turn = turn @ hat([[1.0, 0.0, 0.0], arm])[..., 1:]  # of R^T e_x and R^T t by w_y, w_z
+    J[:2, :2], J[2:, :2], J[2:, 2:] = by_turn[0, [2, 1]] * [[1.0], [-1.0]], by_turn[1, 1:], turn[1:, 1:]
     return r, J
 
 
@@ -814,22 +680,8 @@ def sight_normals(lines, model):
 
 
 def sight_block(pose, points, normals, sigma):
-    """Distances of points from planes through the camera centre, metres.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    points, normals : ndarray, shape (..., n, 3)
-    sigma : ndarray, shape (..., n)
-        Metres.
-
-    Returns
-    -------
-    Block
-    """
+    """Distances of points (..., n, 3) from planes through the camera centre with unit normals (..., n, 3), metres."""
     rotated = rotate_points(pose, points)
     residuals = np.sum(normals * (rotated + pose[..., None, :, 3]), axis=-1)
-    normals = np.broadcast_to(normals, rotated.shape)
-    return Block(
-        residuals, gradient_by_pose(rotated, normals), np.broadcast_to(1.0 / np.asarray(sigma), residuals.shape)
-    )
+    jacobian = gradient_by_pose(rotated, np.broadcast_to(normals, rotated.shape))
+    return Block(residuals, jacobian, np.full(residuals.shape, 1.0 / sigma))

@@ -48,10 +48,8 @@ class Solution:
     parameters : ndarray, shape (..., k)
         For a transform its rotation vector and translation (radians, metres), then whatever else was unknown.
     names : tuple of str, length k
-    converged : bool or ndarray of bool
-    iterations : int
-    cost_history : ndarray, shape (iterations + 1, ...)
-        Half the sum of squared whitened residuals (of the loss, where one is used).
+    converged, iterations, cost_history
+        The last, shape (iterations + 1, ...): half the sum of squared whitened residuals (or of the loss).
     residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
         Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]`` for a transform).
     weights : ndarray, shape (..., n)
@@ -65,16 +63,12 @@ class Solution:
         covariance cannot know. None where one placement alone carries an unknown, or with fewer than three placements.
     unobservable : tuple of str
         Motions that the data do not determine, in words.
-    method : str
-    n_observations : int
-    chi2 : float or ndarray
-        Sum of squared whitened residuals (weighted).
-    inflation : float or ndarray
-        1 where chi-square agrees with the stated noise.
+    chi2, inflation : float or ndarray
+        Sum of squared whitened residuals (weighted); 1 where it agrees with the stated noise.
     model : CameraModel or None
-        Refined intrinsics of a joint refinement.
+        Refined intrinsics.
     board_poses : ndarray, shape (p, 4, 4), or None
-        Refined ``T_camera_board`` of a joint refinement, in the order of the observations' `placements`.
+        Refined ``T_camera_board`` in the order of the observations' `placements`.
     state : object
         What the core moved about: everything that was unknown, shared or not.
     """

@@ -56,17 +56,7 @@ class Board:
     features: tuple[str, str] = ("", "")
 
     def lines(self):
-        """Edges as board-frame lines ``a x + b y + c = 0`` with (a, b) the unit normal that points out of the board.
-
-        Returns
-        -------
-        ndarray, shape (n_edges, 3)
-
-        Raises
-        ------
-        ValueError
-            If the outline is not known.
-        """
+        """Edges as board-frame lines, see :func:`outline_lines`; ValueError where the outline is not known."""
         return outline_lines(self.known_corners())
 
     def lengths(self):
@@ -81,17 +71,7 @@ class Board:
 
 
 def outline_lines(corners):
-    """Lines ``a x + b y + c = 0`` of a polygon's sides, unit normals outwards.
-
-    Parameters
-    ----------
-    corners : array_like, shape (n, 2)
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Row i belongs to the side from corner i to corner i + 1.
-    """
+    """Lines ``a x + b y + c = 0`` (n, 3) of a polygon's sides, unit normals outwards; row i from corner i to i + 1."""
     corners = np.asarray(corners, float)
     along = np.roll(corners, -1, axis=0) - corners
     turn = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
@@ -101,36 +81,17 @@ def outline_lines(corners):
 
 
 def corners_of_lines(lines):
-    """Corners of a polygon from its sides: corner i is where side i - 1 meets side i.
-
-    Parameters
-    ----------
-    lines : array_like, shape (n, 3)
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-    """
+    """Corners (n, 2) of a polygon from its sides (n, 3): corner i is where side i - 1 meets side i."""
     lines = np.asarray(lines, float)
     points = np.cross(np.roll(lines, 1, axis=0), lines)
     return points[:, :2] / points[:, 2:]
 
 
 def triangle_board(ab=0.315, ac=0.380, name="triangle", pattern=None):
-    """The paper's board: a right-angled triangle with its right angle A in the origin, B on +x and C on +y.
+    """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y, metres.
 
-    Parameters
-    ----------
-    ab, ac : float
-        The two edges at the right angle, metres. The paper states 315, 380 and 491 mm; a right angle makes the third
-        edge 493.58 mm (the stated one closes at 89.4 deg), so the exact right angle is used here.
-    name : str
-    pattern : Chessboard, optional
-
-    Returns
-    -------
-    Board
-        Edges ``ab``, ``bc``, ``ca``.
+    The paper states 315, 380 and 491 mm; a right angle makes the third edge 493.58 mm (the stated one closes at
+    89.4 deg), so the exact right angle is used here. Edges are ``ab``, ``bc``, ``ca``.
     """
     corners = np.array([[0.0, 0.0], [ab, 0.0], [0.0, ac]])
     return Board(name, ("ab", "bc", "ca"), corners, pattern, ("ab", "ca"))

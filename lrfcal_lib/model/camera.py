@@ -53,19 +53,7 @@ class CameraModel:
 
 
 def pinhole(p_camera, model):
-    """Project points to undistorted pixels: a pinhole with `model`'s K and no lens, equation (19).
-
-    Parameters
-    ----------
-    p_camera : array_like, shape (..., 3)
-        Metres.
-    model : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        Undistorted pixels; NaN where z <= 0.
-    """
+    """Project points (..., 3) to undistorted pixels (..., 2), NaN where z <= 0; equation (19), K without a lens."""
     p_camera = np.asarray(p_camera, float)
     z = np.where(p_camera[..., 2] > 0, p_camera[..., 2], np.nan)
     return np.stack([model.fx * p_camera[..., 0] / z + model.cx, model.fy * p_camera[..., 1] / z + model.cy], axis=-1)
@@ -82,17 +70,9 @@ def pinhole_jacobian(p_camera, model):
 
 
 def distort(normalized, distortion):
-    """Lens distortion of normalised image coordinates, equation (18) read as 1 + k1 r^2 + k2 r^4 + k5 r^6.
+    """Lens distortion of normalised image coordinates (x / z, y / z), shape (..., 2).
 
-    Parameters
-    ----------
-    normalized : array_like, shape (..., 2)
-        (x / z, y / z).
-    distortion : array_like, shape (5,)
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
+    Equation (18), its radial part read as 1 + k1 r^2 + k2 r^4 + k5 r^6.
     """
     normalized = np.asarray(normalized, float)
     k1, k2, k3, k4, k5 = distortion
@@ -105,32 +85,14 @@ def distort(normalized, distortion):
 
 
 def project(p_camera, model):
-    """Project points to pixels through the pinhole with lens distortion, equations (18) and (19).
-
-    Parameters
-    ----------
-    p_camera : array_like, shape (..., 3)
-        Metres.
-    model : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        Pixels; NaN where z <= 0.
-    """
+    """Project points (..., 3) to pixels (..., 2), NaN where z <= 0; equations (18) and (19)."""
     p_camera = np.asarray(p_camera, float)
     z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
     return distort(p_camera[..., :2] / z, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
 
 
 def project_jacobians(p_camera, model):
-    """Derivatives of :func:`project` by the point and by the intrinsics.
-
-    Parameters
-    ----------
-    p_camera : array_like, shape (..., 3)
-        Points in front of the camera, metres.
-    model : CameraModel
+    """Derivatives of :func:`project` at points (..., 3) in front of the camera.
 
     Returns
     -------
@@ -151,28 +113,15 @@ def project_jacobians(p_camera, model):
     v = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], -1) * model.fy
     lens = distort(np.stack([x, y], -1), model.distortion)
     zero, one = np.zeros_like(x), np.ones_like(x)
-    powers = [r2, r2**2, None, None, r2**3]
-    du = [x * powers[0], x * powers[1], 2 * x * y, r2 + 2 * x * x, x * powers[4]]
-    dv = [y * powers[0], y * powers[1], r2 + 2 * y * y, 2 * x * y, y * powers[4]]
+    du = [x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3]  # by k1..k5
+    dv = [y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3]
     iu = np.stack([lens[..., 0], zero, one, zero, *(model.fx * d for d in du)], -1)
     iv = np.stack([zero, lens[..., 1], zero, one, *(model.fy * d for d in dv)], -1)
     return np.stack([u, v], axis=-2), np.stack([iu, iv], axis=-2)
 
 
 def undistort(uv, model):
-    """Undistorted pixels of image points.
-
-    Parameters
-    ----------
-    uv : array_like, shape (..., 2)
-        Pixels as recorded.
-    model : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        Pixels of a camera with the same K and no lens distortion.
-    """
+    """Undistorted pixels (..., 2) of image points: of a camera with the same K and no lens distortion."""
     uv = np.asarray(uv, float)
     if uv.size == 0:
         return uv.copy()
@@ -200,21 +149,7 @@ def line_distance(uv, line):
 
 
 def board_line_in_image(line, T_camera_board, model):
-    """Undistorted pixel line of a line drawn on the board.
-
-    Parameters
-    ----------
-    line : array_like, shape (3,)
-        ``a x + b y + c = 0`` in the board frame.
-    T_camera_board : RigidTransform
-    model : CameraModel
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        With unit normal on the same side as the board line's (both sides keep their sign in front of the camera).
-    """
-    pose = T_camera_board.as_matrix()
-    homography = model.matrix @ pose[:3, [0, 1, 3]]
+    """Undistorted pixel line of a line ``a x + b y + c = 0`` drawn on the board, the unit normal on the same side."""
+    homography = model.matrix @ T_camera_board.as_matrix()[:3, [0, 1, 3]]
     out = np.linalg.solve(homography.T, np.asarray(line, float))
     return out / np.hypot(out[0], out[1])

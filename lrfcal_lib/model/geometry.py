@@ -13,25 +13,23 @@ class DegenerateGeometry(ValueError):
 
 
 def hat(v):
-    """Cross-product matrices of vectors, ``hat(v) @ u == cross(v, u)``.
-
-    Parameters
-    ----------
-    v : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3), ``hat(v) @ u == cross(v, u)``."""
     v = np.asarray(v, dtype=float)
     out = np.zeros(v.shape + (3,))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
+    return out - np.swapaxes(out, -1, -2)
+
+
+def cross(a, b):
+    """Cross product along the last axis; several times faster than `numpy.cross` on stacks."""
+    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.stack([x, y, z], axis=-1)
 
 
 def polar_to_points(ranges, bearings):
-    """Points of a 2D scan in the LRF frame.
+    """Points of a 2D scan in the LRF frame, Li et al. 2009, equation (17).
 
     Parameters
     ----------
@@ -44,61 +42,42 @@ def polar_to_points(ranges, bearings):
     -------
     ndarray, shape (..., 3)
         ``p_lrf``, metres; NaN rows where the range is NaN.
-
-    Notes
-    -----
-    Li et al. 2009, equation (17).
     """
     ranges, bearings = np.broadcast_arrays(np.asarray(ranges, float), np.asarray(bearings, float))
     return np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings), 0.0 * ranges], axis=-1)
 
 
 def polar_covariance(ranges, bearings, sigma_range, sigma_bearing):
-    """Covariance of polar points in the LRF frame, from independent errors along and across the beam.
-
-    Parameters
-    ----------
-    ranges, bearings : array_like, shape (...)
-        Metres and radians.
-    sigma_range, sigma_bearing : array_like, broadcastable
-        Standard deviations, metres and radians.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    ranges, bearings = np.broadcast_arrays(np.asarray(ranges, float), np.asarray(bearings, float))
-    along = np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], -1)
-    across = np.stack([-np.sin(bearings), np.cos(bearings), 0 * bearings], -1)
-    across = across * (ranges * sigma_bearing)[..., None]
-    along = along * np.broadcast_to(np.asarray(sigma_range, float), ranges.shape)[..., None]
+    """Covariance (..., 3, 3) of polar points in the LRF frame, from independent errors along and across the beam."""
+    ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, np.asarray(sigma_range, float))
+    along = np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], -1) * sigma_range[..., None]
+    across = np.stack([-np.sin(bearings), np.cos(bearings), 0 * bearings], -1) * (ranges * sigma_bearing)[..., None]
     return along[..., :, None] * along[..., None, :] + across[..., :, None] * across[..., None, :]
 
 
 def tilt(points, pitch):
-    """Turn points about the tilt axis, from the head to the platform frame.
+    """Turn points about the tilt axis, from the head to the platform frame, equations (4) and (5).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
         ``p_head``, metres.
-    pitch : array_like, broadcastable to ``points.shape[:-1]``
+    pitch : array_like, broadcastable with ``points.shape[:-1]``
         Radians; positive lifts the view.
 
     Returns
     -------
     ndarray, shape (..., 3)
-        ``p_platform = Rx(pitch) p_head``; equations (4) and (5).
+        ``p_platform = Rx(pitch) p_head``.
     """
-    points = np.asarray(points, float)
+    points = np.asarray(points)
     c, s = np.cos(pitch), np.sin(pitch)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    x = np.broadcast_to(x, np.broadcast_shapes(x.shape, np.shape(c)))
-    return np.stack([x, c * y - s * z, s * y + c * z], axis=-1)
+    return np.stack([x + 0 * c, c * y - s * z, s * y + c * z], axis=-1)
 
 
 def lrf_to_platform(p_lrf, pitch, T_head_lrf):
-    """Points of scans taken at known pitch angles in the fixed platform frame, equation (6).
+    """Points of scans in the fixed platform frame, ``p_platform = Rx(pitch) (R p_lrf + t)``, equation (6).
 
     Parameters
     ----------
@@ -107,15 +86,8 @@ def lrf_to_platform(p_lrf, pitch, T_head_lrf):
     pitch : array_like, broadcastable to ``p_lrf.shape[:-1]``
         Radians.
     T_head_lrf : RigidTransform
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        ``p_platform = Rx(pitch) (R p_lrf + t)``.
     """
-    p_lrf = np.asarray(p_lrf, float)
-    p_head = T_head_lrf.apply(p_lrf.reshape(-1, 3)).reshape(p_lrf.shape)
-    return tilt(p_head, pitch)
+    return tilt(T_head_lrf.apply(p_lrf), pitch)
 
 
 def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
@@ -123,13 +95,10 @@ def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
 
     Parameters
     ----------
-    p_lrf : array_like, shape (..., 3)
-        Metres.
-    pitch : array_like, broadcastable to ``p_lrf.shape[:-1]``
-        Pitch of each point's scan, radians.
-    T_head_lrf : RigidTransform
+    p_lrf, pitch, T_head_lrf
+        See :func:`lrf_to_platform`.
     mount : {'platform', 'head'}
-        What the camera is fixed to.
+        What the camera is fixed to; ValueError for anything else.
     image_pitch : float
         Pitch at which the image was taken, radians; only used for a camera on the head.
 
@@ -138,18 +107,12 @@ def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
     ndarray, shape (..., 3)
         Platform coordinates for a camera on the base; for a camera on the head, LRF coordinates of a scan that would
         have been taken at `image_pitch`.
-
-    Raises
-    ------
-    ValueError
-        For another `mount`.
     """
     if mount == "platform":
         return lrf_to_platform(p_lrf, pitch, T_head_lrf)
     if mount != "head":
         raise ValueError(f"mount is 'head' or 'platform', got '{mount}'")
-    turned = lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf)
-    return T_head_lrf.inv().apply(turned.reshape(-1, 3)).reshape(turned.shape)
+    return T_head_lrf.inv().apply(lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf))
 
 
 @dataclass(frozen=True)
@@ -173,35 +136,19 @@ class TiltAxis:
 
 
 def axis_of(T_head_lrf):
-    """The tilt axis in the LRF frame that a head transform stands for.
+    """The tilt axis that a head transform stands for: ``R^T e_x`` through ``-R^T t``.
 
-    Parameters
-    ----------
-    T_head_lrf : RigidTransform
-
-    Returns
-    -------
-    TiltAxis
-        ``direction = R^T e_x``, ``foot`` = the foot of the perpendicular from the LRF's origin on the line through
-        ``-R^T t``. Turning about x and sliding along x change nothing.
+    Turning about x and sliding along x change nothing.
     """
     lrf_head = T_head_lrf.inv()
-    direction = lrf_head.rotation.apply([1.0, 0.0, 0.0])
-    point = lrf_head.translation
+    direction, point = lrf_head.rotation.apply([1.0, 0.0, 0.0]), lrf_head.translation
     return TiltAxis(direction, point - direction * (direction @ point))
 
 
 def head_from_axis(axis):
     """The head transform that turns the LRF least: the gauge used in this repository.
 
-    Parameters
-    ----------
-    axis : TiltAxis
-
-    Returns
-    -------
-    RigidTransform
-        ``T_head_lrf`` with the smallest rotation that maps the axis direction to x, and no shift along the axis.
+    It has the smallest rotation that maps the axis' direction to x, and no shift along the axis.
     """
     d = np.asarray(axis.direction, float)
     w = np.cross(d, [1.0, 0.0, 0.0])
@@ -213,10 +160,6 @@ def head_from_axis(axis):
 def paper_parameters(T_head_lrf):
     """Phi and t_y of equations (1) and (2) for the same tilt axis.
 
-    Parameters
-    ----------
-    T_head_lrf : RigidTransform
-
     Returns
     -------
     phi : ndarray, shape (3,)
@@ -226,8 +169,7 @@ def paper_parameters(T_head_lrf):
     """
     axis = axis_of(T_head_lrf)
     d = axis.direction
-    phi_y = np.arctan2(d[2], np.hypot(d[0], d[1]))
-    phi_z = np.arctan2(-d[1], d[0])
+    phi_y, phi_z = np.arctan2(d[2], np.hypot(d[0], d[1])), np.arctan2(-d[1], d[0])
     turned = Rotation.from_euler("YZ", [phi_y, phi_z]).apply(-axis.foot)
     ty = float(np.hypot(turned[1], turned[2]))
     phi_x = float(np.arctan2(-turned[2], turned[1])) if ty > 0 else 0.0
@@ -235,32 +177,12 @@ def paper_parameters(T_head_lrf):
 
 
 def head_from_paper(phi, ty):
-    """``T_head_lrf`` from the paper's parameters, equations (1) to (3) with ``R = Rx Ry Rz`` (x last).
-
-    Parameters
-    ----------
-    phi : array_like, shape (3,)
-        Radians.
-    ty : float
-        Metres.
-
-    Returns
-    -------
-    RigidTransform
-    """
+    """``T_head_lrf`` from phi (radians) and ty (metres), equations (1) to (3) with ``R = Rx Ry Rz`` (x last)."""
     return RigidTransform.from_components([0.0, ty, 0.0], Rotation.from_euler("XYZ", phi))
 
 
 def axis_difference(a, b):
-    """Angle between two axes and the distance of their foot points.
-
-    Returns
-    -------
-    angle : float
-        Radians.
-    offset : float
-        Distance of the two lines at the LRF (of the foot points), metres.
-    """
+    """Angle between two axes (radians) and the distance of their foot points (metres)."""
     angle = np.arctan2(np.linalg.norm(np.cross(a.direction, b.direction)), a.direction @ b.direction)
     return float(angle), float(np.linalg.norm(a.foot - b.foot))
 
@@ -270,82 +192,58 @@ def transform_difference(a, b):
     return float((a.rotation * b.rotation.inv()).magnitude()), float(np.linalg.norm(a.translation - b.translation))
 
 
-def fit_plane(points, weights=None):
+def _principal(points):
+    """Centre of points (n, 3), and variances along their principal axes (columns), the smallest first."""
+    centre = np.mean(points, axis=0)
+    return centre, *np.linalg.eigh((points - centre).T @ (points - centre) / len(points))
+
+
+def fit_plane(points):
     """Total least squares plane ``normal . p = distance``.
 
     Parameters
     ----------
     points : array_like, shape (n, 3)
-        Rows with NaN are ignored.
-    weights : array_like, shape (n,), optional
+        Rows with NaN are ignored. DegenerateGeometry with fewer than three points, or all on one line.
 
     Returns
     -------
     normal : ndarray, shape (3,)
         Unit vector, away from the origin (``distance >= 0``).
-    distance : float
-    rms : float
-        Root mean square distance of the points from the plane.
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than three points, or all on one line.
+    distance, rms : float
+        Of the origin, and root mean square of the points from the plane.
     """
     points = np.asarray(points, float)
-    good = np.isfinite(points).all(axis=1)
-    points = points[good]
-    weights = np.ones(len(points)) if weights is None else np.asarray(weights, float)[good]
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 3:
         raise DegenerateGeometry(f"a plane needs three points, got {len(points)}")
-    centre = np.average(points, axis=0, weights=weights)
-    values, vectors = np.linalg.eigh(((points - centre) * weights[:, None]).T @ (points - centre) / weights.sum())
+    centre, values, vectors = _principal(points)
     if values[1] < 1e-12 * max(values[2], 1e-300):
         raise DegenerateGeometry("the points lie on one line: the rotation of a plane about it stays unobservable")
-    normal = vectors[:, 0]
-    normal = -normal if normal @ centre < 0 else normal
+    normal = vectors[:, 0] * (-1.0 if vectors[:, 0] @ centre < 0 else 1.0)
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
-def fit_line(points, weights=None):
+def fit_line(points):
     """Total least squares line in space.
 
     Parameters
     ----------
     points : array_like, shape (n, 3)
-    weights : array_like, shape (n,), optional
+        DegenerateGeometry with fewer than two distinct ones.
 
     Returns
     -------
-    point : ndarray, shape (3,)
-        Centre of the points, on the line.
-    direction : ndarray, shape (3,)
-        Unit vector.
+    point, direction : ndarray, shape (3,)
+        Centre of the points, on the line, and unit vector.
     rms : float
         Root mean square distance of the points from the line.
-
-    Raises
-    ------
-    DegenerateGeometry
-        With fewer than two distinct points.
     """
     points = np.asarray(points, float)
-    weights = np.ones(len(points)) if weights is None else np.asarray(weights, float)
     if len(points) < 2 or np.ptp(points, axis=0).max() == 0:
         raise DegenerateGeometry(f"a line needs two distinct points, got {len(points)}")
-    centre = np.average(points, axis=0, weights=weights)
-    values, vectors = np.linalg.eigh(((points - centre) * weights[:, None]).T @ (points - centre) / weights.sum())
+    centre, values, vectors = _principal(points)
     return centre, vectors[:, 2], float(np.sqrt(max(values[0] + values[1], 0.0)))
-
-
-def line_gap(point1, direction1, point2, direction2):
-    """Distance of two lines in space, equation (14); the distance of parallel lines is measured across them."""
-    normal = np.cross(direction1, direction2)
-    between = np.asarray(point1) - np.asarray(point2)
-    length = np.linalg.norm(normal)
-    if length < 1e-12 * np.linalg.norm(direction1) * np.linalg.norm(direction2):
-        return float(np.linalg.norm(np.cross(between, direction1)) / np.linalg.norm(direction1))
-    return float(abs(normal @ between) / length)
 
 
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -361,31 +259,26 @@ def pose_transform(pose):
     return RigidTransform.from_components(pose[..., 3], Rotation.from_matrix(pose[..., :3]))
 
 
-def pose_parameters(pose):
-    """Rotation vector and translation of pose arrays, shape (..., 6), in the order of `POSE_NAMES`."""
-    flat = pose.reshape(-1, 3, 4)
-    rotvec = Rotation.from_matrix(flat[:, :, :3]).as_rotvec()
-    return np.concatenate([rotvec, flat[:, :, 3]], axis=1).reshape(pose.shape[:-2] + (6,))
-
-
 def exp_rotation(w):
     """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3)."""
-    w = np.asarray(w, float)
+    w = np.asarray(w, float)  # flat: SciPy is several times slower on more than one leading axis
     return Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(w.shape[:-1] + (3, 3))
 
 
+def log_rotation(R):
+    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3)."""
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+
+
+def pose_parameters(pose):
+    """Rotation vector and translation of pose arrays, shape (..., 6), in the order of `POSE_NAMES`."""
+    return np.concatenate([log_rotation(pose[..., :3]), pose[..., 3]], axis=-1)
+
+
 def move_pose(pose, delta):
-    """Small change of poses: ``R <- exp(w) R``, ``t <- t + v`` with ``delta = [w, v]``.
+    """Small change of poses (..., 3, 4): ``R <- exp(w) R``, ``t <- t + v`` with ``delta = [w, v]`` (..., 6).
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-    delta : ndarray, shape (..., 6)
-        Radians and metres, in the destination frame.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 4)
+    Radians and metres, in the destination frame.
     """
     turned = exp_rotation(delta[..., :3]) @ pose[..., :3]
     return np.concatenate([turned, (pose[..., 3] + delta[..., 3:6])[..., None]], axis=-1)
@@ -401,27 +294,10 @@ def apply_pose(pose, points):
     return rotate_points(pose, points) + pose[..., None, :, 3]
 
 
-def cross(a, b):
-    """Cross product along the last axis; several times faster than `numpy.cross` on stacks."""
-    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return np.stack([x, y, z], axis=-1)
-
-
 def gradient_by_pose(rotated, gradient):
-    """Jacobian rows by ``[w, v]`` of scalars with gradient `gradient` by the moved point.
+    """Jacobian rows (..., n, 6) by ``[w, v]`` of scalars with gradient ``a`` (..., n, 3) by the moved point.
 
-    Parameters
-    ----------
-    rotated : ndarray, shape (..., n, 3)
-        ``R p`` (without the translation).
-    gradient : ndarray, shape (..., n, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 6)
-        ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``.
+    ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``; `rotated` is ``R p``, without the translation.
     """
     return np.concatenate([cross(rotated, gradient), gradient], axis=-1)
 
@@ -439,10 +315,6 @@ def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
         ``R C R^T`` times a gradient: the direction in which the noise pulls the point.
     factor : ndarray, shape (..., n)
         Weighted residual.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 6)
     """
     spun = cross(shift, gradient)
     if not pinhole:
@@ -455,7 +327,7 @@ def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
 
 def moved_noise(pose, gradient, covariance):
     """``R C R^T a`` of source-frame covariances and gradients by the moved point, shape (..., n, 3)."""
-    return ((gradient @ pose[..., :3])[..., None, :] @ covariance)[..., 0, :] @ np.swapaxes(pose[..., :3], -1, -2)
+    return rotate_points(pose, ((gradient @ pose[..., :3])[..., None, :] @ covariance)[..., 0, :])
 
 
 def axis_words(direction):
@@ -468,22 +340,9 @@ def axis_words(direction):
     return "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
 
 
-def motion_words(delta, frame="destination"):
-    """Name a small motion of a transform, e.g. ``translation along x of the left frame``.
-
-    Parameters
-    ----------
-    delta : array_like, shape (6,)
-        ``[w, v]``; only its direction counts.
-    frame : str
-        Destination frame of the transform.
-
-    Returns
-    -------
-    str
-    """
-    delta = np.asarray(delta, float)
-    w, v = delta[:3], delta[3:6]
+def motion_words(delta, frame):
+    """Name a small motion ``[w, v]`` by its direction, e.g. ``translation along x of the left frame``."""
+    w, v = np.asarray(delta[:3], float), np.asarray(delta[3:6], float)
     turn, shift = np.linalg.norm(w), np.linalg.norm(v)
     if turn < 0.02 * shift:
         return f"translation along {axis_words(v)} of the {frame} frame"
@@ -492,59 +351,24 @@ def motion_words(delta, frame="destination"):
 
 
 def point_set(positions, point, distance, tolerance):
-    """Positions that a point at a measured distance allows: a spherical shell around it, figure 3 (a).
-
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-        Candidate positions of the sensor, metres.
-    point : array_like, shape (3,)
-    distance, tolerance : float
-        Measured distance and how far it may be off, metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
-    """
+    """Positions (..., 3) that a point at a measured distance allows: a spherical shell around it, figure 3 (a)."""
     away = np.linalg.norm(np.asarray(positions, float) - point, axis=-1)
     return np.abs(away - distance) <= tolerance
 
 
 def line_set(positions, point, direction, distance, tolerance):
-    """Positions that a line with one hit point at a measured distance allows: the inside of a cylinder, figure 3 (b).
+    """Positions (..., 3) that a line with one hit point at a measured distance allows: a cylinder, figure 3 (b).
 
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-        Metres.
-    point, direction : array_like, shape (3,)
-        A point of the line and its unit direction. Which point of the line was hit is not known.
-    distance, tolerance : float
-        Metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
+    Which point of the line (through `point`, with unit `direction`) was hit is not known.
     """
     away = np.linalg.norm(np.cross(np.asarray(positions, float) - point, direction), axis=-1)
     return away <= distance + tolerance
 
 
 def plane_set(positions, point, normal, distance, tolerance):
-    """Positions that a plane with one hit point at a measured distance allows: a slab in front of it, figure 3 (c).
+    """Positions (..., 3) that a plane with one hit point at a measured distance allows: a slab, figure 3 (c).
 
-    Parameters
-    ----------
-    positions : array_like, shape (..., 3)
-        Metres.
-    point, normal : array_like, shape (3,)
-        A point of the plane and its unit normal, towards the sensor.
-    distance, tolerance : float
-        Metres.
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
+    The unit `normal` points towards the sensor.
     """
     height = (np.asarray(positions, float) - point) @ np.asarray(normal, float)
     return (height >= -tolerance) & (height <= distance + tolerance)
@@ -556,20 +380,9 @@ def shell_volume(distance, tolerance):
 
 
 def crossing_volume(radius, angle):
-    """Volume common to two cylinders of equal radius whose axes meet at an angle.
+    """Volume common to two cylinders of equal radius whose axes meet at an angle (radians), cubic metres.
 
-    Parameters
-    ----------
-    radius : float
-        Metres.
-    angle : array_like
-        Between the axes, radians.
-
-    Returns
-    -------
-    ndarray
-        ``16 r^3 / (3 sin angle)``, cubic metres; smallest for perpendicular axes, without bound for parallel ones
-        (inf).
+    ``16 r^3 / (3 sin angle)``: smallest for perpendicular axes, infinite for parallel ones.
     """
     sine = np.abs(np.sin(np.asarray(angle, float)))
     with np.errstate(divide="ignore"):

@@ -63,42 +63,34 @@ class CameraObservations(_Groups):
         The image line of that edge (ab and ac), undistorted pixels, unit normal pointing out of the board.
     crossing_line_sigma : ndarray, shape (n,)
         Standard deviation of the image line at the crossing, pixels; 0.5 by default.
-    crossing_placement : ndarray of int, shape (n,)
+    crossing_placement, crossing_edge : ndarray of int and of str, shape (n,)
         Every row has a placement of its own by default, as of the other groups.
-    crossing_edge : ndarray of str, shape (n,)
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
         the recorded pitch. The paper uses none of these.
-    crossing_half_step : ndarray, shape (n, 3)
-        From halfway between the last beam on the board and the first off it to the latter, metres.
-    crossing_noise : ndarray, shape (n, 3, 3)
-        The covariance without the beam spacing.
-    crossing_radius : ndarray, shape (n,)
-        Of the beam's spot there, metres; 5 mm by default.
-    crossing_background : ndarray, shape (n,)
-        What the background adds to the log odds at which a reading flips from the board to it (see
-        :mod:`lrfcal_lib.fit.residuals`).
-    plane_points, plane_covariance : ndarray, shapes (m, 3) and (m, 3, 3)
+    crossing_half_step, crossing_noise : ndarray, shapes (n, 3), (n, 3, 3)
+        From halfway between the last beam on the board and the first off it to the latter, metres; the covariance
+        without this spacing of the beams.
+    crossing_radius, crossing_background : ndarray, shape (n,)
+        Of the beam's spot there, metres (5 mm by default), and what the background adds to the log odds at which a
+        reading flips from the board to it (see :mod:`lrfcal_lib.fit.residuals`).
+    plane_points, plane_covariance, plane_placement : ndarray, shapes (m, 3), (m, 3, 3), (m,)
         Points on the face of the board, metres.
-    plane_placement : ndarray of int, shape (m,)
     placements : ndarray of int, shape (p,)
         Placements of which the camera knows the board's pose.
     board_poses : ndarray, shape (p, 4, 4)
         ``T_camera_board``.
     board_covariance : ndarray, shape (p, 6, 6)
         Of ``[w, v]`` of the poses (see :mod:`lrfcal_lib`); zeros (exact) by default.
-    pattern_points : ndarray, shape (k, 3)
-        Corners of the printed pattern in the board frame, metres; k = 0 without a pattern.
-    pattern_pixels : ndarray, shape (p, k, 2)
-        Their recorded pixels, NaN where not seen.
+    pattern_points, pattern_pixels : ndarray, shapes (k, 3), (p, k, 2)
+        Corners of the printed pattern in the board frame, metres (k = 0 without a pattern), and their recorded pixels,
+        NaN where not seen.
     pattern_sigma_px : float
         Standard deviation of one coordinate of a pattern corner.
     scene_points, scene_covariance : ndarray, shapes (q, 3) and (q, 3, 3)
         Points that LRF and camera can both name (outline corners: where fitted edges meet), metres.
-    scene_pixels : ndarray, shape (q, 2)
+    scene_pixels, scene_sigma_px, scene_placement : ndarray, shapes (q, 2), (q,), (q,)
         Undistorted pixels of the same points.
-    scene_sigma_px : ndarray, shape (q,)
-    scene_placement : ndarray of int, shape (q,)
 
     Raises
     ------
@@ -158,23 +150,15 @@ class CameraObservations(_Groups):
         points = (self.crossing_points, self.plane_points, self.scene_points, self.pattern_points)
         n, m, q, k = (0 if rows is None else rows.shape[-2] for rows in points)
         p = 0 if self.board_poses is None else self.board_poses.shape[-3]
-        defaults = {
-            "crossing_lines": np.zeros((0, 3)),
-            "crossing_line_sigma": np.full(n, 0.5),
-            "crossing_edge": np.full(n, ""),
-            "crossing_across": np.zeros(n, bool),
-            "crossing_half_step": np.zeros((n, 3)),
-            "crossing_noise": np.zeros((n, 3, 3)),
-            "crossing_radius": np.full(n, 0.005),
-            "crossing_background": np.zeros(n),
-            "placements": np.arange(p),
-            "board_poses": np.zeros((0, 4, 4)),
-            "board_covariance": np.zeros((p, 6, 6)),
-            "pattern_points": np.zeros((0, 3)),
-            "pattern_pixels": np.full((p, k, 2), np.nan),
-            "scene_pixels": np.zeros((0, 2)),
-            "scene_sigma_px": np.full(q, 0.5),
-        }
+        zeros = {
+            "crossing_lines": (0, 3), "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3),
+            "crossing_background": n, "board_poses": (0, 4, 4), "board_covariance": (p, 6, 6),
+            "pattern_points": (0, 3), "scene_pixels": (0, 2),
+        }  # fmt: skip
+        defaults = {name: np.zeros(shape) for name, shape in zeros.items()}
+        defaults |= {"crossing_edge": np.full(n, ""), "crossing_across": np.zeros(n, bool), "placements": np.arange(p)}
+        defaults |= {"crossing_line_sigma": np.full(n, 0.5), "scene_sigma_px": np.full(q, 0.5)}
+        defaults |= {"crossing_radius": np.full(n, 0.005), "pattern_pixels": np.full((p, k, 2), np.nan)}
         for group, count in (("crossing", n), ("plane", m), ("scene", q)):
             defaults[f"{group}_points"] = np.zeros((0, 3))
             defaults[f"{group}_covariance"] = np.tile(ROUGH_NOISE, (count, 1, 1))
@@ -240,23 +224,14 @@ class JointObservations(_Groups):
         Ranges measured on the board's face (metres), their bearings and recorded pitch (radians), and standard
         deviations (metres).
     face_placement : ndarray of int, shape (m,)
-    beam_bearing, beam_pitch : ndarray, shape (n,)
-        Of beams near an edge, radians.
-    beam_hit : ndarray of bool, shape (n,)
-        Whether the beam read the board.
-    beam_edge : ndarray of int, shape (n,)
-        Index into `edges`.
-    beam_radius : ndarray, shape (n,)
-        Of the spot at the board, metres.
-    beam_background : ndarray, shape (n,)
-        See :mod:`lrfcal_lib.fit.residuals`.
-    beam_step : ndarray, shape (n,)
-        Distance at the board to the next beam in the direction in which the edge was found, metres.
+    beam_bearing, beam_pitch, beam_hit, beam_edge : ndarray, shape (n,)
+        Of beams near an edge: radians, whether the beam read the board, index into `edges`.
+    beam_radius, beam_background, beam_step : ndarray, shape (n,)
+        Of the spot at the board, metres; see :mod:`lrfcal_lib.fit.residuals`; distance at the board to the next beam in
+        the direction in which the edge was found, metres.
     beam_placement : ndarray of int, shape (n,)
-    view_camera : ndarray of int, shape (v,)
-        Index into `cameras`.
-    view_pitch : ndarray, shape (v,)
-        Recorded pitch at the image, radians; only used for cameras on the head.
+    view_camera, view_pitch : ndarray, shape (v,)
+        Index into `cameras`, and recorded pitch at the image, radians; only used for cameras on the head.
     view_pose : ndarray, shape (v, 4, 4)
         ``T_camera_board`` from the pattern's corners and the board's edges in the image.
     view_covariance : ndarray, shape (v, 6, 6)

@@ -3,113 +3,79 @@
 from __future__ import annotations
 
 import numpy as np
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.plots.recording import AXES_RGB, COLORS, color_of
+
+SURFACE = {"color": COLORS["left"], "alpha": 0.15, "linewidth": 0, "antialiased": True, "shade": True}
 
 
 def frames(ax, transforms, length=0.1):
     """Coordinate frames in space: x red, y green, z blue.
 
-    Parameters
-    ----------
-    ax : Axes3D
-    transforms : dict of str to RigidTransform
-        From each frame to the one drawn in.
-    length : float
-        Of the arrows, metres.
+    `transforms` lead from each frame, by name, to the one drawn in; `length` of the arrows in metres.
     """
     for name, transform in transforms.items():
-        origin = transform.translation
         for axis, color in zip(np.eye(3), AXES_RGB, strict=True):
-            tip = transform.apply(length * axis)
-            ax.plot(*np.column_stack([origin, tip]), color=color, linewidth=1.8)
+            ax.plot(*transform.apply(np.outer([0, length], axis)).T, color=color, linewidth=1.8)
         ax.text(*transform.apply([-0.35 * length] * 3), name, fontsize=8, color=color_of(name, 7), weight="bold")
 
 
-def polygon(ax, corners, color="#222222", alpha=0.15):
-    """A flat polygon in space, for instance a board.
-
-    Parameters
-    ----------
-    ax : Axes3D
-    corners : ndarray, shape (n, 3)
-        Metres.
-    """
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    ax.add_collection3d(Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=alpha))
-    closed = np.vstack([corners, corners[:1]])
-    ax.plot(*closed.T, color=color, linewidth=1.2)
+def polygon(ax, corners, color=COLORS["truth"]):
+    """A flat polygon in space, for instance a board; corners (n, 3) in metres."""
+    ax.add_collection3d(Poly3DCollection([corners], facecolors=color, edgecolors=color, alpha=0.15))
+    ax.plot(*np.vstack([corners, corners[:1]]).T, color=color, linewidth=1.2)
 
 
-def rays(ax, origin, points, color=None):
+def rays(ax, origin, points):
     """Beams in space, from one origin (or one a point) to the points they hit, shapes (3,) or (n, 3), metres."""
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
-
-    starts = np.broadcast_to(origin, np.shape(points))
-    color = color or COLORS["lrf"]
-    ax.add_collection3d(Line3DCollection(np.stack([starts, points], axis=1), colors=color, linewidths=0.4, alpha=0.35))
+    beams, color = np.stack([np.broadcast_to(origin, np.shape(points)), points], axis=1), COLORS["lrf"]
+    ax.add_collection3d(Line3DCollection(beams, colors=color, linewidths=0.4, alpha=0.35))
     ax.plot(*np.asarray(points).T, ".", color=color, markersize=2.5)
 
 
 def space(ax, points, elev=22.0, azim=-60.0, zoom=1.0, labels=True):
-    """Equal scales and a view for axes in space, limits from the points to show.
+    """Equal scales and a view for axes in space, limits from the points (n, 3) to show, metres.
 
-    Parameters
-    ----------
-    ax : Axes3D
-    points : ndarray, shape (n, 3)
-        Metres.
-    elev, azim : float
-        Where one looks from, degrees.
-    zoom : float
-        Matplotlib leaves wide margins around flat scenes.
-    labels : bool
-        Without them the axes are not drawn at all.
+    One looks from `elev` and `azim` (degrees); `zoom`: Matplotlib leaves wide margins around flat scenes. Without
+    `labels` the axes are not drawn at all.
     """
-    points = np.asarray(points, float).reshape(-1, 3)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     ax.set_box_aspect(np.maximum(high - low, 1e-6), zoom=zoom)
     ax.view_init(elev=elev, azim=azim)
-    if labels:
-        ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    else:
+    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    if not labels:
         ax.set_axis_off()
 
 
-def sphere(ax, centre, radius, color="#0072b2", alpha=0.15):
+def sphere(ax, centre, radius):
     """The set a point allows, figure 3 (a): the surface of a sphere, metres."""
     u, v = np.mgrid[0 : 2 * np.pi : 36j, 0 : np.pi : 19j]
-    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    _surface(ax, np.asarray(centre) + radius * ball, color, alpha)
+    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
+    ax.plot_surface(*(np.reshape(centre, (3, 1, 1)) + radius * ball), **SURFACE)
 
 
-def cylinder(ax, point, direction, radius, half_length, color="#0072b2", alpha=0.15):
+def cylinder(ax, point, direction, radius, half_length):
     """The set a line allows, figure 3 (b): a cylinder around it, metres; `direction` is a unit vector."""
     across = np.linalg.svd(np.asarray(direction, float)[None])[2][1:]
     u, s = np.mgrid[0 : 2 * np.pi : 36j, -half_length:half_length:9j]
     ring = radius * (np.cos(u)[..., None] * across[0] + np.sin(u)[..., None] * across[1])
-    _surface(ax, np.asarray(point) + ring + s[..., None] * np.asarray(direction), color, alpha)
-    ends = np.asarray(point) + np.outer([-half_length, half_length], direction)
-    ax.plot(*ends.T, color=COLORS["truth"])
+    ax.plot_surface(*np.moveaxis(point + ring + s[..., None] * np.asarray(direction), -1, 0), **SURFACE)
+    ax.plot(*(point + np.outer([-half_length, half_length], direction)).T, color=COLORS["truth"])
 
 
-def slab(ax, point, normal, thickness, half_width, color="#0072b2"):
+def slab(ax, point, normal, thickness, half_width):
     """The set a plane allows, figure 3 (c): the space between it and its parallel on the sensor's side, metres."""
     across = np.linalg.svd(np.asarray(normal, float)[None])[2][1:]
-    square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ across + np.asarray(point)
-    polygon(ax, square, COLORS["truth"])
-    polygon(ax, square + thickness * np.asarray(normal), color)
+    square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ across + point
+    polygon(ax, square)
+    polygon(ax, square + thickness * np.asarray(normal), COLORS["left"])
 
 
-def _surface(ax, grid, color, alpha):
-    ax.plot_surface(*np.moveaxis(grid, -1, 0), color=color, alpha=alpha, linewidth=0, antialiased=True, shade=True)
-
-
-def render(points, colors, T_view, size, focal=None, splat=1, background=255):
-    """A coloured cloud as a pinhole camera sees it: nearest point wins in every pixel.
+def render(points, colors, T_view, size, focal=None, splat=1):
+    """A coloured cloud as a pinhole camera sees it: nearest point wins in every pixel, white where none is.
 
     Parameters
     ----------
@@ -125,47 +91,27 @@ def render(points, colors, T_view, size, focal=None, splat=1, background=255):
         Pixels; the width (53 deg across) unless given.
     splat : int
         Each point covers (2 splat + 1)^2 pixels.
-    background : int
-        Grey level where no point is.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
     """
     height, width = size
     seen = T_view.apply(np.asarray(points, float))
-    keep = np.isfinite(seen).all(axis=1) & (seen[:, 2] > 1e-6)
+    keep = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 1e-6))
+    keep = keep[np.argsort(-seen[keep, 2], kind="stable")]  # far to near: of equal pixels the last one written stays
     seen, colors = seen[keep], np.asarray(colors, np.uint8)[keep]
-    order = np.argsort(-seen[:, 2], kind="stable")  # far to near: of equal pixels the last one written stays
-    seen, colors = seen[order], colors[order]
-    focal = width if focal is None else focal
-    uv = np.rint(focal * seen[:, :2] / seen[:, 2:] + [(width - 1) / 2, (height - 1) / 2])
-    winner = np.full(height * width, -1)
+    uv = np.rint((focal or width) * seen[:, :2] / seen[:, 2:] + [(width - 1) / 2, (height - 1) / 2]).astype(int)
+    winner = np.full((height, width), -1)
     for dv, du in np.ndindex(2 * splat + 1, 2 * splat + 1):
         u, v = uv[:, 0] + du - splat, uv[:, 1] + dv - splat
         inside = np.flatnonzero((u >= 0) & (u < width) & (v >= 0) & (v < height))
-        layer = np.full(height * width, -1)
-        layer[(v[inside] * width + u[inside]).astype(int)] = inside
+        layer = np.full((height, width), -1)
+        layer[v[inside], u[inside]] = inside
         winner = np.maximum(winner, layer)  # a larger index is nearer
-    image = np.full((height * width, 3), background, np.uint8)
-    image[winner >= 0] = colors[winner[winner >= 0]]
-    return image.reshape(height, width, 3)
+    return np.vstack([colors, np.full((1, 3), 255, np.uint8)])[winner]  # the last row where no point is
 
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)):
-    """The view from one point to another for :func:`render`, as RigidTransform from the points' frame.
+    """The view from one point to another (metres) for :func:`render`, as RigidTransform from the points' frame.
 
-    Parameters
-    ----------
-    eye, target : array_like, shape (3,)
-        Metres.
-    up : array_like, shape (3,)
-        Shown upwards; not along the line of sight.
-
-    Raises
-    ------
-    ValueError
-        If eye and target coincide, or `up` is the line of sight.
+    `up` is shown upwards. A ValueError if eye and target coincide, or `up` is the line of sight.
     """
     eye, ahead = np.asarray(eye, float), np.subtract(target, eye)
     right = np.cross(ahead, up)

@@ -1,13 +1,7 @@
 """What every notebook needs around its subject: its looks, its session, and where figures, tables and findings go.
 
-Outside a report run nothing is written: figures and tables are shown, and that is all. In one, three environment
-variables tell where things go; :mod:`lrfcal_lib.report.report` sets them.
-
-====================== ==========================================================================================
-``LRFCAL_SESSION``     folder of the session the notebook works on
-``LRFCAL_REPORT``      folder that takes ``figures/``, ``tables/`` and ``parts/``; unset outside a report run
-``LRFCAL_NOTEBOOK``    name of the notebook, under which ``parts/`` keeps what it found
-====================== ==========================================================================================
+Nothing is written outside a report run (:mod:`lrfcal_lib.report.report`), which sets ``LRFCAL_SESSION`` (folder of the
+session), ``LRFCAL_REPORT`` (takes ``figures/``, ``tables/`` and ``parts/``) and ``LRFCAL_NOTEBOOK`` (a name in these).
 """
 
 from __future__ import annotations
@@ -19,35 +13,25 @@ import re
 from numbers import Number
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import pandas as pd
+from IPython import get_ipython
+from IPython.display import HTML, display
+
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import escape
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
 SCRATCH = ROOT / "reports" / ".sessions" / "lms400_zed"
 STYLE = {
-    "figure.figsize": (7.0, 3.8),
-    "figure.dpi": 100,
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 150,
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4,
-    "lines.markersize": 4,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "image.interpolation": "nearest",
+    "figure.figsize": (7.0, 3.8), "figure.dpi": 100, "figure.constrained_layout.use": True, "savefig.dpi": 150,
+    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 10, "axes.titleweight": "bold",
+    "axes.titlelocation": "left", "axes.labelsize": 9, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "lines.linewidth": 1.4,
+    "lines.markersize": 4, "legend.frameon": False, "legend.fontsize": 8, "image.interpolation": "nearest",
     "image.cmap": "viridis",
-}
+}  # fmt: skip
 _found = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
@@ -55,50 +39,23 @@ def set_up():
     """Style figures and tables and keep libraries quiet; for a notebook that needs no session."""
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # read by Open3D when it is imported
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # without it Mesa complains on stderr, in some runs only
-    import matplotlib.pyplot as plt
-    import pandas as pd
-
     plt.rcParams.update(STYLE)
     pd.set_option("display.precision", 4, "display.max_rows", 40, "display.width", 120)
-    shell = _shell()
-    if shell is not None:  # the same pixels must give the same bytes: no version of matplotlib in the PNG
+    if get_ipython() is not None:  # the same pixels must give the same bytes: no version of matplotlib in the PNG
         kwargs = {"bbox_inches": None, "metadata": {"Software": None}}
-        shell.run_line_magic("config", f"InlineBackend.print_figure_kwargs = {kwargs}")
+        get_ipython().run_line_magic("config", f"InlineBackend.print_figure_kwargs = {kwargs}")
     for kind in _found.values():
         kind.clear()
 
 
 def start():
-    """First cell of a notebook: :func:`set_up`, then the session.
-
-    Returns
-    -------
-    Session
-
-    Raises
-    ------
-    SessionError
-        If there is no session, or it is not sound.
-    """
+    """First cell of a notebook: :func:`set_up`, then the Session of :func:`session_path`."""
     set_up()
-    from lrfcal_lib.session.read import open_session
-
     return open_session(session_path())
 
 
 def session_path():
-    """Folder of the session to work on.
-
-    Returns
-    -------
-    Path
-        ``LRFCAL_SESSION``, else the shipped session, else the one that ``make report`` imported.
-
-    Raises
-    ------
-    FileNotFoundError
-        If none of them exists.
-    """
+    """Folder to work on: ``LRFCAL_SESSION``, else the shipped session, else the one that ``make report`` imported."""
     stated = os.environ.get("LRFCAL_SESSION")
     if stated:
         return Path(stated)
@@ -109,13 +66,7 @@ def session_path():
 
 
 def report_file(name):
-    """Path of a file of the report, its folder made, or None outside a report run.
-
-    Parameters
-    ----------
-    name : str
-        For instance ``"cloud.ply"``.
-    """
+    """Path of a file of the report (e.g. ``"cloud.ply"``), its folder made; None outside a report run."""
     folder = os.environ.get("LRFCAL_REPORT")
     if not folder:
         return None
@@ -132,30 +83,21 @@ def save(fig, name, caption, *, main=True):
     fig : matplotlib Figure
         Closed afterwards.
     name : str
-        Lower-case letters, digits and underscores.
+        Lower-case letters, digits and underscores; others raise a ValueError.
     caption : str
         One or two sentences; what to see, not what the axes say.
     main : bool
         Whether the first page of the report shows it.
-
-    Raises
-    ------
-    ValueError
-        For a name that is no plain file name.
     """
-    import matplotlib.pyplot as plt
-    from IPython.display import HTML, display
-
-    _check_name(name)
+    _record("figures", name, {"name": name, "caption": caption, "main": main})
     path = report_file(f"figures/{name}.png")
-    _record("figures", {"name": name, "caption": caption, "main": main})
     # drawing gives a figure without layout engine the default one, which would move what was placed by hand
     with plt.rc_context({"figure.constrained_layout.use": False}):
         if path:
             fig.savefig(path, metadata={"Software": None})
-        if _shell() is not None:
+        if get_ipython() is not None:
             display(fig)
-    if _shell() is not None:
+    if get_ipython() is not None:
         display(HTML(f'<p style="color:#555;max-width:48em">{escape(caption)}</p>'))
     plt.close(fig)
 
@@ -168,7 +110,7 @@ def table(df, name, digits=3, caption=""):
     df : DataFrame
         Tidy: one row an observation, units in the column names. Its index is not kept.
     name : str
-        Lower-case letters, digits and underscores.
+        Lower-case letters, digits and underscores; others raise a ValueError.
     digits : int or dict of str to int
         Decimals shown (all columns, or by column; 3 where a column is not named). The CSV keeps nine digits.
     caption : str
@@ -177,33 +119,19 @@ def table(df, name, digits=3, caption=""):
     -------
     IPython.display.HTML
         The same bytes for the same table.
-
-    Raises
-    ------
-    ValueError
-        For a name that is no plain file name.
     """
-    from IPython.display import HTML
-
-    _check_name(name)
+    places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
+    # none shows a minus before a zero
+    shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
+    _record("tables", name, {"name": name, "caption": caption, "formats": shapes})
     path = report_file(f"tables/{name}.csv")
     if path:
         df.to_csv(path, index=False, float_format="%.9g")
-    shapes = formats(df, digits)
-    _record("tables", {"name": name, "caption": caption, "formats": shapes})
     shown = df.reset_index(drop=True)
     for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
         shown[column] = shown[column].map(lambda v: v if v is None or isinstance(v, Number) else escape(v))
     styler = shown.style.format(shapes, na_rep="–").format_index(escape, axis=1).hide(axis="index").set_uuid(name)
-    if caption:
-        styler = styler.set_caption(escape(caption))
-    return HTML(styler.to_html())
-
-
-def formats(df, digits):
-    """Format strings of the columns with floating-point numbers, by column name; none shows a minus before a zero."""
-    places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
-    return {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
+    return HTML((styler.set_caption(escape(caption)) if caption else styler).to_html())
 
 
 def finding(key, value, text, unit="", digits=3, *, main=True):
@@ -212,7 +140,7 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     Parameters
     ----------
     key : str
-        Lower-case letters, digits and underscores; unique over all notebooks.
+        Lower-case letters, digits and underscores (others raise a ValueError); unique over all notebooks.
     value : float, int or str
         A verdict in words, or a number (NaN is said to be unknown).
     text : str
@@ -222,68 +150,34 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
         Decimals.
     main : bool
         Whether the first page shows it.
-
-    Raises
-    ------
-    ValueError
-        For a key of other characters.
     """
-    _check_name(key)
     value = value.item() if hasattr(value, "item") else value
-    number = isinstance(value, float)
-    shown = value if not number else f"{value:z.{digits}f}" if math.isfinite(value) else "unknown"
-    value = value if not number or math.isfinite(value) else None
+    shown = value
+    if isinstance(value, float):
+        shown, value = (f"{value:z.{digits}f}", value) if math.isfinite(value) else ("unknown", None)
     shown = f"{shown} {unit}".strip()
-    entry = {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main}
-    _record("findings", entry)
+    _record("findings", key, {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main})
     print(f"{text}: {shown}")
 
 
 def verdict(title, sentences):
-    """Print sentences, and put them on the first page of the report before anything else.
-
-    Parameters
-    ----------
-    title : str
-    sentences : sequence of str
-        The most important one first.
-    """
+    """Print sentences, the most important one first, and put them on the first page of the report before all else."""
     sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
-    _record("verdicts", {"title": title, "sentences": sentences})
+    _record("verdicts", "verdict", {"title": title, "sentences": sentences})
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
 def asked(possible, why):
-    """Whether a question can be put to a session; prints why not.
-
-    Parameters
-    ----------
-    possible : object
-        False where it cannot.
-    why : str
-        The rest of a sentence: what the session does not have.
-    """
+    """Whether a question can be put to a session; prints why not: what the session does not have."""
     if not possible:
         print(f"not asked: {why}")
     return bool(possible)
 
 
-def _shell():
-    """The running IPython shell, None in plain Python."""
-    try:
-        from IPython import get_ipython
-    except ImportError:
-        return None
-    return get_ipython()
-
-
-def _check_name(name):
+def _record(kind, name, entry):
+    """Keep an entry; the file is written each time, so that a notebook that fails later has told what it found."""
     if not re.fullmatch(r"[a-z0-9_]+", name):
         raise ValueError(f"'{name}' must consist of lower-case letters, digits and underscores: it becomes a file name")
-
-
-def _record(kind, entry):
-    """Keep an entry; the file is written each time, so that a notebook that fails later has told what it found."""
     _found[kind].append(entry)
     path = report_file(f"parts/{os.environ.get('LRFCAL_NOTEBOOK', 'notebook')}.json")
     if path:

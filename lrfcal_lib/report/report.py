@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
@@ -29,7 +29,7 @@ from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 
-NOTEBOOKS = ROOT / "notebooks"
+NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
 OWN_FILES = ("figures", "tables", "parts", "findings.json", "calibration.json", "cloud.ply", "index.html")
 PART = ".report-"  # begins the names of folders in which a report is being written
@@ -46,18 +46,7 @@ SOURCE_OF_SESSIONS = (
 
 @dataclass(frozen=True)
 class Run:
-    """One executed notebook.
-
-    Attributes
-    ----------
-    name : str
-        File name without suffix.
-    title, thesis : str
-        First heading and first paragraph.
-    seconds : float
-    error : str
-        Traceback of the cell that failed, '' if none did.
-    """
+    """One executed notebook: file name without suffix, first heading, first paragraph; `error` is a traceback or ''."""
 
     name: str
     title: str
@@ -74,9 +63,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session_path : path
         Folder of a session.
     out : path, optional
-        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and
-        takes its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that
-        are no report's are kept.
+        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and takes
+        its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that are no
+        report's are kept.
     jobs : int
         Notebooks executed at the same time.
     notebooks : sequence of path, optional
@@ -85,91 +74,59 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     Returns
     -------
     list of Run
-        In the order of the notebooks. A notebook that fails is reported, the others still run.
-
-    Raises
-    ------
-    SessionError
-        If the session is not sound, or the folder of the report cannot be written.
+        In the order of the notebooks. A notebook that fails is reported, the others still run. A SessionError if the
+        session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
     session_path = Path(session_path).resolve()
     session = open_session(session_path)
     out = Path(out or ROOT / "reports" / session_path.name).resolve()
-    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb") if notebooks is None else map(Path, notebooks))
+    paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
         runs = _execute_all(paths, environment, new, jobs)
-        found = _collect(new, [run.name for run in runs])
+        found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
+        found |= {part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")}
+        shutil.rmtree(new / "parts")
+        findings = [{"notebook": run.name, **entry} for run in runs for entry in found[run.name]["findings"]]
+        (new / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
         _write_index(new, session, runs, found, time.monotonic() - begin)
     return runs
 
 
-def execute(path, environment, folder=None):
-    """Execute a notebook in a fresh kernel.
+def execute(path, environment):
+    """Execute a notebook in a fresh kernel with variables on top of this process's own.
 
-    Parameters
-    ----------
-    path : Path
-    environment : dict of str to str
-        Variables for the kernel on top of this process's own.
-    folder : path, optional
-        Where the kernel runs, the notebook's own folder unless given.
-
-    Returns
-    -------
-    notebook : NotebookNode
-        With outputs, up to the cell that failed if one did.
-    error : str
-        Traceback of that cell, or ''.
+    Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback of that cell or ''.
     """
     import nbformat
     from nbclient import NotebookClient
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
-    notebook = nbformat.read(path, as_version=4)
-    place = {"metadata": {"path": str(folder or Path(path).parent)}}
+    notebook, error = nbformat.read(path, as_version=4), ""
+    place = {"metadata": {"path": str(Path(path).parent)}}
     options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
     _CLIENTS.add(client)
     try:
         client.execute(env={**os.environ, **environment})
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
-        return _without_widgets(notebook), _plain(str(problem)) or type(problem).__name__
+        error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__  # no colours of a terminal
     finally:
         _CLIENTS.discard(client)
-    return _without_widgets(notebook), ""
-
-
-def _without_widgets(notebook):
-    """Leave out live widgets: without their kernel they show an error, and pages would load them from elsewhere."""
+    # without their kernel live widgets show an error, and pages would load them from elsewhere
     notebook.metadata.pop("widgets", None)
-    for cell in notebook.cells:
-        for output in cell.get("outputs", []):
-            output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
-    return notebook
+    for output in (output for cell in notebook.cells for output in cell.get("outputs", [])):
+        output.get("data", {}).pop("application/vnd.jupyter.widget-view+json", None)
+    return notebook, error
 
 
 def store(path, session_path, cache=""):
-    """Execute a notebook and store it in place as run from top to bottom.
+    """Execute a notebook and store it in place as run from top to bottom; the traceback of a cell that failed, or ''.
 
-    Parameters
-    ----------
-    path : Path
-    session_path : Path or None
-        What the notebook works on if it asks for a session.
-    cache : str
-        Folder of stages that other notebooks have worked out (see :mod:`lrfcal_lib.session.cache`).
-
-    Returns
-    -------
-    str
-        Traceback of the cell that failed (the file is then left alone), or ''.
-
-    Notes
-    -----
-    Outputs made from a recording that is not simulated are dropped (its pictures may carry no licence), execution
-    counts are kept. Once a simulated session ships with the repository the outputs stay.
+    A notebook that fails is left alone. Outputs made from a recording that is not simulated are dropped (its pictures
+    may carry no licence), execution counts are kept. `cache` is the folder of stages that other notebooks have worked
+    out.
     """
     import nbformat
 
@@ -177,10 +134,10 @@ def store(path, session_path, cache=""):
     notebook, error = execute(path, environment | {CACHE: cache})
     if error:
         return error
-    if _asks_for_session(notebook) and not open_session(session_path).simulated:
-        for cell in notebook.cells:
-            if cell.cell_type == "code":
-                cell.outputs = []
+    codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    if any("notebook.start(" in cell.source for cell in codes) and not open_session(session_path).simulated:
+        for cell in codes:
+            cell.outputs = []
     kernel = {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"}
     notebook.metadata = nbformat.from_dict({"kernelspec": kernel, "language_info": {"name": "python"}})
     nbformat.write(notebook, path)
@@ -188,18 +145,7 @@ def store(path, session_path, cache=""):
 
 
 def default_session():
-    """The session to report on when none is named.
-
-    Returns
-    -------
-    Path
-        The shipped session, else the public recording where a copy of it is at hand, freshly imported.
-
-    Raises
-    ------
-    SessionError
-        That says where to get one.
-    """
+    """The shipped session, else the public recording where a copy is at hand, freshly imported, else a SessionError."""
     if (SHIPPED / "session.json").is_file():
         return SHIPPED
     recordings = Path(os.environ.get("LRFCAL_REAL_DATA") or ROOT.parent / "shared" / "real") / "lms400_zed"
@@ -207,8 +153,7 @@ def default_session():
         raise SessionError(SOURCE_OF_SESSIONS)
     from lrfcal_lib.session.importers import import_lasersetero
 
-    if SCRATCH.exists():
-        shutil.rmtree(SCRATCH)
+    shutil.rmtree(SCRATCH, ignore_errors=True)
     SCRATCH.parent.mkdir(parents=True, exist_ok=True)
     import_lasersetero(recordings, SCRATCH)
     return SCRATCH
@@ -247,8 +192,7 @@ def _stop(number, frame):
 
 
 def _report(session, options):
-    begin = time.monotonic()
-    out = Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
+    begin, out = time.monotonic(), Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, options.jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
@@ -260,16 +204,11 @@ def _report(session, options):
 
 def _store_all(session):
     open_session(session)
-    paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
     with TemporaryDirectory(prefix="lrfcal-") as cache:
-        errors = {path.name: store(path, session.resolve(), cache) for path in paths}
+        errors = {path.name: store(path, session.resolve(), cache) for path in sorted(NOTEBOOKS.glob(NUMBERED))}
     for name, error in errors.items():
         print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
     return 1 if any(errors.values()) else 0
-
-
-def _asks_for_session(notebook):
-    return any("notebook.start(" in cell.source for cell in notebook.cells if cell.cell_type == "code")
 
 
 @contextmanager
@@ -318,69 +257,39 @@ def _execute_all(paths, environment, out, jobs):
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
-        with ExitStack() as stack, tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
-            stack.callback(_end, futures)
-            for future in as_completed(futures):
-                bar.set_postfix_str(futures[future].stem)
-                bar.update()
+        try:
+            with tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
+                for future in as_completed(futures):
+                    bar.set_postfix_str(futures[future].stem)
+                    bar.update()
+        finally:  # end the notebooks that are being executed and leave out the others
+            for future in futures:
+                future.cancel()
+            while not all(future.done() for future in futures):
+                for client in list(_CLIENTS):
+                    with suppress(AttributeError):  # its kernel is just starting
+                        client.km.provisioner.process.kill()
+                time.sleep(0.05)
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _end(futures):
-    """End the notebooks that are being executed and leave out the others."""
-    for future in futures:
-        future.cancel()
-    while not all(future.done() for future in futures):
-        for client in list(_CLIENTS):
-            with suppress(AttributeError):  # its kernel is just starting
-                client.km.provisioner.process.kill()
-        time.sleep(0.05)
-
-
 def _run(path, environment, out):
-    """Execute one notebook and write its HTML."""
-    begin = time.monotonic()
-    notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
-    title, thesis = _headline(notebook, path.stem)
-    (out / f"{path.stem}.html").write_text(_to_html(notebook, title), encoding="utf-8")
-    return Run(path.stem, title, thesis, time.monotonic() - begin, error)
-
-
-def _to_html(notebook, title):
-    """A page of prose, figures and numbers, without the code."""
+    """Execute one notebook and write its page: prose, figures and numbers, without the code."""
     from nbconvert import HTMLExporter
 
-    exporter = HTMLExporter(
-        exclude_input=True, exclude_input_prompt=True, exclude_output_prompt=True, embed_images=True, theme="light"
-    )
-    page, _ = exporter.from_notebook_node(notebook, resources={"metadata": {"name": title}})
-    return re.sub(r"(<body[^>]*>)", r'\1<p style="margin:1em 2em"><a href="index.html">report</a></p>', page, count=1)
-
-
-def _headline(notebook, name):
-    """First heading and first paragraph of a notebook."""
+    begin = time.monotonic()
+    notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
+    # first heading and first paragraph
     text = "\n\n".join(cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown")
     blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
-    title = next((block.lstrip("# ").splitlines()[0] for block in blocks if block.startswith("#")), name)
-    thesis = next((re.sub(r"[*`>]", "", block).strip() for block in blocks if not block.startswith("#")), "")
-    return title, " ".join(thesis.split())
-
-
-def _plain(text):
-    """Text without the colour codes of a terminal."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", text)
-
-
-def _collect(out, names):
-    """What the notebooks found, by notebook; the findings of all go to ``findings.json``."""
-    found = {}
-    for name in names:
-        part = out / "parts" / f"{name}.json"
-        found[name] = json.loads(part.read_text()) if part.is_file() else {"figures": [], "tables": [], "findings": []}
-    shutil.rmtree(out / "parts")
-    findings = [{"notebook": name, **entry} for name in names for entry in found[name]["findings"]]
-    (out / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
-    return found
+    title = next((block.lstrip("# ").splitlines()[0] for block in blocks if block.startswith("#")), path.stem)
+    thesis = next((re.sub(r"[*`>]", "", block) for block in blocks if not block.startswith("#")), "")
+    plain = {"exclude_input": True, "exclude_input_prompt": True, "exclude_output_prompt": True, "embed_images": True}
+    exporter = HTMLExporter(theme="light", **plain)
+    page, _ = exporter.from_notebook_node(notebook, resources={"metadata": {"name": title}})
+    page = re.sub(r"(<body[^>]*>)", r'\1<p style="margin:1em 2em"><a href="index.html">report</a></p>', page, count=1)
+    (out / f"{path.stem}.html").write_text(page, encoding="utf-8")
+    return Run(path.stem, title, " ".join(thesis.split()), time.monotonic() - begin, error)
 
 
 def _write_index(out, session, runs, found, seconds):
@@ -390,18 +299,14 @@ def _write_index(out, session, runs, found, seconds):
         (Path(__file__).parent / "report.html.jinja").read_text(encoding="utf-8")
     )
     page = template.render(
-        session=session,
-        runs=runs,
-        found=found,
-        seconds=seconds,
-        failed=[run for run in runs if run.error],
+        session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
-        verdicts=[entry for run in runs for entry in found[run.name].get("verdicts", [])],
+        verdicts=[entry for run in runs for entry in found[run.name]["verdicts"]],
         thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
         rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
         files=[name for name in ("calibration.json", "cloud.ply", "findings.json") if (out / name).is_file()],
         provenance=_provenance(session),
-    )
+    )  # fmt: skip
     (out / "index.html").write_text(page, encoding="utf-8")
 
 
@@ -412,9 +317,8 @@ def _thumbnail(file):
     picture = cv2.imread(str(file))
     if picture is None:
         return ""
-    scale = THUMBNAIL_WIDTH / picture.shape[1]
-    if scale < 1:
-        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    scale = min(THUMBNAIL_WIDTH / picture.shape[1], 1.0)
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
 
@@ -426,31 +330,19 @@ def _rows(file, shapes):
     if not file.is_file():
         return None
     table = pd.read_csv(file)
-    numeric = [table[c].dtype.kind in "if" for c in table.columns]
-    cells = [
-        ["–" if pd.isna(v) else shapes.get(c, "{}").format(v) for c, v in zip(table.columns, row, strict=True)]
-        for row in table.itertuples(index=False)
-    ]
-    return {"columns": list(table.columns), "numeric": numeric, "cells": cells}
+    shown = {c: ["–" if pd.isna(v) else shapes.get(c, "{}").format(v) for v in table[c]] for c in table}
+    cells = [list(row) for row in zip(*shown.values(), strict=True)]
+    return {"columns": list(shown), "numeric": [table[c].dtype.kind in "if" for c in table], "cells": cells}
 
 
 def _provenance(session):
-    """Pairs of name and value that tell what the report was made from."""
+    """Pairs of name and value that tell what the report was made from; the commit where git knows one."""
     digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
-    pairs = [("session.json (SHA-256)", digest), ("date", date.today().isoformat()), ("commit", _commit())]
+    describe = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
+    except FileNotFoundError:
+        commit = ""
+    pairs = [("session.json (SHA-256)", digest), ("date", date.today().isoformat()), ("commit", commit)]
     pairs += [("Python", platform.python_version())] + [(name, version(name)) for name in PACKAGES]
     return [(name, value) for name, value in pairs if value]
-
-
-def _commit():
-    """Commit of the checkout, marked where files differ from it; '' outside a git repository."""
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except FileNotFoundError:
-        return ""
-    return done.stdout.strip()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

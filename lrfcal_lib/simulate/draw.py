@@ -7,9 +7,11 @@ hundred: sweeps of a whole rig (:func:`observe`), or single shots, one scan line
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
@@ -19,6 +21,7 @@ from lrfcal_lib.model.geometry import polar_to_points, tilt
 CORNERS = np.array([[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7])
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # axes of a camera, or a board, ahead of the LRF
 MARGIN = 6  # beams beyond the board
+REACH = 2  # beams kept on either side of an edge, along and across the scan lines
 CLEAR = 1.3  # spot radii between a crossing and a second edge
 FEWEST_BEAMS = 8
 MOST_ROUNDS = 200
@@ -91,7 +94,7 @@ def board_poses(rng, count, distances=(1.0, 2.5)):
     return poses
 
 
-def observe(bench, poses, rng, *, images=3, span=None, noise=1.0, reach=2):
+def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
     """Draw what the rig records of boards.
 
     Parameters
@@ -107,34 +110,27 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0, reach=2):
         board's middle.
     noise : float
         Scales all errors; 0 gives exact observations (the edges stay quantised by the beams).
-    reach : int
-        Beams kept on either side of an edge, along and across the scan lines.
 
     Returns
     -------
     dict
         Keyword arguments of :class:`lrfcal_lib.model.observations.JointObservations`.
     """
-    parts, out, count = [], {}, len(poses)
-    for pose in poses:
+    parts, middle, count = defaultdict(list), [], len(poses)
+    for number, pose in enumerate(poses):
         pitch, bearings = _grid(bench, pose, span)
-        face, beam = _scan_lines(bench, pose, pitch, bearings, rng, noise, reach)
+        face, beam = _scan_lines(bench, pose, pitch, bearings, rng, noise)
         view = _views(bench, pose, np.linspace(pitch[0], pitch[-1], images + 2)[1:-1], rng, noise)
-        parts.append({"face": face, "beam": beam, "view": view, "middle": float(pitch.mean())})
-    for name in ("face", "beam", "view"):
-        for key in parts[0][name]:
-            out[f"{name}_{key}"] = np.concatenate([part[name][key] for part in parts])
-        out[f"{name}_placement"] = np.repeat(np.arange(count), [len(part[name]["pitch"]) for part in parts])
-    return out | {
-        "placements": np.arange(1, count + 1),
+        for name, group in (("face", face), ("beam", beam), ("view", view)):
+            for key, values in {**group, "placement": np.full(len(group["pitch"]), number)}.items():
+                parts[f"{name}_{key}"].append(values)
+        middle.append(float(pitch.mean()))
+    return {name: np.concatenate(values) for name, values in parts.items()} | {
+        "placements": np.arange(1, count + 1), "middle": np.array(middle),
         "direction": np.where(np.arange(count) % 2, -1, 1) if span != 0 else np.zeros(count, int),
-        "middle": np.array([part["middle"] for part in parts]),
-        "edges": bench.board.edges,
-        "corners": np.asarray(bench.board.corners, float),
-        "cameras": tuple(bench.cameras),
-        "mounts": (bench.mount,) * len(bench.cameras),
-        "T_head_lrf": None,
-    }
+        "edges": bench.board.edges, "corners": np.asarray(bench.board.corners, float),
+        "cameras": tuple(bench.cameras), "mounts": (bench.mount,) * len(bench.cameras), "T_head_lrf": None,
+    }  # fmt: skip
 
 
 def _grid(bench, pose, span):
@@ -150,7 +146,7 @@ def _grid(bench, pose, span):
     return pitch, bench.step * np.arange(first - MARGIN, last + MARGIN + 1)
 
 
-def _scan_lines(bench, pose, pitch, bearings, rng, noise, reach):
+def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     """Readings of the face, and the beams within reach of where readings change between board and background."""
     true, R, head = pitch[:, None] * (1 + bench.stretch), pose.rotation.as_matrix(), bench.T_head_lrf
     rays = tilt(head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings)), true) @ R
@@ -160,16 +156,12 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise, reach):
     u, edge = distances.max(axis=-1), distances.argmax(axis=-1)
     jitter = noise * np.hypot(bench.softness * radius, bench.floor * bench.step * r) * rng.standard_normal(r.shape)
     hit = (u + jitter < bench.bias * radius) & sensible
-    near = np.zeros((2, *hit.shape), bool)  # to an edge across the scan lines, and along them
-    for axis in (0, 1):
-        at = np.nonzero(np.diff(hit, axis=axis))
-        for k in range(-reach + 1, reach + 1):
-            index = list(at)
-            index[axis] = np.clip(index[axis] + k, 0, hit.shape[axis] - 1)
-            near[(axis, *index)] = True
+    # near to an edge across the scan lines, and along them
+    changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
+    across, along = (maximum_filter1d(c, 2 * REACH, axis, mode="constant") for axis, c in enumerate(changes))
     alone = np.sort(distances, axis=-1)[..., -2] <= -2 * radius  # elsewhere two edges cut the spot
-    row, b = np.nonzero(near.any(axis=0) & alone & sensible)
-    step = np.where(near[1][row, b], bench.step, bench.pitch_step)
+    row, b = np.nonzero((across | along) & alone & sensible)
+    step = np.where(along[row, b], bench.step, bench.pitch_step)
     line, beam = np.nonzero(hit)
     face = {
         "range": r[line, beam] + bench.range_offset + noise * bench.sigma_range * rng.standard_normal(len(line)),

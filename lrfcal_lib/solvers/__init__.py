@@ -10,22 +10,7 @@ from scipy.stats import chi2
 
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
-from lrfcal_lib.solvers.lines import (
-    distance_block,
-    estimate_likely_pose,
-    estimate_pose,
-    interval_block,
-    point_block,
-    start_from_lines,
-    start_from_scene,
-)
-from lrfcal_lib.solvers.planes import (
-    estimate_from_planes,
-    estimate_with_intrinsics,
-    plane_block,
-    planes_and_pattern,
-    start_from_planes,
-)
+from lrfcal_lib.solvers import lines, planes
 
 
 @dataclass(frozen=True)
@@ -44,12 +29,12 @@ class Method:
         For tables and figures.
     residual : callable
         ``residual(pose, obs) -> Block``: its residuals, two or more, at ``T_camera_source`` (..., 3, 4).
+    estimate : callable
+        What is done with the residual; least squares in the pose by default.
     options : dict
         Settings of its own, e.g. ``{"weighted": False}``: every residual counts the same.
     along : bool
         Without the edges found across the scan lines.
-    estimate : callable
-        What is done with the residual; least squares in the pose by default.
     """
 
     variant: str
@@ -57,27 +42,31 @@ class Method:
     fewest: int
     label: str
     residual: Callable
+    estimate: Callable = lines.estimate_pose
     options: dict = field(default_factory=dict)
     along: bool = False
-    estimate: Callable = estimate_pose
 
 
 PLAIN = {"weighted": False}  # as published: every residual counts the same
 METHODS = {
-    "line_last_beam": Method("last_beam", "crossing", 6, "lines, last beam (the paper)", line_block, PLAIN, along=True),
-    "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
-    "line_ml": Method("half_step", "crossing", 7, "lines, likelihood", interval_block, estimate=estimate_likely_pose),
-    "zhang_pless": Method("half_step", "plane", 3, "Zhang-Pless", plane_block, estimate=estimate_from_planes),
-    "zhang_pless_joint": Method(
-        "half_step", "plane", 3, "Zhang-Pless with intrinsics", planes_and_pattern, estimate=estimate_with_intrinsics
+    "line_last_beam": Method(
+        "last_beam", "crossing", 6, "lines, last beam (the paper)", line_block, options=PLAIN, along=True
     ),
-    "wasielewski_strauss": Method("half_step", "crossing", 6, "Wasielewski-Strauss", distance_block, PLAIN),
-    "bauermann": Method("half_step", "scene", 3, "Bauermann", point_block),
+    "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
+    "line_ml": Method("half_step", "crossing", 7, "lines, likelihood", lines.interval_block, lines.estimate_likely),
+    "zhang_pless": Method("half_step", "plane", 3, "Zhang-Pless", planes.plane_block, planes.estimate_from_planes),
+    "zhang_pless_joint": Method(
+        "half_step", "plane", 3, "Zhang-Pless with intrinsics", planes.planes_and_pattern, planes.estimate_with_lens
+    ),
+    "wasielewski_strauss": Method(
+        "half_step", "crossing", 6, "Wasielewski-Strauss", lines.distance_block, options=PLAIN
+    ),
+    "bauermann": Method("half_step", "scene", 3, "Bauermann", lines.point_block),
 }
 STARTS = {
-    "crossing": (start_from_planes, start_from_lines, start_from_scene),
-    "plane": (start_from_planes,),
-    "scene": (start_from_scene, start_from_planes, start_from_lines),
+    "crossing": (planes.start_from_planes, lines.start_from_lines, lines.start_from_scene),
+    "plane": (planes.start_from_planes,),
+    "scene": (lines.start_from_scene, planes.start_from_planes, lines.start_from_lines),
 }
 
 
@@ -133,7 +122,7 @@ def solve_camera(observations, method="line", T0=None, *, required=True, **optio
     anyway = row.uses == "plane" and not required
     obs.require(row.uses, 1 if anyway else row.fewest)
     if T0 is None:
-        T0 = start_from_planes(obs, required=False) if anyway else starting_transform(obs, row.uses)
+        T0 = planes.start_from_planes(obs, required=False) if anyway else starting_transform(obs, row.uses)
     pose = pose_array(T0)
     trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
     options = {"method": method, "uses": row.uses, "required": required} | row.options | options
@@ -144,15 +133,8 @@ def solve_camera(observations, method="line", T0=None, *, required=True, **optio
 class PlacementReport:
     """How well each placement agrees with a robust estimate.
 
-    Attributes
-    ----------
-    placements : ndarray of int, shape (p,)
-    rms : ndarray, shape (p,)
-        Root mean square residual of the placement: metres from the plane, or pixels from the lines.
-    limit : ndarray, shape (p,)
-        What is still accepted.
-    outlying, inliers : tuple of int
-        Placements above and below their limit.
+    `rms` (p,) are metres from the plane or pixels from the lines, `limit` (p,) what is still accepted; `outlying` and
+    `inliers` are the placements above and below it.
     """
 
     placements: np.ndarray

@@ -64,22 +64,10 @@ def point_block(pose, obs):
 
 
 def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
-    """The pose of a camera by least squares, from a residual that depends on nothing else.
+    """The pose (..., 3, 4) of a camera by least squares, from ``residual(pose, obs) -> Block``.
 
-    Parameters
-    ----------
-    residual : callable
-        ``residual(pose, obs) -> Block``.
-    obs : CameraObservations
-    pose : ndarray, shape (..., 3, 4)
-        Start value.
-    method, uses : str
-        Name of the method, and the kind of observations that `residual` has rows of.
-    weighted : bool
-        False: every residual counts the same, the mean of their propagated variances.
-    required : bool
-    **options
-        ``loss``, ``scale`` and ``max_iterations`` of :func:`lrfcal_lib.fit.least_squares.minimise`.
+    `uses` is the kind of observations that the residual has rows of. Without weights every residual counts the same:
+    the mean of their propagated variances.
     """
 
     def evaluate(pose):
@@ -186,26 +174,22 @@ def move_biased(state, step):
 def freeze_intervals(state, obs, sight, lengths, softness):
     """Half widths of the intervals across the planes of sight and standard deviations of where readings flip, metres.
 
-    Where `softness` (in spot radii) is a grid, that which makes the intervals most likely.
+    Of some values of the softness (spot radii) that is taken which makes the intervals most likely.
     """
     pose = state[..., :4]
-    z = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
+    depth = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
     half = np.abs(np.sum(sight * rotate_points(pose, obs.crossing_half_step), axis=-1))
     half = np.maximum(half, 0.02 * np.linalg.norm(obs.crossing_half_step, axis=-1))
-    variance = np.sum(moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
-    variance = variance + (obs.crossing_line_sigma * z / lengths) ** 2
-    margin, cost, softness = interval_margins(state, obs, sight)[0], [], np.atleast_1d(softness)
-
-    def sigma(softness):
-        return np.sqrt(np.maximum(softness * obs.crossing_radius, 2 * LEAST_STEP * half) ** 2 + variance)
-
-    for value in softness if len(softness) > 1 else ():
-        cost.append(np.sum(interval_terms(margin + half, margin - half, sigma(value))[0], axis=-1))
-    best = softness[np.argmin(np.stack(cost), axis=0)] if cost else softness[0]
-    return half, sigma(np.asarray(best)[..., None])
+    noise = np.sum(moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
+    margin = interval_margins(state, obs, sight)[0]
+    soft = np.reshape(softness, (-1,) + (1,) * margin.ndim) * obs.crossing_radius
+    variance = np.maximum(soft, 2 * LEAST_STEP * half) ** 2 + noise + (obs.crossing_line_sigma * depth / lengths) ** 2
+    cost = np.sum(interval_terms(margin + half, margin - half, np.sqrt(variance))[0], axis=-1)
+    best = np.argmin(cost, axis=0)[None, ..., None]
+    return half, np.sqrt(np.take_along_axis(variance, best, axis=0)[0])
 
 
-def estimate_likely_pose(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
+def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
     """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges lie.
 
     `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is

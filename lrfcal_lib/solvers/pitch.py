@@ -64,20 +64,11 @@ class SweepPoints:
 
 @dataclass(frozen=True)
 class PitchData:
-    """All observations by placement, padded.
+    """All observations by placement, padded to (p, n).
 
-    Attributes
-    ----------
-    placements, direction : ndarray of int, shape (p,)
-    middle : ndarray, shape (p,)
-    faces : dict of ndarray, shape (p, n, ...)
-        ``points`` (platform frame, at the recorded pitch), ``pitch``, ``used``, and ``weight``: root of a point's share
-        in the mean square of its placement's face, or of its edge.
-    edges : list of dict of ndarray
-        The same for the crossings of each camera; ``sight`` are unit normals of the planes of sight.
-    boards : ndarray, shape (c, p, 3, 4)
-        ``T_camera_board``.
-    cameras : tuple of str
+    `faces` holds ``points`` (platform frame, at the recorded pitch), ``pitch``, ``used``, and ``weight``: root of a
+    point's share in the mean square of its placement's face, or of its edge. `edges` the same of each camera's
+    crossings, and ``sight``, unit normals of the planes of sight. `boards` (c, p, 3, 4) are ``T_camera_board``.
     """
 
     placements: np.ndarray
@@ -209,15 +200,10 @@ def move_pitch_state(state, step, name):
 
 
 def misfit(data, state):
-    """What the models are compared by.
+    """What the models are compared by, and rms distances of face points and of crossings by camera, metres.
 
-    Returns
-    -------
-    total : float
-        Sum over the placements of the mean square distance of the fitted scan plane from the camera's plane, and over
-        their edges of the mean square distance of the crossings from the planes of sight, m^2; mean over the cameras.
-    rms, edge_rms : dict of str to float
-        Of the point-plane distances and of the crossings' distances, metres (nan without edges).
+    Sum over the placements of the mean square distance of the fitted scan plane from the camera's plane, and over
+    their edges of the mean square distance of the crossings from the planes of sight, m^2; mean over the cameras.
     """
     q, _ = corrected_points(data.faces, data, state)
     used = data.faces["used"]
@@ -244,20 +230,15 @@ class PitchModel:
     name : str
         'none', 'direction' (+offset for sweeps with direction +1, -offset for -1), 'sweep' (an offset each), or
         'sweep_stretch' (an offset and a stretch about the middle each).
-    offset, offset_sigma : ndarray, shape (p,)
-        Radians to *add* to the recorded pitch of each placement.
-    stretch : ndarray, shape (p,)
-        Relative; the corrected pitch is ``pitch + offset + stretch (pitch - middle)``.
+    offset, offset_sigma, stretch : ndarray, shape (p,)
+        Radians to *add* to the recorded pitch of each placement, and relative: the corrected pitch is
+        ``pitch + offset + stretch (pitch - middle)``.
     transforms : dict of str to RigidTransform
         ``T_camera_platform``.
-    misfit : float
-        See :func:`misfit`, m^2.
-    rms, edge_rms : dict of str to float
-        Of all point-plane distances, and of the crossings' distances from the planes of sight, metres; nan without.
-    n_parameters, n_numbers : int
+    misfit, rms, edge_rms
+        Of :func:`misfit`.
     F, p_value : float
         Test against the model before (nan for the first): would the misfit fall so much by chance?
-    converged : bool
     """
 
     name: str

@@ -28,20 +28,9 @@ from lrfcal_lib.model.geometry import (
 
 @dataclass(frozen=True)
 class PlaneSets:
-    """Face points by placement, padded to the same number.
+    """Face points (..., p, n, 3) by placement, padded with zeros to the same number, source frame, metres.
 
-    Attributes
-    ----------
-    placements : ndarray of int, shape (p,)
-    points : ndarray, shape (..., p, n, 3)
-        Source frame, metres; padded rows are zero.
-    covariance : ndarray, shape (..., p, n, 3, 3)
-    used : ndarray of bool, shape (p, n)
-    boards : ndarray, shape (..., p, 3, 4)
-        ``T_camera_board``.
-    board_covariance : ndarray, shape (..., p, 6, 6)
-    rows : ndarray of int, shape (p,)
-        Of the placements among those of the observations.
+    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the observations' own.
     """
 
     placements: np.ndarray
@@ -86,24 +75,12 @@ def _seen_from(sets, pose):
 
 
 def correct_and_compress(sets, pose):
-    """Compress points that were moved onto the camera's planes by their noise, with what that leaves as residuals.
+    """Compress points that were moved onto the camera's planes, as seen at a pose, by their noise.
 
     A point's noise is in its residual and in its row of the Jacobian alike; rows of the moved points are free of the
-    bias (see :mod:`lrfcal_lib.fit.least_squares`).
-
-    Parameters
-    ----------
-    sets : PlaneSets
-    pose : ndarray, shape (..., 3, 4)
-        Where the points are moved to; to be renewed when the pose has changed.
-
-    Returns
-    -------
-    triangles : ndarray, shape (..., p, 4, 4)
-    offset : ndarray, shape (..., p, 4)
-        Residuals are ``A h + offset``; at `pose` they are what the moved rows see of the raw distances.
-    rest : ndarray, shape (...)
-        Chi-square of the raw distances that they do not see.
+    bias (see :mod:`lrfcal_lib.fit.least_squares`). Returns triangles (..., p, 4, 4), an offset (..., p, 4) and a rest:
+    residuals are ``A h + offset``, at the pose what the moved rows see of the raw distances; the rest is the chi-square
+    of what they do not see.
     """
     across, last, pull, variance = _seen_from(sets, pose)
     distance, weights = np.sum(sets.points * across[..., None, :], axis=-1) + last, sets.used / np.sqrt(variance)
@@ -122,25 +99,10 @@ def equal_weights(sets, pose):
 
 
 def plane_block(pose, triangles, boards, whitener=None, count=None, offset=0.0):
-    """Distances of compressed points from the planes of boards with known poses.
+    """Distances of compressed points from the planes of boards with known poses, 4 p residuals.
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3, 4)
-        ``T_camera_source``.
-    triangles : ndarray, shape (..., p, 4, 4)
-    boards : ndarray, shape (..., p, 3, 4)
-    whitener : ndarray, shape (..., p, 4, 4), optional
-        From :func:`board_whitener`; none when the boards' poses count as exact.
-    count : ndarray, shape (p,), optional
-        Number of points of each placement, for losses on raw triangles.
-    offset : ndarray, shape (..., p, 4), optional
-        See :func:`correct_and_compress`.
-
-    Returns
-    -------
-    Block
-        ``4 p`` residuals in standard deviations; a loss judges a placement as a whole.
+    The whitener is that of :func:`board_whitener`, none when the boards' poses count as exact; `count` (p,) is the
+    number of points of each placement, for losses on raw triangles. A loss judges a placement as a whole.
     """
     residuals, by_pose, _ = plane_terms(pose[..., None, :, :], triangles, boards, offset)
     shape = residuals.shape[:-2] + (-1,)
@@ -225,19 +187,10 @@ def start_from_planes(obs, required=True):
 
 
 def common_plane(triangles):
-    """The plane that all points of a recording lie in, and whether they do.
+    """The plane that all compressed points of a recording lie in, and whether they do.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (p, 4, 4)
-        From :func:`compress`.
-
-    Returns
-    -------
-    frame : ndarray, shape (4, 4)
-        Turns rows ``[p, 1]`` into rows of a frame whose plane z = 0 it is:
-    flat : bool
-        True for single scan lines in one plane of the LRF: how far noise scatters them within it tells nothing.
+    The first, (4, 4), turns rows ``[p, 1]`` into rows of a frame whose plane z = 0 it is. They do for single scan lines
+    in one plane of the LRF: how far noise scatters them within it tells nothing.
     """
     root, centre = _centred(triangles.reshape(1, -1, 4))
     _, spread, axes = np.linalg.svd(root[0])
@@ -255,22 +208,10 @@ def _centred(triangles):
 
 
 def closed_form(triangles, boards, solid):
-    """The linear solution of Zhang and Pless for stacks of placements.
+    """The linear solution of Zhang and Pless, ``T_camera_source`` (..., 3, 4), for stacks of placements.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (..., p, 4, 4)
-        Compressed scan points of each placement.
-    boards : ndarray, shape (..., p, 3, 4)
-        ``T_camera_board``.
-    solid : bool
-        True: the points of a placement span a plane, the rotation comes from the planes' normals (p >= 3). False:
-        points of single scan lines (z = 0), nine linear unknowns (p >= 5).
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 4)
-        ``T_camera_source``.
+    `solid`: the points of a placement span a plane, the rotation comes from the planes' normals (p >= 3). Otherwise
+    points of single scan lines (z = 0), nine linear unknowns (p >= 5).
     """
     normal = boards[..., 2]
     offset = np.sum(normal * boards[..., 3], axis=-1)
@@ -416,7 +357,7 @@ def planes_and_pattern(state, planes, obs):
     return [distances, Block(errors.reshape(p, -1), jacobian.reshape(p, sigma.shape[1], 21), sigma)]
 
 
-def estimate_with_intrinsics(residual, obs, pose, *, method, uses, required=True, **options):
+def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, **options):
     """Pose, intrinsics and board poses together: pattern reprojection plus point-plane distances.
 
     The start is the estimate from planes with the board poses and the model that the observations hold. An error that

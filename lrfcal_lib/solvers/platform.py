@@ -69,16 +69,9 @@ class PlatformObservations:
 class PlatformSolution:
     """The estimated tilt axis.
 
-    Attributes
-    ----------
-    solution : Solution
-        Of the least squares problem; its four unknowns are ``(w_y, w_z, v_y, v_z)`` of T_head_lrf.
-    placements : ndarray of int, shape (p,)
-        Placements used.
-    skew, gap : ndarray, shape (p,)
-        Deviation of the two edges from a right angle (radians), and their distance (metres), at the solution.
-    skipped : dict of int to str
-        Placements left out, with the reason.
+    `solution` has the four unknowns ``(w_y, w_z, v_y, v_z)`` of T_head_lrf; `skew` and `gap` are the deviation of the
+    two edges from a right angle (radians) and their distance (metres) at each placement used; `skipped` names the
+    others with the reason.
     """
 
     solution: Solution
@@ -302,27 +295,11 @@ def move_platform(state, step):
 
 
 def solve_projected(obs, T0=None, *, required=True):
-    """The tilt axis by the paper's projected line fits.
+    """The tilt axis by the paper's projected line fits; for parameters and errors see :func:`solve_platform`.
 
-    Parameters
-    ----------
-    obs : PlatformObservations
-        Its edge points are used, without their covariance.
-    T0 : RigidTransform, optional
-        Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
-    required : bool
-        False: report unobservable motions instead of raising.
-
-    Returns
-    -------
-    PlatformSolution
-        `skipped` names the placements with an edge parallel to a coordinate plane: their projected fits would divide by
-        zero. The covariance comes from the scatter of the residuals.
-
-    Raises
-    ------
-    DegenerateGeometry
-        When no placement is left, or when the data leave a motion of the axis open.
+    Of the observations the edge points are used, without their covariance; that of the result comes from the scatter of
+    the residuals. Placements with an edge parallel to a coordinate plane are skipped: their projected fits would divide
+    by zero.
 
     Notes
     -----
