@@ -1,13 +1,31 @@
 """Draws of a whole rig with known truth, for the tests of the joint estimate."""
 
 import numpy as np
+import pytest
 
-from lrfcal_lib.evaluate.monte_carlo import joint_truth
+from lrfcal_lib.evaluate.monte_carlo import joint_truth, state_errors
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import bench, board_poses, observe
 
 OFFSET = 0.005
 COARSE = np.radians(1.0)
+MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
+
+
+def rng(seed=3):
+    return np.random.default_rng(seed)
+
+
+def scores(found, truth):
+    """Errors of an estimate in its own standard deviations."""
+    return state_errors(found.state, truth, found.unknowns) / found.solution.sigma
+
+
+def square_per_number(found, truth):
+    """Normalised squared error of axis and cameras: 1 on the average where the covariance tells the truth."""
+    count = 4 + 6 * len(found.transforms)
+    error, k = state_errors(found.state, truth, found.unknowns)[:count], found.solution.covariance[:count, :count]
+    return error @ np.linalg.solve(k, error) / count
 
 
 def draw(rng, count=10, *, cameras=("left", "right"), seen=None, distances=(1.0, 2.5), lean=None, **settings):

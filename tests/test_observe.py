@@ -4,22 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_draws import draw
+from joint_draws import MOUNTS, draw, rng
 
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, named_blocks
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, pose_transform
 
-MOUNTS = pytest.mark.parametrize("mount", ["head", "platform"])
-
-
-def rng(seed=0):
-    return np.random.default_rng(seed)
-
 
 @MOUNTS
 def test_exact_observations_leave_no_residual(mount):
-    obs, truth, _ = draw(rng(), 6, mount=mount, see_noise=0.0, stretch=0.02)
+    obs, truth, _ = draw(rng(0), 6, mount=mount, see_noise=0.0, stretch=0.02)
     blocks = named_blocks(truth, gather(obs), Unknowns(2, 3))
     assert np.abs(whiten(blocks["face"], False)[0]).max() < 1e-9
     assert np.abs(whiten(blocks["view"], False)[0]).max() < 1e-6
@@ -28,7 +22,7 @@ def test_exact_observations_leave_no_residual(mount):
 @MOUNTS
 def test_noise_is_what_is_stated(mount):
     """Whitened residuals at the truth have unit variance: ranges within 3 %, views within 10 %."""
-    obs, truth, _ = draw(rng(), 40, mount=mount)
+    obs, truth, _ = draw(rng(0), 40, mount=mount)
     data = gather(obs)
     blocks = named_blocks(truth, data, Unknowns(2, 3))
     face = whiten(blocks["face"], False)[0][data.face["used"]]
@@ -40,7 +34,7 @@ def test_noise_is_what_is_stated(mount):
 @pytest.mark.parametrize("bias", [-0.5, 0.0, 0.5])
 def test_beams_flip_where_the_bias_says(bias):
     """Read beams lie inside the shifted edge, missed ones outside, but for the softness."""
-    obs, truth, rig = draw(rng(), 10, bias=bias, softness=0.05)
+    obs, truth, rig = draw(rng(0), 10, bias=bias, softness=0.05)
     data = gather(obs)
     chance = {
         hit: np.exp(-named_blocks(truth, replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)}),
@@ -56,7 +50,7 @@ def test_beams_flip_where_the_bias_says(bias):
 
 
 def test_faces_lie_on_the_board():
-    obs, truth, rig = draw(rng(), 5, see_noise=0.0)
+    obs, truth, rig = draw(rng(0), 5, see_noise=0.0)
     p_lrf = polar_to_points(obs.face_range - rig.range_offset, obs.face_bearing)
     p = lrf_to_platform(p_lrf, obs.face_pitch, rig.T_head_lrf)
     assert len(np.unique(obs.face_placement)) == 5
@@ -69,14 +63,14 @@ def test_faces_lie_on_the_board():
 
 
 def test_single_shots_and_images():
-    obs, *_ = draw(rng(), 4, see_span=0.0, see_images=1)
+    obs, *_ = draw(rng(0), 4, see_span=0.0, see_images=1)
     assert set(obs.direction) == {0} and len(obs.view_pitch) == 8
     for p in range(4):
         mine = obs.face_placement == p
         assert len(np.unique(obs.face_pitch[mine])) == 1
         assert np.allclose(obs.view_pitch[obs.view_placement == p], obs.face_pitch[mine][0])
-    assert draw(rng(), 3, see_images=0)[0].view_pose.shape == (0, 4, 4)
-    assert set(draw(rng(), 3)[0].direction) == {-1, 1}
+    assert draw(rng(0), 3, see_images=0)[0].view_pose.shape == (0, 4, 4)
+    assert set(draw(rng(0), 3)[0].direction) == {-1, 1}
 
 
 def test_one_seed_gives_one_draw():

@@ -307,7 +307,12 @@ def observe_joint(prepared, views=None):
         corners = corners_of_lines(side_lines(board.pattern, np.full(4, board.pattern.square)))
     else:
         corners = board.known_corners()
-    spreads = [prepared.models[camera].covariance for camera in views]
+    ranges, spreads = [], [prepared.models[camera].covariance for camera in views]
+    for row, scan in enumerate(scans.values()):
+        p, pitch, _ = face_points(scan, FACE_POINTS)
+        polar = {"range": np.linalg.norm(p, axis=1), "bearing": np.arctan2(p[:, 1], p[:, 0]), "pitch": pitch}
+        n = len(pitch)
+        ranges.append(polar | {"sigma": np.full(n, scan.sigma_range), "placement": np.full(n, row)})
     return JointObservations(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),
@@ -318,18 +323,10 @@ def observe_joint(prepared, views=None):
         mounts=tuple(session.cameras[c].mount for c in views),
         T_head_lrf=session.T_head_lrf,
         lens_covariance=np.array([np.zeros((9, 9)) if C is None else C for C in spreads]) if views else None,
-        **stack("face_", map(_ranges, scans.values(), range(len(scans))), RANGES),
+        **stack("face_", ranges, RANGES),
         **stack("beam_", _beams(prepared, scans), BEAMS),
         **stack("view_", _views(prepared, views, list(scans)), VIEWS),
     )
-
-
-def _ranges(scan, row):
-    points, pitch, _ = face_points(scan, FACE_POINTS)
-    return {
-        "range": np.linalg.norm(points, axis=1), "bearing": np.arctan2(points[:, 1], points[:, 0]), "pitch": pitch,
-        "sigma": np.full(len(pitch), scan.sigma_range), "placement": np.full(len(pitch), row),
-    }  # fmt: skip
 
 
 def _beams(prepared, placements):

@@ -78,20 +78,13 @@ def color_points(points, image, T_camera_source, model):
     uv = project(p_camera, model)
     seen = visible(uv, np.linalg.norm(p_camera, axis=1), model.width, model.height)
     colors = np.full((len(points), 3), np.nan)
-    colors[seen] = _sample(image, uv[seen])[:, ::-1]
+    if seen.any():
+        maps = np.zeros((-(-seen.sum() // 4096) * 4096, 2), np.float32)  # remap wants maps narrower than 32768
+        maps[: seen.sum()] = uv[seen]
+        u, v = np.ascontiguousarray(maps.reshape(-1, 4096, 2).transpose(2, 0, 1))
+        bgr = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, 3)
+        colors[seen] = bgr[: seen.sum(), ::-1]
     return colors, uv
-
-
-def _sample(image, uv):
-    """Bilinear pixel values at sub-pixel positions, shape (n, channels)."""
-    rows = -(-len(uv) // 4096)  # remap wants maps narrower than 32768
-    maps = np.zeros((rows * 4096, 2), np.float32)
-    maps[: len(uv)] = uv
-    u, v = np.ascontiguousarray(np.moveaxis(maps.reshape(rows, 4096, 2), 2, 0))
-    if rows == 0:
-        return np.zeros((0, image.shape[2]))
-    out = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(rows * 4096, -1)[: len(uv)].astype(float)
 
 
 def blend(colors):
