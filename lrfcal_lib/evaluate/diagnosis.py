@@ -37,12 +37,9 @@ def diagnose(prepared, pitch_errors=None):
 
     `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
     """
-    steadiness = {
-        camera: camera_steadiness(prepared.session, camera, views, prepared.models[camera])
-        for camera, views in prepared.views.items()
-    }
-    bends = board_bends(prepared, board_maps(prepared))
-    return Diagnosis(steadiness, bends, pitch_errors, dict(prepared.problems))
+    session, models = prepared.session, prepared.models
+    steadiness = {c: camera_steadiness(session, c, views, models[c]) for c, views in prepared.views.items()}
+    return Diagnosis(steadiness, board_bends(prepared, board_maps(prepared)), pitch_errors, dict(prepared.problems))
 
 
 def board_maps(prepared):

@@ -153,10 +153,8 @@ def bound(obs, truth, unknowns):
     DegenerateGeometry when the data leave a direction of the shared unknowns open.
     """
     data = gather(obs)
-    read, missed = (
-        named_blocks(truth, replace(data, beam=data.beam | {"hit": np.full_like(data.beam["hit"], hit)}), unknowns)
-        for hit in (True, False)
-    )
+    hits = ({"hit": np.full_like(data.beam["hit"], hit)} for hit in (True, False))
+    read, missed = (named_blocks(truth, replace(data, beam=data.beam | hit), unknowns) for hit in hits)
     hessian = 0.0
     for name, block in read.items():
         J = whiten(block)[1]
@@ -205,10 +203,7 @@ def consistency(trials):
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
     groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
-    rows = [
-        {"group": words, "unit": unit} | _judge(trials, index, factor)
-        for words, (index, unit, factor) in groups.items()
-    ]
+    rows = [{"group": words, "unit": unit} | _judge(trials, i, factor) for words, (i, unit, factor) in groups.items()]
     return pd.DataFrame(rows).assign(trials=count, failed=len(trials.failed))
 
 

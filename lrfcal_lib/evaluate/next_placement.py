@@ -417,9 +417,8 @@ class Suggestion:
 
     def sentence(self):
         """What to record next and what it brings."""
-        known = [
-            f"{name} {brief(1000 * self.before[name])} to {brief(1000 * self.after[name])} mm" for name in self.before
-        ]
+        pairs = ((name, brief(1000 * sigma), brief(1000 * self.after[name])) for name, sigma in self.before.items())
+        known = [f"{name} {before} to {after} mm" for name, before, after in pairs]
         return (
             f"Record next: {self.words()}. Predicted standard deviations at 2 m: {', '.join(known)} "
             f"({100 * self.gain:.0f} % less; a blindly chosen placement: {100 * self.median_gain:.0f} %)."

@@ -1,8 +1,6 @@
 """How well a calibrated rig knows where a beam ends: in the cloud, and in the pixels of its images.
 
-A beam at (bearing, pitch, range) is carried through the calibration to the frame of the image, and the covariance of
-every link goes with it. What counts is relative to the head at the pitch of the image: a motion of the whole cloud
-harms nobody, so a point measured at that very pitch does not depend on the tilt axis at all.
+What counts is relative to the head at the pitch of the image: a point measured at that pitch owes nothing to the axis.
 """
 
 from __future__ import annotations

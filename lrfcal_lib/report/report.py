@@ -295,10 +295,8 @@ def _run(path, environment, out):
 def _write_index(out, session, runs, found, seconds):
     from jinja2 import Environment
 
-    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
-        (Path(__file__).parent / "report.html.jinja").read_text(encoding="utf-8")
-    )
-    page = template.render(
+    source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source).render(
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
         verdicts=[entry for run in runs for entry in found[run.name]["verdicts"]],
