@@ -12,15 +12,25 @@ import time
 
 from lrfcal_lib.drivers.port import PortError, open_port, set_rate
 
+MOMENT_S = 1e-3
 LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
 
 
 class Host:
     """This machine; names and meanings are those of `time` and `threading`."""
 
-    now, time, sleep = staticmethod(time.monotonic), staticmethod(time.time), staticmethod(time.sleep)
+    now, time = staticmethod(time.monotonic), staticmethod(time.time)
     event, lock = threading.Event, staticmethod(threading.RLock)
     port, set_rate = staticmethod(open_port), staticmethod(set_rate)
+
+    @staticmethod
+    def sleep(seconds):
+        """Wait; moments are spent awake, since a busy machine gives the processor back late to those who sleep."""
+        end = time.monotonic() + seconds
+        if seconds > MOMENT_S:
+            time.sleep(seconds)
+        while time.monotonic() < end:
+            pass
 
     @staticmethod
     def thread(target, name):
