@@ -42,19 +42,7 @@ class Task:
 
 
 def next_task(recording, advice=""):
-    """What to record next.
-
-    Parameters
-    ----------
-    recording : Recording
-    advice : str
-        Where to put the board, as far as that was computed.
-
-    Returns
-    -------
-    Task or None
-        None where the plan is done.
-    """
+    """The Task that is next in a recording, None where the plan is done; `advice` says where to put the board."""
     plan, finished = recording.rig.stated.plan, recording.finished
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"

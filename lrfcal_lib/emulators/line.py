@@ -136,16 +136,10 @@ class Faults:
         self._lock, self._times, self._until = threading.Lock(), Counter(), {}
 
     def inject(self, name, count=1, *, seconds=None):
-        """Arm a fault.
+        """Arm a fault of `FAULTS` for so many opportunities (replies, requests, ...) from now on.
 
-        Parameters
-        ----------
-        name : str
-            Key of `FAULTS`; ValueError for one that this device does not know.
-        count : int
-            It happens at that many opportunities (replies, requests, ...) from now on.
-        seconds : float, optional
-            At every opportunity for so long instead; for 'unplug' how long the port is away.
+        With `seconds` at every opportunity for so long instead; for 'unplug' how long the port is away. ValueError for
+        a fault that this device does not know.
         """
         if name not in FAULTS or self.device not in FAULTS[name].devices:
             known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
@@ -233,8 +227,6 @@ class SerialDevice:
     faults : Faults
     counts : dict
         Bytes 'received', 'sent', 'lost' (buffer full), 'unheard' (port not open), 'garbled' (rates differ).
-    busy_until : float
-        When everything given so far has left.
     error : Exception or None
         What ended the device by itself.
     """
@@ -288,19 +280,10 @@ class SerialDevice:
             self.at(self.busy_until, then, SENDING)
 
     def reply(self, kind, data, at, then=None, burst=None, gap=0.0):
-        """Send a reply, subject to faults.
+        """Send a reply as :meth:`write` does, but subject to faults; `then` is called even if one swallowed it.
 
-        Parameters
-        ----------
-        kind : hashable
-            Replies of one kind replace each other for the fault 'stale'.
-        data : bytes
-        at : float
-            When the first byte leaves.
-        then : callable, optional
-            Called with the instant at which the last byte is out, also when a fault swallowed the reply.
-        burst : int, optional
-            At most so many bytes leave at once; the next follow `gap` seconds after the first of them.
+        Replies of one kind replace each other for the fault 'stale'. At most `burst` bytes leave at once; the next
+        follow `gap` seconds after the first of them.
         """
         hit = self.faults.hit
         old, self._last[kind] = self._last.get(kind), data
@@ -358,29 +341,29 @@ class SerialDevice:
 
 
 class _Memory:
-    """The port of a device on a VirtualHost."""
+    """The port of a device on a VirtualHost; `handle` is what the program has that opened it."""
 
     def __init__(self, device):
-        self._device, self._machine, self.handle = device, device.clock.machine, None
+        self.path, self.device, self.machine, self.handle = device.path, device, device.clock.machine, None
         self.wake = device.advance
 
-    there = property(lambda self: self._device.path in self._machine.ports)
+    there = property(lambda self: self.path in self.machine.ports)
     open = property(lambda self: self.handle is not None)
     rate = property(lambda self: self.handle.baudrate if self.open else 0)
 
     def start(self):
-        self._machine.devices.append(self._device)
+        self.machine.devices.append(self.device)
 
     def close(self):
-        if self._device in self._machine.devices:
-            self._machine.devices.remove(self._device)
+        with contextlib.suppress(ValueError):
+            self.machine.devices.remove(self.device)
         self.unplug()
 
     def plug(self):
-        self._machine.ports[self._device.path] = self._connect
+        self.machine.ports[self.path] = lambda baudrate, timeout: _Handle(self, baudrate, timeout)
 
     def unplug(self):
-        self._machine.ports.pop(self._device.path, None)
+        self.machine.ports.pop(self.path, None)
         if self.open:
             self.handle.lost, self.handle = True, None
 
@@ -389,19 +372,15 @@ class _Memory:
         self.handle.data += data
         return len(data)
 
-    def _connect(self, baudrate, timeout):
-        if self.open:
-            raise PortError(f"the port {self._device.path} is busy, held by another program: close that program")
-        self.handle = _Handle(self._device, baudrate, timeout)
-        return self.handle
-
 
 class _Handle:
     """What is used of a serial.Serial."""
 
-    def __init__(self, device, baudrate, timeout):
-        self._device, self.port, self.baudrate, self.timeout = device, device.path, baudrate, timeout
-        self.data, self.lost = b"", False
+    def __init__(self, at, baudrate, timeout):
+        if at.open:
+            raise PortError(f"the port {at.path} is busy, held by another program: close that program")
+        self.port, self.baudrate, self.timeout, self.data, self.lost = at.path, baudrate, timeout, b"", False
+        self._at, at.handle = at, self
 
     def _here(self):
         if self.lost:
@@ -413,22 +392,22 @@ class _Handle:
         return len(self.data)
 
     def read(self, size=1):
-        self._device.clock.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
+        self._at.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
         self._here()
         found, self.data = self.data[:size], self.data[size:]
         return found
 
     def write(self, data):
         self._here()
-        self._device.hear(bytes(data))
+        self._at.device.hear(bytes(data))
 
     def reset_input_buffer(self):
         self._here()
         self.data = b""
 
     def close(self):
-        if self._device.port.handle is self:
-            self._device.port.handle = None
+        if self._at.handle is self:
+            self._at.handle = None
 
 
 class _Terminal(threading.Thread):
