@@ -26,8 +26,7 @@ from lrfcal_lib.drivers.port import PortError
 
 RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
-LONGEST_WAIT_S = 0.25
-CLOSED_LOOK_S = 0.02  # how often to see whether somebody opened the port
+LOOK_S = 0.02  # how often to see whether somebody opened the port, or switched a fault on
 FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
 DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
 ROOM = 4095  # bytes that a port keeps until they are read
@@ -411,36 +410,29 @@ class _Handle:
 
 
 class _Terminal(threading.Thread):
-    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come or something is due."""
+    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come, something is due, or LOOK_S."""
 
     def __init__(self, device):
         super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
-        self._device, self._quit, self._master, self.open = device, False, None, False
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_write, False)
+        self._device, self._quit, self._master, self.open, self.wake = device, False, None, False, lambda: None
 
     there = property(lambda self: self._master is not None)
     rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
 
-    def wake(self):
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"x")
-
     def close(self):
         """Take the port away and end the thread."""
         self._quit = True
-        self.wake()
         if self.is_alive():
             self.join(5)
-        for fd in (self._wake_read, self._wake_write):
-            with contextlib.suppress(OSError):
-                os.close(fd)
 
     def run(self):
         """Serve the port until it is closed."""
         try:
             while not self._quit:
-                self._listen(min(self._device.due() - REAL.now(), LONGEST_WAIT_S))
+                wait = max(0.0, min(self._device.due() - REAL.now(), LOOK_S))
+                select.select([self._master] if self.open else [], [], [], wait)
+                if self.there:
+                    self._listen()
                 self._device.advance()
         except Exception as error:  # a device that dies must say so: the next look at `error` shows it
             self._device.error = error
@@ -448,15 +440,8 @@ class _Terminal(threading.Thread):
         finally:
             self.unplug()
 
-    def _listen(self, wait):
-        """Wait for bytes of the host, a wake-up, or the time; see whether the host holds the port open."""
-        if self.there and not self.open:  # a port that nobody holds reports so at once: look now and then
-            wait = min(wait, CLOSED_LOOK_S)
-        watched = [self._wake_read, *([self._master] if self.open else [])]
-        if self._wake_read in select.select(watched, [], [], max(0.0, wait))[0]:
-            os.read(self._wake_read, 4096)
-        if not self.there:
-            return
+    def _listen(self):
+        """Take the bytes of the host; see whether it holds the port open."""
         state = select.poll()
         state.register(self._master, select.POLLIN)
         event = dict(state.poll(0)).get(self._master, 0)

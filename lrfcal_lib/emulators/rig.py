@@ -280,20 +280,10 @@ def practice_setup():
 
 
 def emulated(name):
-    """An emulated rig that is not started yet, what recording needs to know of it, and the host clock of its devices.
+    """An emulated rig of :data:`NAMES` that is not started yet, its rig file, and the host clock of its devices.
 
-    Parameters
-    ----------
-    name : str
-        Of :data:`NAMES` (ValueError). 'practice' runs twice as fast as real devices, the others as slow.
-
-    Returns
-    -------
-    rig : EmulatedRig
-    data : callable
-        Gives the rig file, parsed, once the rig is started.
-    clock : callable
-        For :meth:`lrfcal_lib.drivers.rig.Rig.open`.
+    'practice' runs twice as fast as real devices, the others as slow. The file (parsed) is given by a callable once the
+    rig is started; the clock is for :meth:`lrfcal_lib.drivers.rig.Rig.open`. ValueError for another name.
     """
     clock = host_clock()
     if name != PRACTICE:
