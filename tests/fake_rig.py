@@ -79,14 +79,13 @@ class Head(Device):
         return pitch
 
     def start_sweep(self, stop_at, speed=None):
-        self.sweep = (self.clock(), self.at, stop_at)
-        self.track = []
+        self.sweep, self.track = (self.clock(), self.at, stop_at), []
         self.note()
 
     def true(self, instant):
         """Pitch at an instant of the sweep."""
         begun, first, last = self.sweep
-        return first + np.sign(last - first) * np.clip(self.speed * (instant - begun), 0, abs(last - first))
+        return float(first + np.sign(last - first) * np.clip(self.speed * (instant - begun), 0, abs(last - first)))
 
     def note(self):
         """Append to the track; a head that arrived meanwhile is noted when it did."""
@@ -94,19 +93,17 @@ class Head(Device):
         arrives = begun + abs(last - first) / self.speed
         before = self.track[-1][0] if self.track else -math.inf
         for instant in [arrives, self.clock()] if before < arrives < self.clock() else [self.clock()]:
-            resting = instant == begun or instant >= arrives
-            measured = self.has_feedback and (resting or not self.silent_moving)
+            measured = self.has_feedback and (instant == begun or instant >= arrives or not self.silent_moving)
             # between readings a head that moves is only reckoned, badly: nobody may use that where readings exist
             wrong = 0.0 if measured or not self.has_feedback else math.radians(3)
-            self.track = [*self.track, (instant, float(self.true(instant)) + wrong, measured)]
+            self.track = [*self.track, (instant, self.true(instant) + wrong, measured)]
 
     def moving(self):
-        if self.sweep is None:
-            return False
         if self.fail is not None:
             raise self.fail
-        self.note()
-        return abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
+        if self.sweep is not None:
+            self.note()
+        return self.sweep is not None and abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
 
     def finish_sweep(self, timeout=None):
         self.clock.now += 0.05
@@ -117,19 +114,18 @@ class Head(Device):
     def stop(self):
         self.stops += 1
 
-    def close(self):
-        self.stop()
+    close = stop
 
 
 class Lrf(Device):
     """Scans the wall at the head's pitch."""
 
     type, firmware, variant, port = "LMS221", "X01.27", (100.0, 1.0), "/dev/fake"
+    configuration = Configuration().changed(unit="mm")
 
     def __init__(self, head, clock):
         self.head, self.clock, self.streaming, self.silent, self.stale = head, clock, False, False, 0.0
-        self.configuration = Configuration().changed(measuring_mode=0, unit="mm")
-        self.readings, self.wait, self.lost, self.reconnects = [], None, 0, 0
+        self.readings, self.wait, self.lost, self.reconnects = [], lambda: None, 0, 0
 
     def start(self, interlaced=False):
         self.streaming = True
@@ -137,17 +133,16 @@ class Lrf(Device):
     def stop(self):
         self.streaming = False
 
-    def close(self):
-        self.stop()
+    close = stop
 
     def _scan(self, instant):
-        pitch = self.head.at if self.head.sweep is None else float(self.head.true(instant))
+        pitch = self.head.at
         if self.head.sweep is not None:
+            pitch = self.head.true(instant)
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
-        reading = Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times)
-        self.readings.append(reading)
-        return reading
+        self.readings.append(Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times))
+        return self.readings[-1]
 
     def newest(self, after=None, timeout=2.0):
         return self.take(1, after)[0]
@@ -164,20 +159,18 @@ class Lrf(Device):
             self.streaming = False
 
     def reconnect(self, deadline=10.0):
-        self.reconnects += 1
-        self.lost -= 1
+        self.reconnects, self.lost = self.reconnects + 1, self.lost - 1
 
-    def take(self, count, after=None, timeout=None):
+    def take(self, count, after=-math.inf, timeout=2.0):
         if not self.streaming:
             raise DeviceError("the device does not stream; call start() first")
         out = []
         for _ in range(count):
-            if self.wait is not None:
-                self.wait()
+            self.wait()
             if self.silent:
-                self.clock.now += timeout or 2.0
+                self.clock.now += timeout
                 raise NoReply("no new scan: the stream is silent")
-            instant = (self.clock() if after is None else max(after, self.clock())) + LAZY_S - self.stale
+            instant = max(after or -math.inf, self.clock()) + LAZY_S - self.stale
             out.append(self._scan(instant))
             self.clock.now = max(self.clock.now, instant) + SCAN_S
         return out

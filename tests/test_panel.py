@@ -425,25 +425,6 @@ def test_shown_with_words_for_those_who_do_not_run_it(panel, monkeypatch):
     assert shown[0]["application/vnd.jupyter.widget-view+json"]["model_id"] == panel.parts.root.model_id
 
 
-# ------------------------------------------------------------------------------------------- an emulated rig
-
-
-def test_an_emulated_rig_by_its_name(tmp_path):
-    """Connected, looked through, sent too far, and recorded with; the notebook calibrates one."""
-    with Panel("practice", tmp_path / "s") as panel:
-        panel.connect()
-        rig, parts = panel.collector.rig, panel.parts
-        assert panel.collector.emulated and set(parts.pictures) == {"scan", "sweep", "left", "right"}
-        assert (parts.slider.min, parts.slider.max) == pytest.approx((-60, 45))
-        with pytest.raises(OutOfRange, match="ask for less"):
-            panel.collector.move_to(np.radians(70))
-        lights = panel.capture()
-        assert {light.name: light.state for light in lights}["scan"] == "ok", lights
-        wait_until(lambda: parts.pictures["left"].image.value)
-        assert "The emulated board moves by itself" in parts.task.value
-    assert validate(tmp_path / "s") == [] and rig.stated.control is not None
-
-
 def test_the_emulated_rigs_are_those_that_there_are():
     assert sorted(collector.PRACTICE_RIGS) == sorted(practice.NAMES)
     with pytest.raises(ValueError, match="no set-up 'nowhere'"):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from importlib.util import find_spec
 from pathlib import Path
 
 import nbformat
@@ -28,20 +29,10 @@ def require_browser():
     reasons = []
     if CHROMIUM is None:
         reasons.append("there is no Chromium: run 'sudo apt-get install -y chromium'")
-    try:
-        import playwright  # noqa: F401
-    except ImportError:
+    if find_spec("playwright") is None:
         reasons.append("there is no playwright: run 'pip install -r environment.txt'")
-    if reasons and os.environ.get("CI") == "true":
-        pytest.fail("; ".join(reasons))
     if reasons:
-        pytest.skip("; ".join(reasons))
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("; ".join(reasons))
 
 
 def panel_only(folder):
@@ -59,44 +50,40 @@ def panel_only(folder):
 def lab(tmp_path):
     """Address of a JupyterLab with the panel's notebook, its token included."""
     require_browser()
-    work = tmp_path / "work"
+    work, log, token = tmp_path / "work", tmp_path / "log", secrets.token_hex(16)
     work.mkdir()
     panel_only(work)
-    port, token = free_port(), secrets.token_hex(16)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{probe.getsockname()[1]}"
     environment = os.environ | {f"JUPYTER_{kind}_DIR": str(tmp_path / kind.lower()) for kind in ("CONFIG", "RUNTIME")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
-    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1", f"--port={port}"]
-    command += ["--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}", QUIET]
-    with (tmp_path / "log").open("w") as log:
-        server = subprocess.Popen(command, env=environment, cwd=work, stdout=log, stderr=log)
+    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1",
+               f"--port={address.rpartition(':')[2]}", "--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}",
+               QUIET]  # fmt: skip
+
+    def call(path, **options):
+        request = urllib.request.Request(address + path, headers={"Authorization": f"token {token}"}, **options)
+        return urllib.request.urlopen(request, timeout=20).read()
+
+    with log.open("w") as stream:
+        server = subprocess.Popen(command, env=environment, stdout=stream, stderr=stream)
+        end = time.monotonic() + START_S
         try:
-            wait_for(f"http://127.0.0.1:{port}/api?token={token}", server, tmp_path / "log")
-            yield f"http://127.0.0.1:{port}/doc/tree/panel.ipynb?token={token}"
+            while True:
+                try:
+                    call("/api")
+                    break
+                except OSError:
+                    if server.poll() is not None or time.monotonic() > end:
+                        pytest.fail(f"JupyterLab does not start:\n{log.read_text()[-3000:]}")
+                    time.sleep(0.2)
+            yield f"{address}/doc/tree/panel.ipynb?token={token}"
+            for kernel in json.loads(call("/api/kernels")):  # by itself: the panel's rig is closed, its head stopped
+                call(f"/api/kernels/{kernel['id']}", method="DELETE")
         finally:
-            end_kernels(f"http://127.0.0.1:{port}/api/kernels", token)
             server.terminate()
             server.wait(20)
-
-
-def wait_for(address, server, log):
-    end = time.monotonic() + START_S
-    while True:
-        try:
-            return urllib.request.urlopen(address, timeout=5).read()
-        except OSError:
-            if server.poll() is not None or time.monotonic() > end:
-                pytest.fail(f"JupyterLab does not start:\n{log.read_text()[-3000:]}")
-            time.sleep(0.2)
-
-
-def end_kernels(address, token):
-    """Let the kernels end by themselves: the panel's rig is closed, its head stopped."""
-    header = {"Authorization": f"token {token}"}
-    with urllib.request.urlopen(urllib.request.Request(address, headers=header), timeout=10) as answer:
-        kernels = json.load(answer)
-    for kernel in kernels:
-        request = urllib.request.Request(f"{address}/{kernel['id']}", headers=header, method="DELETE")
-        urllib.request.urlopen(request, timeout=20).close()
 
 
 @pytest.fixture
@@ -124,28 +111,17 @@ def run_all(page):
     page.wait_for_selector(".lrfcal-panel")
 
 
-def pixels(page, name):
-    """Size of a picture as the browser decoded it; (0, 0) for none."""
-    return page.eval_on_selector(f"img.lrfcal-picture-{name}", "i => [i.naturalWidth, i.naturalHeight]")
-
-
 def changed(page, name, before):
-    """Wait until a picture is another one; returns its address."""
-    differs = "([name, before]) => document.querySelector(`img.lrfcal-picture-${name}`).src !== before"
+    """Wait until a picture is another one, and wide."""
+    differs = """([name, before]) => {
+        const image = document.querySelector(`img.lrfcal-picture-${name}`);
+        return image.src !== before && image.naturalWidth > 100}"""
     page.wait_for_function(differs, arg=[name, before])
-    return address(page, name)
 
 
-def address(page, name):
-    return page.get_attribute(f"img.lrfcal-picture-{name}", "src")
-
-
-def press(page, name):
+def press(page, name, text):
+    """Press a button and wait until the panel says something, or that something failed."""
     page.click(f"button.lrfcal-{name}:enabled")
-
-
-def wait_for_text(page, text):
-    """Wait until the panel says something, or that something failed."""
     page.wait_for_selector(f".lrfcal-panel :text('{text}'), .lrfcal-error:has-text('failed')")
     failed = page.locator(".lrfcal-error:has-text('failed')")
     assert failed.count() == 0, failed.first.inner_text()
@@ -154,36 +130,28 @@ def wait_for_text(page, text):
 def test_buttons_record_and_calibrate(page):
     run_all(page)
     page.fill(".lrfcal-session input", "recordings/monday")
-    press(page, "connect")
-    wait_for_text(page, "Placement 1 of")
-    empty = address(page, "sweep")
-    changed(page, "scan", "")
-    for name in ("left", "right"):
-        page.wait_for_function("n => document.querySelector(`img.lrfcal-picture-${n}`).naturalWidth > 100", arg=name)
-    assert pixels(page, "scan")[0] > 100
+    press(page, "connect", "Placement 1 of")
+    empty = page.get_attribute("img.lrfcal-picture-sweep", "src")
+    for name in ("scan", "left", "right"):
+        changed(page, name, "")
     for number in range(1, PLACEMENTS + 1):
-        press(page, "capture")
-        wait_for_text(page, f"Quality of placement {number}")
-        wait_for_text(page, f"Placement {number + 1} of")
+        press(page, "capture", f"Quality of placement {number}")
+        page.wait_for_selector(f".lrfcal-panel :text('Placement {number + 1} of')")
         assert page.locator(".light:has-text('camera left')").count() == 1
         assert "board on" in page.inner_text(".light:has-text('scan')")
-    assert changed(page, "sweep", empty) != empty
-    press(page, "calibrate")
-    wait_for_text(page, "rotation vector")
+    changed(page, "sweep", empty)
+    press(page, "calibrate", "rotation vector")
     said = page.inner_text(".lrfcal-result")
     assert "rotation vector" in said and "right" in said and "recordings/monday_calibration" in said, said
     if os.environ.get("LRFCAL_SCREENSHOT"):
         page.add_style_tag(content=".Toastify {display: none}")
         page.locator(".lrfcal-panel").screenshot(path=os.environ["LRFCAL_SCREENSHOT"])
-    press(page, "close")
-    page.wait_for_selector(".lrfcal-state:has-text('not connected')")
+    press(page, "close", "not connected")
 
 
-def test_without_a_browser_only_ci_fails(monkeypatch):
+@pytest.mark.parametrize(("ci", "error"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
+def test_without_a_browser_only_ci_fails(monkeypatch, ci, error):
     monkeypatch.setattr(sys.modules[__name__], "CHROMIUM", None)
-    monkeypatch.delenv("CI", raising=False)
-    with pytest.raises(pytest.skip.Exception, match="sudo apt-get install -y chromium"):
-        require_browser()
-    monkeypatch.setenv("CI", "true")
-    with pytest.raises(pytest.fail.Exception, match="there is no Chromium"):
+    monkeypatch.setenv("CI", ci)
+    with pytest.raises(error, match="there is no Chromium: run 'sudo apt-get install -y chromium'"):
         require_browser()

@@ -42,19 +42,7 @@ class Task:
 
 
 def next_task(recording, advice=""):
-    """What to record next.
-
-    Parameters
-    ----------
-    recording : Recording
-    advice : str
-        Where to put the board, as far as that was computed.
-
-    Returns
-    -------
-    Task or None
-        None where the plan is done.
-    """
+    """The Task that is next in a recording, None where the plan is done; `advice` says where to put the board."""
     plan, finished = recording.rig.stated.plan, recording.finished
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
@@ -77,27 +65,13 @@ METHOD = "line"  # the paper's, beside the joint estimate
 
 @dataclass(frozen=True)
 class Result:
-    """A calibration.
+    """A calibration."""
 
-    Attributes
-    ----------
-    answer : {'yes', 'with care', 'no'}
-        Whether to trust it.
-    sentences : tuple of str
-    method : str
-        Whose poses are handed over; '' where none is.
-    poses : dict of str to tuple
-        By camera: rotation vector (deg), translation (mm), and their standard deviations, each of shape (3,).
-    file : Path or None
-        calibration.json.
-    calibration : Calibration
-    """
-
-    answer: str
+    answer: str  # whether to trust it: yes, with care, no
     sentences: tuple
-    method: str
-    poses: dict
-    file: Path | None
+    method: str  # whose poses are handed over; '' where none is
+    poses: dict  # by camera: rotation vector (deg), translation (mm), and their standard deviations, each (3,)
+    file: Path | None  # calibration.json
     calibration: object
 
 
@@ -335,9 +309,8 @@ class Collector:
 
         Raises
         ------
-        Interrupted
-            If it was stopped: the placement does not count.
-        DeviceError, RecordingError
+        DeviceError, RecordingError, Interrupted
+            The last if it was stopped: the placement does not count.
         """
         self._needed()
         task = self.task()

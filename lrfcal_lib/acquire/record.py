@@ -252,19 +252,9 @@ def record_session(rig, path, *, resume=False, count=None, terminal=None):
 
     Parameters
     ----------
-    rig : Rig
-    path : path-like
-        Folder of the session.
-    resume : bool
-        Go on with a session that was not finished.
-    count : int, optional
-        Placements of the plan; all by default.
+    rig, path, resume, count
+        As of :class:`Recording`, which is returned: finished, with all placements or those that the user wanted.
     terminal : Terminal, optional
-
-    Returns
-    -------
-    Recording
-        Finished, with all placements or those that the user wanted.
 
     Raises
     ------
@@ -324,21 +314,10 @@ def _placements(recording, terminal):
 
 
 def main(rig_file, path, *, resume=False, count=None, mode=None, terminal=None):
-    """Record from the command line.
+    """Record from the command line; options as of :func:`record_session`, `mode` instead of the plan's.
 
-    Parameters
-    ----------
-    rig_file, path : path-like
-    resume, count, terminal
-        As of :func:`record_session`.
-    mode : {'stop-and-go', 'continuous'}, optional
-        Instead of the plan's.
-
-    Returns
-    -------
-    int
-        0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal.
-        The head is stopped in any case.
+    0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal. The head
+    is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:

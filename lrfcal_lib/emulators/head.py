@@ -147,22 +147,14 @@ class EmulatedHead(SerialDevice):
         'single': besides, one byte 0x01 to commands. 'five': 5 bytes without sync and address to queries.
     echo : bool
         The two-wire line hands back what the host sends.
-    speeds : tuple of float
-        Tilt speed at speed byte 0 and at 0x3F, degrees a second; in between it grows evenly.
-    go_speed : float
-        Of absolute moves, degrees a second.
+    speeds, go_speed : tuple of float, float
+        Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; of absolute moves; degrees a second.
     watchdog_s : float, optional
         Stops when no frame came for so long.
     invert : bool
         'Up' and positive elevation lower the view.
     seed, clock
-        As for :class:`EmulatedLms`.
-
-    Attributes
-    ----------
-    faults : Faults
-    frames : deque of (float, Frame)
-        Host time and sound frames to this address.
+        As for :class:`EmulatedLms`. `frames` holds host time and sound frames to this address.
     """
 
     def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", reply="extended", echo=False,

@@ -26,8 +26,7 @@ from lrfcal_lib.drivers.port import PortError
 
 RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
-LONGEST_WAIT_S = 0.25
-CLOSED_LOOK_S = 0.02  # how often to see whether somebody opened the port
+LOOK_S = 0.02  # how often to see whether somebody opened the port, or switched a fault on
 FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
 DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
 ROOM = 4095  # bytes that a port keeps until they are read
@@ -136,16 +135,10 @@ class Faults:
         self._lock, self._times, self._until = threading.Lock(), Counter(), {}
 
     def inject(self, name, count=1, *, seconds=None):
-        """Arm a fault.
+        """Arm a fault of `FAULTS` for so many opportunities (replies, requests, ...) from now on.
 
-        Parameters
-        ----------
-        name : str
-            Key of `FAULTS`; ValueError for one that this device does not know.
-        count : int
-            It happens at that many opportunities (replies, requests, ...) from now on.
-        seconds : float, optional
-            At every opportunity for so long instead; for 'unplug' how long the port is away.
+        With `seconds` at every opportunity for so long instead; for 'unplug' how long the port is away. ValueError for
+        a fault that this device does not know.
         """
         if name not in FAULTS or self.device not in FAULTS[name].devices:
             known = ", ".join(n for n, f in FAULTS.items() if self.device in f.devices)
@@ -233,8 +226,6 @@ class SerialDevice:
     faults : Faults
     counts : dict
         Bytes 'received', 'sent', 'lost' (buffer full), 'unheard' (port not open), 'garbled' (rates differ).
-    busy_until : float
-        When everything given so far has left.
     error : Exception or None
         What ended the device by itself.
     """
@@ -288,19 +279,10 @@ class SerialDevice:
             self.at(self.busy_until, then, SENDING)
 
     def reply(self, kind, data, at, then=None, burst=None, gap=0.0):
-        """Send a reply, subject to faults.
+        """Send a reply as :meth:`write` does, but subject to faults; `then` is called even if one swallowed it.
 
-        Parameters
-        ----------
-        kind : hashable
-            Replies of one kind replace each other for the fault 'stale'.
-        data : bytes
-        at : float
-            When the first byte leaves.
-        then : callable, optional
-            Called with the instant at which the last byte is out, also when a fault swallowed the reply.
-        burst : int, optional
-            At most so many bytes leave at once; the next follow `gap` seconds after the first of them.
+        Replies of one kind replace each other for the fault 'stale'. At most `burst` bytes leave at once; the next
+        follow `gap` seconds after the first of them.
         """
         hit = self.faults.hit
         old, self._last[kind] = self._last.get(kind), data
@@ -358,29 +340,29 @@ class SerialDevice:
 
 
 class _Memory:
-    """The port of a device on a VirtualHost."""
+    """The port of a device on a VirtualHost; `handle` is what the program has that opened it."""
 
     def __init__(self, device):
-        self._device, self._machine, self.handle = device, device.clock.machine, None
+        self.path, self.device, self.machine, self.handle = device.path, device, device.clock.machine, None
         self.wake = device.advance
 
-    there = property(lambda self: self._device.path in self._machine.ports)
+    there = property(lambda self: self.path in self.machine.ports)
     open = property(lambda self: self.handle is not None)
     rate = property(lambda self: self.handle.baudrate if self.open else 0)
 
     def start(self):
-        self._machine.devices.append(self._device)
+        self.machine.devices.append(self.device)
 
     def close(self):
-        if self._device in self._machine.devices:
-            self._machine.devices.remove(self._device)
+        with contextlib.suppress(ValueError):
+            self.machine.devices.remove(self.device)
         self.unplug()
 
     def plug(self):
-        self._machine.ports[self._device.path] = self._connect
+        self.machine.ports[self.path] = lambda baudrate, timeout: _Handle(self, baudrate, timeout)
 
     def unplug(self):
-        self._machine.ports.pop(self._device.path, None)
+        self.machine.ports.pop(self.path, None)
         if self.open:
             self.handle.lost, self.handle = True, None
 
@@ -389,19 +371,15 @@ class _Memory:
         self.handle.data += data
         return len(data)
 
-    def _connect(self, baudrate, timeout):
-        if self.open:
-            raise PortError(f"the port {self._device.path} is busy, held by another program: close that program")
-        self.handle = _Handle(self._device, baudrate, timeout)
-        return self.handle
-
 
 class _Handle:
     """What is used of a serial.Serial."""
 
-    def __init__(self, device, baudrate, timeout):
-        self._device, self.port, self.baudrate, self.timeout = device, device.path, baudrate, timeout
-        self.data, self.lost = b"", False
+    def __init__(self, at, baudrate, timeout):
+        if at.open:
+            raise PortError(f"the port {at.path} is busy, held by another program: close that program")
+        self.port, self.baudrate, self.timeout, self.data, self.lost = at.path, baudrate, timeout, b"", False
+        self._at, at.handle = at, self
 
     def _here(self):
         if self.lost:
@@ -413,55 +391,48 @@ class _Handle:
         return len(self.data)
 
     def read(self, size=1):
-        self._device.clock.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
+        self._at.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
         self._here()
         found, self.data = self.data[:size], self.data[size:]
         return found
 
     def write(self, data):
         self._here()
-        self._device.hear(bytes(data))
+        self._at.device.hear(bytes(data))
 
     def reset_input_buffer(self):
         self._here()
         self.data = b""
 
     def close(self):
-        if self._device.port.handle is self:
-            self._device.port.handle = None
+        if self._at.handle is self:
+            self._at.handle = None
 
 
 class _Terminal(threading.Thread):
-    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come or something is due."""
+    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come, something is due, or LOOK_S."""
 
     def __init__(self, device):
         super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
-        self._device, self._quit, self._master, self.open = device, False, None, False
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_write, False)
+        self._device, self._quit, self._master, self.open, self.wake = device, False, None, False, lambda: None
 
     there = property(lambda self: self._master is not None)
     rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
 
-    def wake(self):
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"x")
-
     def close(self):
         """Take the port away and end the thread."""
         self._quit = True
-        self.wake()
         if self.is_alive():
             self.join(5)
-        for fd in (self._wake_read, self._wake_write):
-            with contextlib.suppress(OSError):
-                os.close(fd)
 
     def run(self):
         """Serve the port until it is closed."""
         try:
             while not self._quit:
-                self._listen(min(self._device.due() - REAL.now(), LONGEST_WAIT_S))
+                wait = max(0.0, min(self._device.due() - REAL.now(), LOOK_S))
+                select.select([self._master] if self.open else [], [], [], wait)
+                if self.there:
+                    self._listen()
                 self._device.advance()
         except Exception as error:  # a device that dies must say so: the next look at `error` shows it
             self._device.error = error
@@ -469,15 +440,8 @@ class _Terminal(threading.Thread):
         finally:
             self.unplug()
 
-    def _listen(self, wait):
-        """Wait for bytes of the host, a wake-up, or the time; see whether the host holds the port open."""
-        if self.there and not self.open:  # a port that nobody holds reports so at once: look now and then
-            wait = min(wait, CLOSED_LOOK_S)
-        watched = [self._wake_read, *([self._master] if self.open else [])]
-        if self._wake_read in select.select(watched, [], [], max(0.0, wait))[0]:
-            os.read(self._wake_read, 4096)
-        if not self.there:
-            return
+    def _listen(self):
+        """Take the bytes of the host; see whether it holds the port open."""
         state = select.poll()
         state.register(self._master, select.POLLIN)
         event = dict(state.poll(0)).get(self._master, 0)

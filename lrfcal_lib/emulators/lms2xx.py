@@ -58,25 +58,10 @@ class SyntheticSource:
     """Scans that are a cheap function of the mirror's turn: no two in a row alike, every range within 8 m."""
 
     def scan(self, turn, quarters, times):
-        """Readings of a scan.
+        """Readings of a scan: of the mirror's first turn, bearings (B,) in quarters of a degree, seconds of every beam.
 
-        Parameters
-        ----------
-        turn : int
-            Of the mirror, the first of the scan.
-        quarters : ndarray of int, shape (B,)
-            Bearings, quarters of a degree.
-        times : ndarray, shape (B,)
-            Of every beam, seconds of the devices.
-
-        Returns
-        -------
-        ranges : ndarray, shape (B,)
-            Metres.
-        reasons : ndarray of int, shape (B,)
-            Index into `lms2xx.REASONS`; 0 for a range.
-        pitch : ndarray, shape (2,)
-            Of the head at the earliest and the latest beam; NaN here.
+        Ranges (B,) in metres, index into `REASONS` (B,; 0 for a range), and the pitch (2,) of the head at the earliest
+        and the latest beam, NaN here.
         """
         ranges = 1.0 + (quarters * 13 + turn * 37) % 6000 / 1000
         reasons = np.where((quarters + turn) % 97 == 0, 1 + turn % 2 * 3, 0)
@@ -131,12 +116,11 @@ class Memory:
 
 
 class EmulatedLms(SerialDevice):
-    """An LMS2xx.
+    """An LMS2xx, which looks at a source of scans such as :class:`SyntheticSource`, the default.
 
     Parameters
     ----------
     source : object, optional
-        Has the method of :class:`SyntheticSource`, which is the default.
     path : path-like
         Of the port to appear.
     seed : int
@@ -148,12 +132,10 @@ class EmulatedLms(SerialDevice):
     baudrates : tuple of int
         That the line allows; RS-232 ends at 38400.
     **settings
-        Of :class:`Memory`: model, variant, configuration, baudrate, address, password, ...
+        Of its `memory`, :class:`Memory`: model, variant, configuration, baudrate, address, password, ...
 
     Attributes
     ----------
-    memory : Memory
-    faults : Faults
     scans : deque of ScanRecord
         The newest 20000.
     requests : deque of (float, bytes)

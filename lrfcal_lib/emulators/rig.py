@@ -10,7 +10,6 @@ import argparse
 import contextlib
 import json
 import math
-import shutil
 import signal
 import socketserver
 import tempfile
@@ -42,7 +41,7 @@ MARGIN = np.radians(1.0)  # of a sweep beyond the board
 
 
 class EmulatedRig:
-    """The devices of a simulated setup, as files and addresses that any program can open.
+    """The devices of a simulated setup, as files and addresses that any program can open; a context manager.
 
     Parameters
     ----------
@@ -56,14 +55,12 @@ class EmulatedRig:
     time_scale : float
         Seconds of the devices in a second of the host; 1 is safe. Up to 8 does for stop-and-go. A stream of scans
         leaves some out, with a warning, where this machine is too slow for it, as with a head that moves. The instants
-        of scans need a host clock that runs as fast (`clock` of `LMS2xx` and `Rig.open`): by another one they
-        are off by tenths of a second.
+        of scans need a host clock that runs as fast (`clock` of `LMS2xx` and `Rig.open`): by another one they are off
+        by tenths of a second.
     model : str, optional
         Type string of the laser range finder.
-    head_options : dict, optional
-        Of :class:`EmulatedHead`: feedback, reply, echo, speeds, ...
-    platform : dict, optional
-        What differs from the setup's Platform: backlash, settle, noise, ...
+    head_options, platform : dict, optional
+        Of :class:`EmulatedHead`; what differs from the setup's Platform.
     cameras : bool
         Whether there are cameras.
     image_width : int, optional
@@ -72,19 +69,6 @@ class EmulatedRig:
         Of :class:`CameraServer`.
     machine : Host
         On a VirtualHost the ports are in memory.
-
-    Attributes
-    ----------
-    lrf : EmulatedLms
-    pan_tilt : EmulatedHead
-    world : EmulatedWorld
-    control : str
-        Path of the socket.
-    camera_server : CameraServer or None
-    camera_urls : dict of str to str
-    faults : dict of str to Faults
-        'lrf' and 'head'.
-    scans : deque of ScanRecord
 
     Examples
     --------
@@ -101,8 +85,9 @@ class EmulatedRig:
         rig = replace(setup.rig, platform=replace(setup.rig.platform, **(platform or {})))
         setup, self.clock = replace(setup, rig=rig), Clock(time_scale, machine)
         self.setup = setup if image_width is None else replace(setup, rig=scaled(rig, image_width))
-        self._own = None if folder else tempfile.mkdtemp(prefix="lrfcal-")
-        self.folder = Path(folder or self._own)
+        self._closing = contextlib.ExitStack()
+        own = None if folder else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
+        self.folder = Path(folder or self._closing.enter_context(own))
         self.folder.mkdir(parents=True, exist_ok=True)
         self.world = EmulatedWorld(setup, self.clock, seed, placements)
         shared, kind = {"clock": self.clock, "seed": seed}, rig.beam.name.split("-")[0]
@@ -113,8 +98,8 @@ class EmulatedRig:
         self.control = str(self.folder / "control")
         self.camera_server = CameraServer(self.world, self.setup, seed=seed, rest_s=rest_s) if cameras else None
         self.camera_urls = self.camera_server.urls if cameras else {}
-        parts = (self.lrf, self.pan_tilt, self.camera_server, ControlSocket(self.control, self))
-        self._parts = [part for part in parts if part is not None]
+        self._parts = [self.lrf, self.pan_tilt, *([self.camera_server] if cameras else []),
+                       ControlSocket(self.control, self)]  # fmt: skip
 
     def start(self):
         """Let all devices appear."""
@@ -124,10 +109,9 @@ class EmulatedRig:
 
     def close(self):
         """Remove all devices, and the folder where it was made here."""
-        for part in reversed(self._parts):
-            part.close()
-        if self._own:
-            shutil.rmtree(self._own, ignore_errors=True)
+        with self._closing:
+            for part in reversed(self._parts):
+                part.close()
 
     __enter__ = start
 
@@ -296,20 +280,10 @@ def practice_setup():
 
 
 def emulated(name):
-    """An emulated rig that is not started yet, what recording needs to know of it, and the host clock of its devices.
+    """An emulated rig of :data:`NAMES` that is not started yet, its rig file, and the host clock of its devices.
 
-    Parameters
-    ----------
-    name : str
-        Of :data:`NAMES` (ValueError). 'practice' runs twice as fast as real devices, the others as slow.
-
-    Returns
-    -------
-    rig : EmulatedRig
-    data : callable
-        Gives the rig file, parsed, once the rig is started.
-    clock : callable
-        For :meth:`lrfcal_lib.drivers.rig.Rig.open`.
+    'practice' runs twice as fast as real devices, the others as slow. The file (parsed) is given by a callable once the
+    rig is started; the clock is for :meth:`lrfcal_lib.drivers.rig.Rig.open`. ValueError for another name.
     """
     clock = host_clock()
     if name != PRACTICE:
@@ -352,21 +326,9 @@ def parser():
 
 
 def main(argv=None):
-    """Emulate a rig until Ctrl-C, SIGTERM or SIGHUP.
+    """Emulate a rig until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
 
-    Parameters
-    ----------
-    argv : list of str, optional
-
-    Returns
-    -------
-    int
-        0, or 1 when a device ended by itself.
-
-    Raises
-    ------
-    ValueError
-        For options that no rig has.
+    ValueError for options that no rig has.
     """
     options, quit_ = vars(parser().parse_args(argv)), threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -53,19 +53,7 @@ class Place:
 class EmulatedWorld:
     """The world of a simulated setup at the present; the source of the scans of :class:`EmulatedLms`.
 
-    Parameters
-    ----------
-    setup : Setup
-    clock : Clock
-    seed : int
-    placements : sequence of Placement, optional
-        Where the board can be put; those of the setup by default, with the sweep of the room last.
-
-    Attributes
-    ----------
-    head : Head
-    place : Place
-    placements : dict of int to Placement
+    `placements` are where the board can be put; by default those of the setup, with the sweep of the room last.
     """
 
     place = property(lambda self: self._scene[0], doc="Where the board is.")
@@ -219,18 +207,9 @@ class CameraServer:
         return not self.quit.is_set() and self.error is None
 
     def image(self, name, timeout=1.0):
-        """The image of a camera that shows the rig as it stands now.
+        """What a camera's image shows (a key), and the image of the rig as it stands now, a JPEG file.
 
-        Parameters
-        ----------
-        name : str
-        timeout : float
-            Seconds to wait for the head to rest and the image to be drawn.
-
-        Returns
-        -------
-        key, bytes
-            What it shows, and a JPEG file; (None, None) where there is none in time.
+        (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
         """
         end = time.monotonic() + timeout
         while self.serving:
