@@ -121,15 +121,7 @@ def photograph(setup, shots):
 
 
 def simulate(path, setup, workers=1):
-    """Simulate a recording and write its session.
-
-    Parameters
-    ----------
-    path : path-like
-        Folder of the new session; must not exist.
-    setup : Setup
-    workers : int
-        Processes that render images.
+    """Simulate a recording and write its session into a new folder; `workers` processes render the images.
 
     Raises
     ------
