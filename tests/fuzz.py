@@ -140,25 +140,14 @@ def damage(rng, path):
 
 def raw(rng, file):
     """Any bytes."""
-    data = bytearray(file.read_bytes()[:1_000_000])
+    data = file.read_bytes()[:1_000_000]
     at, n = int(rng.integers(len(data) + 1)), int(rng.choice([1, 2, 4, 16, 100, 1000]))
-    how = rng.integers(7)
-    if how == 0:
-        data = data[:at]
-    elif how == 1:
-        del data[at : at + n]
-    elif how == 2:
-        data[at:at] = rng.bytes(n)
-    elif how == 3:
-        data[at : at + n] = bytes(n)
-    elif how == 4:
-        data[at:at] = data[at : at + n]
-    elif how == 5:
-        data += data[:n]
-    else:
-        for place in rng.integers(max(len(data), 1), size=min(n, len(data))):
-            data[place] ^= 1 << rng.integers(8)
-    file.write_bytes(data)
+    flipped = bytearray(data)
+    for place in rng.integers(max(len(data), 1), size=min(n, len(data))):
+        flipped[place] ^= 1 << rng.integers(8)
+    middle = [b"", rng.bytes(n) + data[at : at + n], bytes(n), 2 * data[at : at + n]]
+    ways = [data[:at], flipped, data + data[:n], *(data[:at] + part + data[at + n :] for part in middle)]
+    file.write_bytes(ways[rng.integers(len(ways))])
 
 
 def text(rng, file):
@@ -195,18 +184,14 @@ def rows(rng, file):
     """Lines doubled, gone, moved, or many."""
     lines, how = file.read_text().splitlines(), rng.integers(5)
     at, to = rng.integers(len(lines), size=2)
-    if how == 0:
-        lines.insert(to, lines[at])
-    elif how == 1:
-        del lines[at]
-    elif how == 2:
-        lines[at], lines[to] = lines[to], lines[at]
-    elif how == 3:
-        lines += [lines[at]] * int(rng.choice([3, 1000, 300_000]) if rng.random() < 0.05 else 3)
-    else:
-        cells = lines[at].split(",")
-        cells[rng.integers(len(cells))] = NASTY[rng.integers(len(NASTY))]
-        lines[at] = ",".join(cells)
+    cells = lines[at].split(",")
+    cells[rng.integers(len(cells))] = NASTY[rng.integers(len(NASTY))]
+    many = int(rng.choice([3, 1000, 300_000])) if rng.random() < 0.05 else 3
+    moved = [lines[{at: to, to: at}.get(i, i)] for i in range(len(lines))]
+    lines = [
+        [*lines[:to], lines[at], *lines[to:]], lines[:at] + lines[at + 1 :], moved, lines + [lines[at]] * many,
+        [*lines[:at], ",".join(cells), *lines[at + 1 :]],
+    ][how]  # fmt: skip
     file.write_bytes(("\n".join(lines) + "\n").encode("utf-8", "replace"))
 
 
@@ -290,18 +275,12 @@ def other(rng, file):
         return os.symlink(outside.parent, file.parent)
     content = file.read_bytes()
     file.unlink()
-    if how == 2:
-        os.mkfifo(file)
-    elif how == 3:
-        os.symlink("/dev/zero", file)
-    elif how in (4, 5):
-        os.symlink(outside if how == 4 else outside.parent, file)
-    elif how == 6:
-        file.mkdir()
-    elif how == 7:
-        file.write_bytes(content)
-        os.truncate(file, 3_000_000_000)
-    return None
+    ways = [
+        lambda: os.mkfifo(file), lambda: os.symlink("/dev/zero", file), lambda: os.symlink(outside, file),
+        lambda: os.symlink(outside.parent, file), file.mkdir, lambda: None,
+        lambda: (file.write_bytes(content), os.truncate(file, 3_000_000_000)),
+    ]  # fmt: skip
+    return ways[how - 2]()
 
 
 # ---------------------------------------------------------------------------------------------- what is done with it

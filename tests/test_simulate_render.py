@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.camera import CameraModel, project, undistort
+from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.simulate.rig import printed_triangle
 from lrfcal_lib.simulate.scene import (
     Exposure,
@@ -106,12 +106,3 @@ def test_a_camera_looks_out_of_the_window():
     up = np.array([[3.1, 3.1, 0.3]]) / np.linalg.norm([3.1, 3.1, 0.3])
     hits = world.cast(np.zeros((1, 3)), up)
     assert np.isinf(hits.distance[0]) and world.radiance(np.zeros((1, 3)), up, hits).min() > 0.9
-
-
-def test_lenses_that_fold_and_odd_sizes():
-    folded = CameraModel(512, 384, 200.0, 200.0, 255.0, 191.0, np.array([-0.9, 0.0, 0.0, 0.0, 0.0]))
-    assert undistort([[0.0, 0.0]], folded).shape == (1, 2)
-    with pytest.raises(ValueError, match="folds the image"):
-        Imager(folded)
-    with pytest.raises(ValueError, match="513 x 384 pixels, both must be multiples of 2"):
-        Imager(CameraModel(513, 384, 800.0, 800.0, 256.0, 192.0))

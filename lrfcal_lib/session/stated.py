@@ -252,7 +252,7 @@ ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobo
 def in_words(error):
     """The first mistake that pydantic found: where, value, what is needed."""
     first = error.errors(include_url=False)[0]
-    where, kind, value = ".".join(map(str, first["loc"])), first["type"], ascii(first["input"])
+    where, kind, value = ".".join(map(str, first["loc"])) or "it", first["type"], ascii(first["input"])
     if kind == "missing":
         return f"{where} is missing"
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"

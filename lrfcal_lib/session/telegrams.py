@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +24,7 @@ class TelegramLog:
 
     Attributes
     ----------
+    file : Path
     offset, placement : ndarray of int, shape (n,)
         In the file; -1 for no placement.
     outcome : ndarray of uint8, shape (n,)
@@ -32,6 +34,7 @@ class TelegramLog:
     problems : tuple of str
     """
 
+    file: Path
     offset: np.ndarray
     placement: np.ndarray
     outcome: np.ndarray
@@ -110,7 +113,7 @@ def read_telegrams(file, within):
         values[mine, 0] = reasons.shape[1] - values[mine].sum(axis=1)
     problems = [f"{path}: the last row is cut off, its telegram is left out"] * torn
     problems += [f"{file}: {note}" for note in [*notes, *_damage(index, outcome, len(data))]]
-    return scans, TelegramLog(offset, index["placement"], outcome, values, tuple(problems))
+    return scans, TelegramLog(file, offset, index["placement"], outcome, values, tuple(problems))
 
 
 def _check_index(index, size, file):

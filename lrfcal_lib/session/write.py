@@ -181,7 +181,7 @@ class SessionWriter:
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
-        """Append an image: a PNG or JPEG file, copied byte for byte, or blue-green-red pixels (h, w, 3).
+        """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red pixels (h, w, 3).
 
         The placement is -1 for none, pitch in radians, purpose one of 'board', 'intrinsics', 'scene'. SessionError for
         an unknown camera or purpose, or an image of another size than the camera's.
@@ -189,12 +189,16 @@ class SessionWriter:
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
-        pixels = isinstance(image, np.ndarray)
-        size = image.shape[1::-1] if pixels else read.image_size(image)
-        read.check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
+        what, content = f"camera '{camera}'", image
+        if isinstance(image, np.ndarray):
+            content = cv2.imencode(".png", image)[1].tobytes()
+        elif not isinstance(image, bytes):
+            what, content = image, stated.read_bytes(image)
+        read.check_image_size(what, read.size_in_header(what, content), self.cameras[camera])
         self.shots[camera] += 1
-        name = f"images/{camera}/{self.shots[camera]:04d}{'.png' if pixels else Path(image).suffix.lower()}"
-        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else stated.read_bytes(image))
+        kind = "jpg" if content[:2] == b"\xff\xd8" else "png"
+        name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
+        self._write(name, content)
         self._note_placement(placement)
         number = "" if placement < 0 else placement
         self._append_rows("images.csv", [[cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]])

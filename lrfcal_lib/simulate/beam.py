@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -86,10 +86,6 @@ class Beam:
         """Diameter of the spot, metres."""
         return self.spot_exit + self.divergence * np.asarray(distance, float)
 
-    def with_settings(self, **changes):
-        """The same device set otherwise."""
-        return replace(self, **changes)
-
 
 _OUTDOOR = {
     "spot_exit": 0.016, "divergence": 0.0119, "sigma_range": 0.010, "systematic": 0.0,
@@ -146,22 +142,12 @@ def echo(beam, distance, energy):
 
 
 def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
-    """Readings without noise, offset and rounding.
-
-    Parameters
-    ----------
-    beam : Beam
-    world : World
-    bearings, pitch : ndarray, shape (n,)
-        Radians; the pitch of the head while each beam is measured.
-    T_head_lrf : RigidTransform
+    """Readings without noise, offset and rounding, of beams at bearings (n,) while the head is at pitch (n,), radians.
 
     Returns
     -------
-    reading : ndarray, shape (n,)
-        Metres; NaN without an echo.
-    total : ndarray, shape (n,)
-        Returned energy.
+    reading, total : ndarray, shape (n,)
+        Metres, NaN without an echo; returned energy.
     dazzled : ndarray of bool, shape (n,)
 
     Notes

@@ -191,12 +191,6 @@ def _views(bench, pose, at, rng, noise):
 def draw_shots(setup, rng, trials, placements=20):
     """Draw calibration sessions of single shots: one scan line and one image a placement.
 
-    Parameters
-    ----------
-    setup : ShotSetup
-    rng : numpy.random.Generator
-    trials, placements : int
-
     Returns
     -------
     dict of ndarray

@@ -19,11 +19,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_words
+from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
-from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room
+from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room, need
 
 LICENCE = "CC-BY-4.0"
 SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACES is one more
@@ -72,8 +73,7 @@ def world_of(setup, T_platform_board, stand=True):
 
 def step_angles(first, last, step):
     """Pitch commands of a stop-and-go sweep: multiples of `step` from about `first` to about `last`, radians."""
-    if step <= 0:
-        raise ValueError(f"a pitch step must be positive, got {step} rad")
+    need(step > 0, f"a pitch step must be positive, got {step} rad")
     low, high = sorted((first, last))
     angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
     return angles if last >= first else angles[::-1]
@@ -121,15 +121,7 @@ def photograph(setup, shots):
 
 
 def simulate(path, setup, workers=1):
-    """Simulate a recording and write its session.
-
-    Parameters
-    ----------
-    path : path-like
-        Folder of the new session; must not exist.
-    setup : Setup
-    workers : int
-        Processes that render images.
+    """Simulate a recording and write its session into a new folder; `workers` processes render the images.
 
     Raises
     ------
@@ -158,9 +150,9 @@ def _record(folder, name, setup, workers):
     everything = boards if room is None else [*boards, room]
     for placement in everything:
         setup.rig.platform.check(np.array(placement.sweep))
-    clock, log, truth = 0.0, ["t_s,commanded_deg,measured_deg"], _truth(setup, boards)
+    clock, log, truth = 0.0, [",".join(PLATFORM_COLUMNS)], _truth(setup, boards)
     with _writer(folder, name, setup) as writer:
-        mode = Configuration().changed(measuring_mode=0, unit="mm" if beam.unit < 0.005 else "cm")
+        mode = Configuration().changed(measuring_mode=0, unit=_unit(beam))
         writer.add_telegrams(-1, [encode_configuration(mode)], time_s=0.0)
         shots = shots_of(setup, everything)
         files = _photographs(setup, shots, workers)
@@ -201,6 +193,10 @@ def _writer(folder, name, setup):
     )  # fmt: skip
 
 
+def _unit(beam):
+    return "mm" if beam.unit < 0.005 else "cm"
+
+
 def _add_placement(writer, setup, placement, photos, clock, log, truth):
     """Write the images and then the sweep of a placement; the time when it is done."""
     beam, pause, (images, lines) = setup.rig.beam, setup.rig.platform.settle, stops_of(setup, placement)
@@ -209,8 +205,7 @@ def _add_placement(writer, setup, placement, photos, clock, log, truth):
         _add_images(writer, setup, item, files, truth, images, shot_at)
     scan_time = beam.turns * lrf.MIRROR_TURN
     began = shot_at[-1] + pause + (pause + scan_time) * np.arange(len(lines.true))
-    unit = "mm" if beam.unit < 0.005 else "cm"
-    telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement).words]
+    telegrams = [encode_words(words, unit=_unit(beam)) for words in sweep_of(setup, placement).words]
     writer.add_telegrams(placement.number, telegrams, lines.measured, np.round(began + scan_time + REPLY_TIME, 4))
     for stops, times in ((images, shot_at), (lines, began)):
         rows = zip(times, np.degrees(stops.commanded), np.degrees(stops.measured), strict=True)
@@ -222,12 +217,9 @@ def _add_placement(writer, setup, placement, photos, clock, log, truth):
 def _add_images(writer, setup, item, files, truth, stops=None, times=None):
     name = setup.rig.cameras[item.camera].name
     for i, data in enumerate(files):
-        picture = writer.path / f"{name}.jpg"
-        write_file(picture, data, writer.path)
         pitch, true = (0.0, 0.0) if stops is None else (float(stops.measured[i]), float(stops.true[i]))
         time = math.nan if times is None else float(np.round(times[i], 4))
-        writer.add_image(name, picture, item.placement, pitch=pitch, time_s=time, purpose=item.purpose)
-        picture.unlink()
+        writer.add_image(name, data, item.placement, pitch=pitch, time_s=time, purpose=item.purpose)
         known = {"pitch_rad": true}
         if item.T_platform_board is not None:
             known["T_camera_board"] = transform_to_json(item.poses[i] * item.T_platform_board)
@@ -260,8 +252,7 @@ def write_card(folder, names):
     lines = {name: f"{value}  {name}\n" for name, value in sums.items()}
     before, first, rest = (folder / "README.md").read_text().partition(BEGIN)
     _, last, after = rest.partition(END)
-    if not (first and last):
-        raise ValueError(f"{folder / 'README.md'}: put the marks '{BEGIN}' and '{END}' around the table of sums")
+    need(first and last, f"{folder / 'README.md'}: put the marks '{BEGIN}' and '{END}' around the table of sums")
     rows = ["| file | bytes | SHA-256 |", "|---|---|---|"]
     for name in names:
         rows += [f"| {name}/{f} | {(folder / name / f).stat().st_size} | `{sums[f'{name}/{f}']}` |" for f in SMALL]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -195,7 +195,7 @@ def load_setup(name):
         RigidTransform.from_components(row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True))
         for k in ("head", "head_stated")
     )
-    beam, platform = LMS221.with_settings(**row["beam"]), Platform(**_radians(row["platform"]))
+    beam, platform = replace(LMS221, **row["beam"]), Platform(**_radians(row["platform"]))
     rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
     return Setup(name, rig=rig, **{k: row[k] for k in names})
 
@@ -259,27 +259,10 @@ def check_size(rig, nearest):
 def pairs(rig, count, distances, rng, margin=OUTSIDE):
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
-    Parameters
-    ----------
-    rig : Rig
-    count : int
-        Of pairs.
-    distances : tuple of float
-        Least and greatest distance of the board from the platform, metres.
-    rng : numpy.random.Generator
-    margin : float
-        The sweep begins and ends this far outside the board, radians.
-
-    Returns
-    -------
-    list of Placement
-        Numbered from 1. The first of each pair has images at three pitch angles, the second at one. Sweeps go upwards
-        at odd placements and downwards at even ones.
-
-    Raises
-    ------
-    ValueError
-        If the board does not fit into a view, or no place is found that everything sees.
+    Boards stand at `distances` (least and greatest, metres) from the platform; a sweep begins and ends `margin`
+    (radians) outside of them. Placements are numbered from 1. The first of each pair has images at three pitch angles,
+    the second at one. Sweeps go upwards at odd placements and downwards at even ones. ValueError if the board does not
+    fit into a view, or no place is found that everything sees.
     """
     asked = f"{count} pairs at {distances} m"
     need(count >= 1 and 0.3 <= distances[0] <= distances[1], f"{asked}: at least one pair, at 0.3 m or more, is needed")

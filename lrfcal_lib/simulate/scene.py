@@ -416,20 +416,9 @@ class Imager:
         need(miss < 1e-3, f"lens {model.distortion} folds the image (off by {miss:.3g} px): weaken the distortion")
 
     def render(self, world, T_camera_platform, rng):
-        """Take a picture.
+        """Take a picture of a World with lights: blue, green, red, ndarray of uint8, shape (height, width, 3).
 
-        Parameters
-        ----------
-        world : World
-            With lights.
-        T_camera_platform : RigidTransform
-        rng : numpy.random.Generator
-            Places the rays in the pixels and makes the noise.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3)
-            Blue, green, red.
+        `rng` places the rays in the pixels and makes the noise.
         """
         e, m = self.exposure, self.model
         light = self.light(world, T_camera_platform, rng)
