@@ -260,8 +260,9 @@ def solve(
         See :func:`null_space`; ones by default.
     words : callable, optional
         ``direction (k,) -> str``; the names with the largest components by default.
-    groups : array_like, shape (n,), optional
-        Placement of every residual, for `covariance_placements` (with `shared` the leading axis is the placement).
+    groups : array_like, optional
+        Placement of every residual, or of every few in a row, for `covariance_placements` (with `shared` the leading
+        axis is the placement).
     freedom, n_observations : optional
         Degrees of freedom of chi-square, and number of observations; by default those of the residuals.
     required : bool
@@ -318,7 +319,8 @@ def _by_placement(r, J, weights, groups, shared):
     weighted = np.swapaxes(weights[..., None] * J, -1, -2)
     if shared is not None:
         return reduced_hessian(weighted @ J, shared), (weighted @ r[..., None])[:, :shared, 0]
-    groups = np.zeros(r.shape[-1], int) if groups is None else np.asarray(groups)
+    groups = np.zeros(1, int) if groups is None else np.asarray(groups)
+    groups = np.repeat(groups, r.shape[-1] // len(groups))
     rows = [groups == group for group in np.unique(groups)]
     hessians = [weighted[..., here] @ J[..., here, :] for here in rows]
     scores = [(weighted[..., here] @ r[..., here, None])[..., 0] for here in rows]

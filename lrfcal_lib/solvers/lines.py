@@ -85,8 +85,7 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=
     problem, earlier = evaluate, []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
-    placement = getattr(obs, f"{uses}_placement")
-    groups = np.repeat(placement, evaluate(pose).residuals.shape[-1] // len(placement))
+    groups = getattr(obs, f"{uses}_placement")
     about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, obs.camera)}
     return solve(problem, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
 

@@ -302,7 +302,7 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
     count = int(sets.count.sum())
     return solve(
         problem, pose, move_pose, names=POSE_NAMES, method=method, read=read_pose,
-        words=lambda d: motion_words(d, obs.camera), groups=np.repeat(sets.placements, 4), freedom=count - 6,
+        words=lambda d: motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
         required=required, n_observations=count, earlier=earlier,
         chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0, **options,
     )  # fmt: skip
