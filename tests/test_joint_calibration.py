@@ -127,19 +127,6 @@ def test_what_did_not_converge_is_not_handed_over(found):
     assert tables.handed_over(replace(found, joint=replace(found.joint, solution=bad))) in ("line", "zhang_pless")
 
 
-def test_tables_hold_the_joint_estimate(found, joint):
-    comparison = tables.method_comparison(found.observations, found.solutions, joint=joint)
-    row = comparison[comparison.method == "joint"].iloc[0]
-    assert np.isfinite([row.left_out_edge_rms_px, row.left_out_plane_rms_mm]).all()
-    assert "joint" in set(tables.platform_calibration_table(found.platform).method)
-    assert "joint" in set(tables.camera_calibration_table(found.solutions).method)
-    assert set(jointly.joint_table(joint).unit) <= {"deg", "mm", "%", "1"}
-    assert (jointly.joint_table(joint).sigma > 0).all()
-    assert len(jointly.noise_table(joint)) == len(joint.solution.noise)
-    assert jointly.joint_fit(joint)["plane_rms_mm"] < 12
-    assert set(jointly.edge_bias_mm(joint).edge) <= set(joint.observations.edges)
-
-
 def test_boards_of_unknown_size_in_the_coloured_cloud(joint):
     """Edge lengths from the plane of the cloud and the edges in the images, calibrated without the placement."""
     true = joint.prepared.board.lengths()
