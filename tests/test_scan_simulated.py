@@ -7,7 +7,8 @@ import pytest
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
+from lrfcal_lib.preprocess.board_in_scan import find_board
+from lrfcal_lib.preprocess.edges_in_scan import edge_points, sweep_edges
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 
@@ -23,22 +24,17 @@ def opened(name):
 
 @lru_cache
 def seen(name, placement):
-    """The board in a sweep, with the place of every beam on its true plane (board frame) and the true ranges."""
+    """The board in a sweep, how far every beam lies outside the true outline on its true plane, and the true ranges."""
     session, truth = opened(name)
-    sweep = session.sweep(placement)
+    sweep, pose = session.sweep(placement), truth.boards[placement]
     pitch = np.repeat(truth.pitch[placement][:, None], len(sweep.bearings), axis=1)
     origin = lrf_to_platform(np.zeros(pitch.shape + (3,)), pitch, truth.T_head_lrf)
     rays = lrf_to_platform(polar_to_points(np.ones(pitch.shape), sweep.bearings), pitch, truth.T_head_lrf) - origin
-    pose = truth.boards[placement]
-    normal = pose.rotation.apply([0, 0, 1.0])
+    normal, lines = pose.rotation.apply([0, 0, 1.0]), truth.board.lines()
     ranges = (normal @ pose.translation - origin @ normal) / (rays @ normal)
     at = pose.inv().apply((origin + ranges[..., None] * rays).reshape(-1, 3))[:, :2]
-    beyond = (at @ truth.board.lines()[:, :2].T + truth.board.lines()[:, 2]).max(axis=1).reshape(pitch.shape)
-    return (
-        board_in_scan.find_board(sweep, session.board, session.T_head_lrf),
-        np.where(ranges > 0, beyond, np.inf),
-        ranges,
-    )
+    beyond = np.where(ranges > 0, (at @ lines[:, :2].T + lines[:, 2]).max(axis=1).reshape(pitch.shape), np.inf)
+    return find_board(sweep, session.board, session.T_head_lrf), beyond, ranges
 
 
 def on_board(name, placement, edges):
@@ -64,10 +60,7 @@ def test_the_board_and_hardly_anything_else_is_found(name, placement):
 @pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
 def test_each_edge_gives_one_side_with_its_direction(name, placement):
     lines, number_of = opened(name)[1].board.lines(), {}
-    for edges in (
-        edges_in_scan.edge_points(seen(name, placement)[0]),
-        edges_in_scan.sweep_edges(seen(name, placement)[0]),
-    ):
+    for edges in (edge_points(seen(name, placement)[0]), sweep_edges(seen(name, placement)[0])):
         p, here = on_board(name, placement, edges), []
         for side in edges.sides:
             mine = p[edges.side == side.side]
@@ -84,7 +77,5 @@ def test_each_edge_gives_one_side_with_its_direction(name, placement):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_board_that_hangs_together_with_the_room_is_found_by_any_sample(seed):
     session, (expected, _, _) = opened("sim_lms221")[0], seen("sim_lms221", 2)
-    board = board_in_scan.find_board(
-        session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed)
-    )
+    board = find_board(session.sweep(2), session.board, session.T_head_lrf, rng=np.random.default_rng(seed))
     assert np.sum(board.mask != expected.mask) < 0.03 * expected.mask.sum()

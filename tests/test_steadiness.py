@@ -103,28 +103,27 @@ def test_derivative_of_the_motion_is_that_of_differences():
     np.testing.assert_allclose((base - moved) / step, by_state[:, :, 3], atol=1e-5)
 
 
+def in_pixels(bare):
+    return distort(bare, MODEL.distortion) * [MODEL.fx, MODEL.fy] + [MODEL.cx, MODEL.cy]
+
+
 @pytest.mark.parametrize("scale", [1.0, 1.002])
 def test_a_turn_is_recovered_among_features_that_went_elsewhere(scale):
-    rng = np.random.default_rng(1)
+    rng, turn = np.random.default_rng(1), np.array([0.003, -0.002, 0.004])
     bare = rng.uniform(-0.7, 0.7, (400, 2)) * [1.0, 0.66]
-    focal, centre = np.array([MODEL.fx, MODEL.fy]), np.array([MODEL.cx, MODEL.cy])
-    turn = np.array([0.003, -0.002, 0.004])
     rays = Rotation.from_rotvec(turn).apply(np.column_stack([bare, np.ones(400)]))
-    start = distort(bare, MODEL.distortion) * focal + centre
-    end = distort(scale * rays[:, :2] / rays[:, 2:], MODEL.distortion) * focal + centre
-    start, end = start + 0.05 * rng.standard_normal(start.shape), end + 0.05 * rng.standard_normal(end.shape)
+    start, end = in_pixels(bare), in_pixels(scale * rays[:, :2] / rays[:, 2:])
+    start, end = (p + 0.05 * rng.standard_normal(p.shape) for p in (start, end))
     end[:100] += rng.uniform(-6, 6, (100, 2))
     found = fit_motion(start, end, MODEL)
     error = np.r_[found.rotvec - turn, found.scale - scale]
     assert (np.abs(error) < 4 * np.sqrt(np.diag(found.covariance))).all()
-    assert np.abs(error).max() * MODEL.fx < 0.03
-    assert 220 < found.n_features < 340
+    assert np.abs(error).max() * MODEL.fx < 0.03 and 220 < found.n_features < 340
 
 
 def test_the_covariance_is_that_of_many_draws():
     rng = np.random.default_rng(2)
-    bare = rng.uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.66]
-    pixels = distort(bare, MODEL.distortion) * [MODEL.fx, MODEL.fy] + [MODEL.cx, MODEL.cy]
+    pixels = in_pixels(rng.uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.66])
     draws = [fit_motion(pixels, pixels + 0.1 * rng.standard_normal(pixels.shape), MODEL) for _ in range(60)]
     spread = np.std([np.r_[d.rotvec, d.scale] for d in draws], axis=0)
     stated = np.sqrt(np.mean([np.diag(d.covariance) for d in draws], axis=0))
@@ -191,21 +190,19 @@ def test_all_steps_are_found():
     np.testing.assert_allclose(steps[1].rotvec, [-0.002, 0.001, 0.0], atol=1e-4)
 
 
-@pytest.mark.parametrize("k", [1, 10, 19])
-def test_one_placement_apart_is_no_step(k):
-    turns = np.zeros((20, 3))
-    turns[k] = 0.003
-    assert find_steps(*motion(turns, 3e-5)) == ()
+SMALL = 0.1 / MODEL.fx
+NO_STEP = {
+    "one placement apart": (step_at(10, size=(0.003,) * 3) - step_at(11, size=(0.003,) * 3), 3e-5),
+    "the first apart": (step_at(1, size=(0.003,) * 3), 3e-5),
+    "the last apart": (step_at(19, size=(0.003,) * 3), 3e-5),
+    "too small to matter": (step_at(10, size=(SMALL, 0, 0)), SMALL / 50),
+    "five placements": (step_at(3, 5), 1e-6),
+}
 
 
-def test_a_step_too_small_to_matter_is_not_reported():
-    small = 0.1 / MODEL.fx
-    assert find_steps(*motion(step_at(10, size=(small, 0, 0)), small / 50)) == ()
-    assert find_steps(*motion(step_at(10, size=(6 * small, 0, 0)), small / 50))
-
-
-def test_five_placements_are_too_few():
-    assert find_steps(*motion(step_at(3, 5), 1e-6)) == ()
+@pytest.mark.parametrize("what", NO_STEP)
+def test_what_is_no_step(what):
+    assert find_steps(*motion(*NO_STEP[what])) == ()
 
 
 def test_a_camera_on_the_head_is_not_judged(texture):

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import f as f_distribution
 
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import lrf_to_platform
+from lrfcal_lib.model.geometry import gradient_by_pose, lrf_to_platform, move_pose, pose_array, rotate_points
 from lrfcal_lib.preprocess.board_in_scan import face_points, plane_axes
+from lrfcal_lib.preprocess.intrinsics import raised_points
 
 MOST_POINTS = 12000  # a placement; more of them only cost time, since parts of the board count
 MARGIN = 0.02  # of a scan line and of a column, left out at either end: mixed pixels
@@ -96,18 +96,9 @@ class BoardBends:
 class Face:
     """Points on a board's face in coordinates of its plane.
 
-    Attributes
-    ----------
-    flat : ndarray, shape (n, 2)
-        Metres.
-    height : ndarray, shape (n,)
-        Over the plane, away from the LRF, metres.
-    by_range : ndarray, shape (n,)
-        Derivative of the height by the range.
-    around : ndarray, shape (n,)
-        0 within the pattern, 1 around it, nan in between; all 0 for one material, or an unknown place of the pattern.
-    outline : ndarray, shape (k, 2)
-        Corners of the area that was scanned, metres.
+    `flat` (n, 2) in metres; `height` (n,) over the plane, away from the LRF, and its derivative by the range; `around`
+    (n,) is 0 within the pattern, 1 around it, nan in between (all 0 for one material, or an unknown place of the
+    pattern); `outline` (k, 2) are the corners of the area that was scanned.
     """
 
     flat: np.ndarray
@@ -140,27 +131,18 @@ def board_bends(prepared, to_board=None):
     found = {p: bend_of(face, p, level if applied else 0.0) for p, face in faces.items()}
     sheets = {p: sheet_surface(prepared, p) for p in faces if p in to_board and not found[p].reason}
     sheets = {p: sheet for p, sheet in sheets.items() if sheet is not None}
-    usual = np.median([surface for surface, _ in sheets.values()], axis=0) if len(sheets) >= FEWEST_SHEETS else None
-    for p, (surface, covariance) in sheets.items() if usual is not None else ():
-        size, spread = _height_range(faces[p], surface - usual, covariance)
-        found[p] = replace(found[p], sheet=size, sheet_sigma=spread)
+    if len(sheets) >= FEWEST_SHEETS:
+        usual = np.median([surface for surface, _ in sheets.values()], axis=0)
+        for p, (surface, covariance) in sheets.items():
+            size, spread = _height_range(faces[p], surface - usual, covariance)
+            found[p] = replace(found[p], sheet=size, sheet_sigma=spread)
     return BoardBends(found, level, sigma, applied)
 
 
 def face_of(scan, board=None, to_board=None):
-    """The face of a scanned board in coordinates of its plane.
+    """The face of a scanned board (BoardScan) in coordinates of its plane.
 
-    Parameters
-    ----------
-    scan : BoardScan
-    board : Board, optional
-    to_board : callable, optional
-        See :func:`board_bends`.
-
-    Returns
-    -------
-    Face
-        In board coordinates with `to_board`, else in arbitrary ones of the plane.
+    In board coordinates with `to_board` (see :func:`board_bends`), else in arbitrary ones of the plane.
     """
     p_lrf, pitch, _ = face_points(scan, MOST_POINTS, MARGIN)
     points = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf)
@@ -193,16 +175,9 @@ def around_pattern(flat, board):
 
 
 def common_level(faces):
-    """How much farther the board around the pattern reads than the pattern, over all placements.
+    """How much farther the board around the pattern reads than the pattern: median over placements, and its sigma.
 
-    Parameters
-    ----------
-    faces : sequence of Face
-
-    Returns
-    -------
-    level, sigma : float
-        Median over placements and its standard deviation, metres; nan with fewer than four that show both materials.
+    Metres; nan with fewer than four faces that show both materials.
     """
     levels = []
     for face in faces:
@@ -211,7 +186,7 @@ def common_level(faces):
         if LEAST_SHARE < share < 1 - LEAST_SHARE:
             columns = np.column_stack([_surface(face, face.flat), np.nan_to_num(face.around) * face.by_range])
             levels.append(_robust_fit(columns[known], face.height[known])[0][-1])
-    if len(levels) < 4:
+    if len(levels) < FEWEST_SHEETS:
         return np.nan, np.nan
     spread = 1.4826 * np.median(np.abs(levels - np.median(levels)))
     return float(np.median(levels)), float(1.2533 * spread / np.sqrt(len(levels)))
@@ -219,8 +194,7 @@ def common_level(faces):
 
 def _surface(face, flat):
     """Columns of a plane and a quadratic surface at points of the plane, shape (n, 6)."""
-    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
-    x, y = (flat - (low + high) / 2).T
+    x, y = (flat - (face.outline.min(axis=0) + face.outline.max(axis=0)) / 2).T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
@@ -238,61 +212,35 @@ def _robust_fit(columns, values, rounds=3):
 def bend_of(face, placement=0, level=0.0):
     """The bend of one board.
 
-    Parameters
-    ----------
-    face : Face
-    placement : int
-    level : float
-        Taken off the ranges around the pattern, metres; points that may belong to either material are left out then.
-
-    Returns
-    -------
-    Bend
+    `level` (metres) is taken off the ranges around the pattern; points that may belong to either material are left out
+    then. The covariance comes from the scatter over parts of the board. Few parts may agree by luck, so that single
+    points have their say in the p-value as well.
     """
+    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
+    cell = np.clip((PARTS * (face.flat - low) / np.maximum(high - low, 1e-9)).astype(int), 0, PARTS - 1)
     known = np.isfinite(face.around) if level else np.ones(len(face.flat), bool)
-    part = _part_of(face)[known]
+    part = (cell @ [1, PARTS])[known]
     if len(np.unique(part)) < FEWEST_PARTS:
         reason = f"the scan shows {len(np.unique(part))} of {PARTS**2} parts of the board, {FEWEST_PARTS} are needed"
         return Bend(placement, np.nan, np.nan, np.nan, False, f"placement {placement}: {reason}")
     columns = _surface(face, face.flat[known])
     height = face.height[known] - (level * np.nan_to_num(face.around) * face.by_range)[known]
     found, miss, used = _robust_fit(columns, height)
-    by_parts, by_points = _covariances(columns[used], miss[used], part[used])
-    q = found[3:]
-    p_value = max(_p_value(q, *by_parts), _p_value(q, *by_points))
-    size, sigma = _height_range(face, q, by_parts[0])
-    return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
-
-
-def _part_of(face):
-    """Which part of the board each point belongs to."""
-    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
-    column = np.clip((PARTS * (face.flat - low) / np.maximum(high - low, 1e-9)).astype(int), 0, PARTS - 1)
-    return column @ [1, PARTS]
-
-
-def _covariances(columns, miss, part):
-    """Covariances of the quadratic terms with their degrees of freedom: from the scatter over parts, and over points.
-
-    The first one leaves out each part in turn (the jackknife, without refitting): plain scores of so few parts would
-    call a flat board bent six times too often. Few parts may agree by luck, so that points have their say as well.
-    """
-    pieces, unknowns = np.unique(part), columns.shape[1]
-    bread = np.linalg.inv(columns.T @ columns)
-    moved = np.stack([_without(columns[part == p], miss[part == p], bread) for p in pieces])
-    by_parts = (len(pieces) - 1) / len(pieces) * moved.T @ moved
+    columns, miss, part, q = columns[used], miss[used], part[used], found[3:]
+    bread, pieces, unknowns = np.linalg.inv(columns.T @ columns), np.unique(part), columns.shape[1]
+    # leaves out each part in turn (the jackknife, without refitting): plain scores of so few parts would call a flat
+    # board bent six times too often
+    moved = []
+    for C, m in ((columns[part == p], miss[part == p]) for p in pieces):
+        moved.append(bread @ np.linalg.solve(np.eye(unknowns) - C.T @ C @ bread, C.T @ m))
+    by_parts = (len(pieces) - 1) / len(pieces) * np.transpose(moved) @ moved
     by_points = bread * (miss @ miss) / (len(miss) - unknowns)
-    return (by_parts[3:, 3:], len(pieces) - unknowns), (by_points[3:, 3:], len(miss) - unknowns)
-
-
-def _without(columns, miss, bread):
-    """How far the coefficients move when these points are left out of a fit, shape (6,)."""
-    return bread @ np.linalg.solve(np.eye(len(bread)) - columns.T @ columns @ bread, columns.T @ miss)
-
-
-def _p_value(q, covariance, free):
-    """Of quadratic terms on a flat board."""
-    return float(f_distribution.sf(q @ np.linalg.solve(covariance, q) / len(q), len(q), free))
+    p_value = 0.0
+    for covariance, count in ((by_parts, len(pieces)), (by_points, len(miss))):
+        F = q @ np.linalg.solve(covariance[3:, 3:], q) / len(q)
+        p_value = max(p_value, float(f_distribution.sf(F, len(q), count - unknowns)))
+    size, sigma = _height_range(face, q, by_parts[3:, 3:])
+    return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
 
 
 def _height_range(face, q, covariance):
@@ -311,51 +259,40 @@ def _height_range(face, q, covariance):
 def sheet_surface(prepared, placement):
     """The bend of the printed sheet at a placement over the waves that it has at all of them, from the images.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    placement : int
-
-    Returns
-    -------
-    (ndarray, shape (3,), ndarray, shape (3, 3)) or None
-        Coefficients of x^2, x y, y^2 of the board frame, away from the camera, 1/m, with their covariance, which grows
-        by what two cameras differ; None without a pattern in an image.
+    Coefficients of x^2, x y, y^2 of the board frame, away from the camera, 1/m, with their covariance (3, 3), which
+    grows by what two cameras differ; None without a pattern in an image.
     """
-    pattern, information, right, seen = prepared.board.pattern, np.zeros((3, 3)), np.zeros(3), []
+    if prepared.board.pattern is None:
+        return None
+    points, seen = raised_points(prepared.board.pattern, prepared.relief), []
     for camera, views in prepared.views.items():
         view = views.get(placement)
-        if pattern is None or view is None or view.pixels is None or view.T_camera_board is None:
+        if view is None or view.pixels is None or view.T_camera_board is None:
             continue
         if np.isfinite(view.pixels).all(axis=1).sum() >= FEWEST_CORNERS:
-            q, weight = _bent_pattern(view, prepared.models[camera], pattern.points(), prepared.relief)
-            seen.append((q, weight))
-            information, right = information + weight, right + weight @ q
+            seen.append(_bent_pattern(view, prepared.models[camera], points))
     if not seen:
         return None
-    q = np.linalg.solve(information, right)
-    differ = sum((own - q) @ weight @ (own - q) for own, weight in seen) / max(3 * (len(seen) - 1), 1)
+    surfaces, weights = (np.stack(v) for v in zip(*seen, strict=True))
+    information = weights.sum(axis=0)
+    q = np.linalg.solve(information, np.einsum("nij,nj->i", weights, surfaces))
+    differ = np.einsum("ni,nij,nj->", surfaces - q, weights, surfaces - q) / max(3 * (len(seen) - 1), 1)
     return q, np.linalg.inv(information) * max(1.0, differ)
 
 
-def _bent_pattern(view, model, points, relief, rounds=6):
+def _bent_pattern(view, model, points, rounds=6):
     """Surface of the pattern in one image (coefficients with their information), pose and surface free."""
     seen = np.isfinite(view.pixels).all(axis=1)
-    points[:, 2] += 0.0 if relief is None else relief
     x, y = (points[seen, :2] - points[:, :2].mean(axis=0)).T
-    shape, pose, q = np.stack([x * x, x * y, y * y], axis=1), view.T_camera_board, np.zeros(3)
-    away = np.sign(pose.rotation.as_matrix()[:, 2] @ pose.translation)
+    shape, pose, q = np.stack([x * x, x * y, y * y], axis=1), pose_array(view.T_camera_board), np.zeros(3)
+    away = np.sign(pose[:, 2] @ pose[:, 3])
     for _ in range(rounds):
-        rotation = pose.rotation.as_matrix()
-        turned = (points[seen] + np.outer(shape @ q, [0.0, 0.0, 1.0])) @ rotation.T
-        miss = view.pixels[seen] - project(turned + pose.translation, model)
-        by_point = project_jacobians(turned + pose.translation, model)[0]
-        by_turn = np.cross(turned[:, None], by_point)  # a . (w x p) = w . (p x a)
-        by_shape = (by_point @ rotation[:, 2])[:, :, None] * shape[:, None]
-        jacobian = np.concatenate([by_turn, by_point, by_shape], axis=2).reshape(-1, 9)
+        turned = rotate_points(pose, points[seen] + np.outer(shape @ q, [0.0, 0.0, 1.0]))
+        miss = view.pixels[seen] - project(turned + pose[:, 3], model)
+        by_point = project_jacobians(turned + pose[:, 3], model)[0]
+        by_shape = (by_point @ pose[:, 2])[:, :, None] * shape[:, None]
+        jacobian = np.concatenate([gradient_by_pose(turned[:, None], by_point), by_shape], axis=2).reshape(-1, 9)
         step = np.linalg.lstsq(jacobian, miss.ravel(), rcond=None)[0]
-        turn = Rotation.from_rotvec(step[:3]) * pose.rotation
-        pose, q = RigidTransform.from_components(pose.translation + step[3:6], turn), q + step[6:]
+        pose, q = move_pose(pose, step[:6]), q + step[6:]
     variance = np.sum(miss**2) / (miss.size - 9)
-    covariance = np.linalg.inv(jacobian.T @ jacobian)[6:, 6:] * variance
-    return away * q, np.linalg.inv(covariance)
+    return away * q, np.linalg.inv(np.linalg.inv(jacobian.T @ jacobian)[6:, 6:] * variance)

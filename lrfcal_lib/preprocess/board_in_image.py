@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project, undistort
+from lrfcal_lib.model.camera import line_distance, pinhole, pinhole_jacobian, project, undistort
 from lrfcal_lib.model.geometry import apply_pose, gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
 from lrfcal_lib.preprocess.edges_in_image import (
     FULL_CONTRAST,
@@ -98,12 +98,9 @@ def view_board(image, board, model, view=None, picks=None, *, pixels=None, lines
         Says whose image it is.
     picks : dict of str to ndarray, shape (2, 2), optional
         Ends of edges picked by hand (recorded pixels), which override the detector.
-    pixels : ndarray, shape (k, 2)
-        Corners of the pattern in the right order; not for a board without one.
-    lines : ndarray, shape (E, 3), optional
-        Outline that predicts the edges around a pattern; without it none are looked for.
-    relief : ndarray, shape (k,), optional
-        Heights of the pattern's corners, metres.
+    pixels, lines, relief : ndarray
+        For a board with a pattern: its corners (k, 2) in the right order, the outline (E, 3) that predicts its edges
+        (without it none are looked for), and the heights of the corners (k,), metres.
     guess : RigidTransform, optional
         Rough ``T_camera_board``; chooses between the poses of a board without pattern.
 
@@ -303,7 +300,12 @@ def _view_plain(view, image, board, model, picks, guess):
             refine_edge(image, model, "", a + 0.04 * (b - a), b - 0.04 * (b - a), (a + b) / 2 - middle, SEARCH_PX)
             for a, b in sides
         ]
-        found = [item for item in board_poses(edges, board, model) if _carries_names(item[2], picks, model)]
+        ends = {name: undistort(uv, model) for name, uv in picks.items()}
+        found = [
+            item
+            for item in board_poses(edges, board, model)
+            if all(np.abs(line_distance(ends[e.name], e.line)).max() < SAME_NAMES_PX for e in item[2] if e.name in ends)
+        ]
     if not found:
         return replace(view, reason=f"no pose of board '{board.name}' explains the outline in the image")
     if guess is not None:
@@ -312,13 +314,6 @@ def _view_plain(view, image, board, model, picks, guess):
     inner = np.mean([e.centre for e in edges], axis=0)
     edges = tuple(_pick(e.name, picks[e.name], inner, model) if e.name in picks else e for e in edges)
     return replace(view, T_camera_board=pose, covariance=covariance, edges=edges, alternatives=others)
-
-
-def _carries_names(edges, picks, model):
-    """Whether the edges carry the names that were picked by hand."""
-    named = {e.name: e.line for e in edges}
-    off = [np.abs(undistort(ends, model) @ named[n][:2] + named[n][2]).max() for n, ends in picks.items()]
-    return max(off, default=0.0) < SAME_NAMES_PX
 
 
 def find_polygon(image, n_corners):

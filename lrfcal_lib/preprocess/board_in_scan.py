@@ -412,14 +412,14 @@ def jump_points(ranges, fitted, sigma_range):
     return inside | (single & _span(on, -2) & ~on)
 
 
-def count_jump_points(scan, width=MEDIAN_WIDTH):
+def count_jump_points(scan):
     """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of the paper.
 
     The filter runs over the board's returns and the jump points among and beside them, without the background: what
     step (i) of the paper leaves.
     """
     jumps = jump_points(scan.sweep.ranges, scan.fitted, scan.sigma_range)
-    filtered = median_filter(scan.sweep.ranges, scan.mask | jumps, width)
+    filtered = median_filter(scan.sweep.ranges, scan.mask | jumps)
     return scan.n_jump_points, int(jump_points(filtered, scan.fitted, scan.sigma_range).sum())
 
 

@@ -211,38 +211,17 @@ def edge_points(scan, variant="half_step"):
         along the ray by what the outermost beams say where the board turns out to be warped. The covariance holds the
         beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at
         less than 20 deg to the scan lines are left out (side -1): there the pitch decides where a line ends.
-
-    Raises
-    ------
-    ValueError
-        For another variant.
     """
     return _edges(scan, variant, False)
 
 
 def sweep_edges(scan, variant="half_step"):
-    """Where columns of the range image (one beam over the pitch) cross the board's edges.
+    """Where columns of the range image (one beam over the pitch) cross the board's edges: as :func:`edge_points`.
 
-    Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here.
-
-    Parameters
-    ----------
-    scan : BoardScan
-    variant : {'half_step', 'last_beam'}
-        As in :func:`edge_points`, with scan lines for beams.
-
-    Returns
-    -------
-    ScanEdges
-        Nothing ends at the first or last scan lines of the sweep, which may have been cut. The points lie on the
-        board at the pitch given with them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points`
-        sees too has the same number. Sides at less than 20 deg to the columns are left out (side -1).
-        The covariance is that of the pitch step (as a displacement on the board) and of the line fit.
-
-    Raises
-    ------
-    ValueError
-        For another variant.
+    Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here. Nothing ends at the
+    first or last scan lines of the sweep, which may have been cut. The points lie on the board at the pitch given with
+    them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points` sees too has the same number. The
+    covariance is that of the pitch step (as a displacement on the board) and of the line fit.
     """
     return _edges(scan, variant, True)
 
@@ -310,8 +289,8 @@ def _points_at(scan, line, beam, angle, shift, across):
     if not across:
         slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
         return (r + shift)[:, None] * rays, slope[:, None] * rays + r[:, None] * turned, range_sigma
-    ahead, there = (_plane_range(scan, rays, pitch) for pitch in (scan.sweep.pitch[line], angle))
-    points = (scan.fitted[line, beam] + (there - ahead))[:, None] * rays
+    change = _plane_range(scan, rays, angle) - _plane_range(scan, rays, scan.sweep.pitch[line])
+    points = (scan.fitted[line, beam] + change)[:, None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation  # d p / d pitch, in the LRF frame
     normal = tilt(scan.normal, -angle) @ rotation

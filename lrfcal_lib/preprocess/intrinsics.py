@@ -24,23 +24,11 @@ UP = np.array([0.0, 0.0, 1.0])
 class Adjustment:
     """Least squares over corners seen by rigidly mounted cameras.
 
-    Attributes
-    ----------
-    models : tuple of CameraModel
-        With `covariance` where the intrinsics were free; `rms_px` per camera.
-    mounting, poses : RigidTransform
-        Stacks: ``T_camera_first`` of every camera (the first is the identity), ``T_first_board`` of every view.
-    mounting_covariance, pose_covariance : ndarray, shape (cameras - 1, 6, 6), (views, 6, 6)
-    relief : ndarray, shape (k,)
-        Height of every corner over the sheet's mean plane, along z of the board, metres; zero unless it was free.
-    residuals : ndarray, shape (cameras, views, k, 2)
-        Seen minus predicted, pixels; NaN where a corner was not used.
-    sigma_px : float
-        Standard deviation of one coordinate, from the residuals.
-    rms_px : float
-        Root mean square distance between seen and predicted corners, as OpenCV counts it.
-    bic : float
-        Bayesian information criterion, to compare adjustments of the same corners.
+    `models` have covariances and rms where the intrinsics were free. `mounting` is a stack of ``T_camera_first`` (the
+    first is the identity), `poses` one of ``T_first_board``; their covariances (cameras - 1 or views, 6, 6) are of
+    ``[w, v]``. `relief` (k,) are the heights of the corners over the sheet's mean plane, metres, `residuals` (cameras,
+    views, k, 2) seen minus predicted pixels, NaN where a corner was not used. `sigma_px` is that of one coordinate,
+    `rms_px` of distances, as OpenCV counts it; `bic` compares adjustments of the same corners.
     """
 
     models: tuple
@@ -92,7 +80,22 @@ def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, rel
 
     state = minimise(evaluate, state, retract)[0]
     block = evaluate(state)
-    jacobian, count = block.jacobian[seen.ravel()], seen.sum()
+    residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
+    error, count, sigma_px, covariance = _noise(block, free)
+    lens, mount, view = (
+        _diagonal_blocks(covariance[a:b, a:b], size) for a, b, size in zip([0, *cuts], cuts, (9, 6, 6), strict=False)
+    )
+    if intrinsics:
+        each = zip(models, state[0], lens, map(_rms, residuals), strict=True)
+        models = [m.with_parameters(values, own, rms) for m, values, own, rms in each]
+    bic = float(count * np.log(max(error, 1e-300) / count) + free.sum() * np.log(count))
+    poses = pose_transform(state[1]), mount, pose_transform(state[2]), view
+    return Adjustment(tuple(models), *poses, basis @ state[3], residuals, sigma_px, _rms(residuals), bic)
+
+
+def _noise(block, free):
+    """Sum of squares, number of coordinates, sigma of one, and the covariance of all unknowns (zero where not free)."""
+    jacobian, count = block.jacobian[block.whitener > 0], int(block.whitener.sum())
     normal, error = jacobian.T @ jacobian, block.residuals @ block.residuals
     sigma2 = max(error / max(count - free.sum(), 1), 1e-18)
     # unit diagonal, so that pixels, radians and metres mix safely
@@ -100,24 +103,7 @@ def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, rel
     inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
     covariance = np.zeros((len(free),) * 2)
     covariance[np.ix_(free, free)] = sigma2 * inverse
-    residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
-    if intrinsics:
-        models = tuple(
-            m.with_parameters(values, covariance[9 * c : 9 * c + 9, 9 * c : 9 * c + 9], _rms(residuals[c]))
-            for c, (m, values) in enumerate(zip(models, state[0], strict=True))
-        )
-    return Adjustment(
-        tuple(models),
-        pose_transform(state[1]),
-        _diagonal_blocks(covariance[cuts[0] : cuts[1], cuts[0] : cuts[1]]),
-        pose_transform(state[2]),
-        _diagonal_blocks(covariance[cuts[1] : cuts[2], cuts[1] : cuts[2]]),
-        basis @ state[3],
-        residuals,
-        float(np.sqrt(sigma2)),
-        _rms(residuals),
-        float(count * np.log(max(error, 1e-300) / count) + free.sum() * np.log(count)),
-    )
+    return error, count, float(np.sqrt(sigma2)), covariance
 
 
 def predict(state, points, basis):
@@ -165,9 +151,9 @@ def _rms(residuals):
     return float(np.sqrt(2 * np.nanmean(residuals**2)))
 
 
-def _diagonal_blocks(covariance):
-    n = len(covariance) // 6
-    return covariance.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
+def _diagonal_blocks(covariance, size):
+    n = len(covariance) // size
+    return covariance.reshape(n, size, n, size)[np.arange(n), :, np.arange(n)]
 
 
 def adjust_robust(pixels, points, models, poses, mounting=None, **options):
@@ -266,32 +252,12 @@ def first_pose(points, pixels, model):
 
 
 def board_pose(pixels, pattern, model, relief=None, start=None):
-    """Pose of a chessboard in one image.
+    """Pose of a chessboard in one image: ``T_camera_board``, its covariance (6, 6) of ``[w, v]``, corners used (k,).
 
-    Parameters
-    ----------
-    pixels : array_like, shape (k, 2)
-        Recorded pixels in the order of ``pattern.points()``; NaN where a corner is not to be used.
-    pattern : Chessboard
-    model : CameraModel
-    relief : array_like, shape (k,), optional
-        Heights of the corners along z of the board, metres.
-    start : RigidTransform, optional
-        Replaces the start pose of OpenCV's solver.
-
-    Returns
-    -------
-    T_camera_board : RigidTransform
-    covariance : ndarray, shape (6, 6)
-        Of ``[w, v]`` (see :mod:`lrfcal_lib`), for the given intrinsics. The noise is taken from the residuals, and
-        widened where neighbouring residuals agree (a wavy sheet), because such errors do not average out.
-    used : ndarray of bool, shape (k,)
-        Without glaring corners.
-
-    Raises
-    ------
-    ValueError
-        With fewer than four corners, or when they do not determine a pose.
+    `pixels` (k, 2) are in the order of ``pattern.points()``, NaN where a corner is not to be used; glaring ones are
+    left out. The covariance is for the given intrinsics. The noise is taken from the residuals, and widened where
+    neighbouring residuals agree (a wavy sheet), because such errors do not average out. `start` replaces OpenCV's start
+    pose. ValueError with fewer than four corners, or when they do not determine a pose.
     """
     pixels, points = np.asarray(pixels, float), raised_points(pattern, relief)
     if pixels.shape != (len(points), 2) or np.isfinite(pixels).all(axis=1).sum() < 4:
@@ -312,25 +278,3 @@ def board_pose(pixels, pattern, model, relief=None, start=None):
 def raised_points(pattern, relief=None):
     """Corners of a pattern on a wavy sheet, board frame, metres; shape (k, 3)."""
     return pattern.points() + (0.0 if relief is None else np.asarray(relief, float)[:, None] * UP)
-
-
-def stereo_transform(first, second, pattern, models, *, intrinsics=False, relief=False):
-    """Relative pose of two cameras from chessboard views, and how well it is known: an Adjustment.
-
-    `first` and `second` hold the corners (k, 2) by placement, in the same order in both cameras; ``.mounting[1]`` is
-    ``T_second_first``. `intrinsics` refines those of both cameras along, `relief` lets the sheet be wavy.
-    """
-    common = sorted(set(first) & set(second))
-    if not common:
-        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
-    pixels = np.array([[first[p] for p in common], [second[p] for p in common]])
-    poses = [
-        RigidTransform.concatenate([board_pose(p, pattern, m)[0] for p in views])
-        for views, m in zip(pixels, models, strict=True)
-    ]
-    between = poses[1] * poses[0].inv()
-    shift, turn = np.median(between.translation, axis=0), between.rotation.mean()
-    mounting = RigidTransform.concatenate([RigidTransform.identity(), RigidTransform.from_components(shift, turn)])
-    options = {"intrinsics": intrinsics, "relief": relief}
-    fixed = (8,) if all(m.distortion[4] == 0 for m in models) else ()
-    return adjust_robust(pixels, pattern.points(), models, poses[0], mounting, fixed=fixed, **options)

@@ -49,7 +49,11 @@ class PatternFinder:
         PatternNotFound where no detector finds all corners; ValueError for what is no 8-bit image.
         """
         picture, size = grey(image), self.size
-        rough = self._rough(picture)
+        for negative in self.negatives:
+            rough = classic(picture, size, negative)
+            if rough is not None:
+                self.negatives = (negative, not negative)
+                break
         corners = sectors(picture, size) if rough is None else _smoothest(picture, size, rough)
         if corners is None or not _ends_in_squares(picture, corners, size):
             raise PatternNotFound(
@@ -59,14 +63,6 @@ class PatternFinder:
         x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
         clockwise = x[0] * y[1] - x[1] * y[0] > 0
         return (grid if clockwise else grid[::-1]).reshape(-1, 2)
-
-    def _rough(self, picture):
-        for negative in self.negatives:
-            corners = classic(picture, self.size, negative)
-            if corners is not None:
-                self.negatives = (negative, not negative)
-                return corners
-        return None
 
 
 def classic(picture, size, negative):

@@ -22,11 +22,11 @@ from lrfcal_lib.preprocess.edges_in_image import (
     wide_distances,
 )
 from lrfcal_lib.preprocess.intrinsics import (
+    adjust_robust,
     board_pose,
     estimate_intrinsics,
     estimate_relief,
     first_pose,
-    stereo_transform,
 )
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders, spread_views
 
@@ -43,19 +43,10 @@ SETTLED = 100.0  # weight of a turn that was decided before against the edges of
 class Survey:
     """The board in all images of a session.
 
-    Attributes
-    ----------
-    views : dict of str to list of BoardView
-        By camera.
-    models : dict of str to CameraModel
-    outline : Outline or None
-        None where the board is known or has no pattern.
-    board : Board
-        With corners, unless the images do not show them.
-    relief : ndarray, shape (k,), or None
-        Heights of the pattern's corners over the sheet's mean plane, metres (zero for a flat sheet).
-    unseen : str
-        Why the outline of the board is not known; its views have poses then and no edges.
+    `views` (lists of BoardView) and `models` are by camera. `outline` is None where the board is known or has no
+    pattern; `board` has corners, unless the images do not show them. `relief` (k,) are the heights of the pattern's
+    corners over the sheet's mean plane, metres. `unseen` tells why the outline of the board is not known; its views
+    have poses then and no edges.
     """
 
     views: dict
@@ -76,14 +67,11 @@ class Outline:
         Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
-    lengths : dict of str to float
-        Edge lengths of the outline, metres.
-    length_sd : dict of str to float
-        Standard deviation of the length over the views that show the edge with both neighbours; NaN below two.
-    n_views : dict of str to int
-        Views that show the edge.
-    n_lengths : dict of str to int
-        Views that show it with both neighbours.
+    lengths, length_sd : dict of str to float
+        Edge lengths of the outline and their standard deviation over the views that show the edge with both neighbours
+        (NaN below two), metres.
+    n_views, n_lengths : dict of str to int
+        Views that show the edge, and those that show it with both neighbours.
     board : Board
         With its corners filled in.
     """
@@ -163,10 +151,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False, s
     choices = [group for camera in models for group in _choices(records, camera, one_per_placement)]
     if board.pattern is None:
         return _survey_plain(choices, view, board, models)
-    images, finder = [], PatternFinder(board.pattern)
-    for group in choices:
-        tried = (Shown(record, _corners(read(record), finder)) for record in group)
-        images.append(_first(tried, lambda image: image.found))
+    finder = PatternFinder(board.pattern)
+    images = [_with_corners(group, read, finder) for group in choices]
     flat = {c: m or _intrinsics(c, images, board, read) for c, m in models.items()}
     if board.corners is not None:
         images, lines, unseen = _ordered_by_outline(images, read, board, flat, settled or {}), board.lines(), ""
@@ -209,22 +195,15 @@ def _choices(records, camera, one_per_placement):
     return list(groups.values())
 
 
-def _first(results, usable):
-    """The first usable one of some results, or the first one if none is."""
+def _with_corners(group, read, finder):
+    """The first image of a list that shows the pattern; the first one if none does."""
     first = None
-    for result in results:
-        if usable(result):
-            return result
-        first = first or result
+    for record in group:
+        try:
+            return Shown(record, finder(read(record)))
+        except PatternNotFound as error:
+            first = first or Shown(record, str(error))
     return first
-
-
-def _corners(image, finder):
-    """Corners, or the reason why there are none."""
-    try:
-        return finder(image)
-    except PatternNotFound as error:
-        return str(error)
 
 
 def _for_intrinsics(images):
@@ -269,21 +248,18 @@ def _with_relief(images, board, models, flat):
     return out, np.mean(reliefs, axis=0) if reliefs else np.zeros(len(board.pattern.points()))
 
 
-def _rough_poses(images, board, models, orders):
-    """Rough poses of the board in every image for every order of its corners: those of one, turned in the board."""
+def _poses_and_partners(images, board, models, orders):
+    """Rough poses of the board in every image for every order of its corners; which belong together (:func:`alike`).
+
+    The poses of an image are that of one order, turned in the board.
+    """
     points = board.pattern.points()
     middle = points.mean(axis=0)
     turns = [Rotation.align_vectors(points[order] - middle, points - middle)[0] for order in orders]
-    turns = RigidTransform.concatenate(
-        [RigidTransform.from_components(middle - turn.apply(middle), turn) for turn in turns]
-    )
-    return [first_pose(points, image.corners, models[image.record.camera]) * turns for image in images]
-
-
-def _alike(images, poses):
-    """:func:`alike` of images with the poses of every order."""
+    turns = RigidTransform.concatenate([RigidTransform.from_components(middle - t.apply(middle), t) for t in turns])
+    poses = [first_pose(points, image.corners, models[image.record.camera]) * turns for image in images]
     placements = [-1 if i.record.purpose == "intrinsics" else i.record.placement for i in images]
-    return alike([pose.rotation for pose in poses], placements, [i.record.camera for i in images])
+    return poses, *alike([pose.rotation for pose in poses], placements, [i.record.camera for i in images])
 
 
 def _in_order(images, orders):
@@ -295,8 +271,7 @@ def _in_order(images, orders):
 def _ordered_by_outline(images, read, board, models, settled):
     """Corners of every image in the order that the known outline asks for, the same at all images of a placement."""
     seen, orders, scores = [image for image in images if image.found], pattern_orders(board.pattern), []
-    poses = _rough_poses(seen, board, models, orders)
-    first, partner = _alike(seen, poses)
+    poses, first, partner = _poses_and_partners(seen, board, models, orders)
     for image, own, pose in zip(seen, partner, poses, strict=True):
         pixels, camera = image.corners[orders[own]], image.record.camera
         view = settled.get(camera, {}).get(image.record.placement)
@@ -319,7 +294,7 @@ def _ordered_by_votes(images, read, board, models):
     seen, orders = [image for image in images if image.found], pattern_orders(board.pattern, mirrored=False)
     if not seen:
         raise ValueError(f"none of {len(images)} images shows the pattern of board '{board.name}'")
-    first, partner = _alike(seen, _rough_poses(seen, board, models, orders))
+    _, first, partner = _poses_and_partners(seen, board, models, orders)
     votes, up = [], []
     for image, own in zip(seen, partner, strict=True):
         model = models[image.record.camera]
@@ -378,23 +353,10 @@ def common_lines(votes, board):
 def alike(rotations, placements, cameras):
     """Which orders of a pattern's corners belong together in the images of one placement.
 
-    Parameters
-    ----------
-    rotations : sequence of m Rotation, n in each
-        From the board to the camera, for every order that the corners may have; the same orders in all images.
-    placements : sequence of m int
-        Negative for an image of none, which stands alone.
-    cameras : sequence of m str
+    `rotations` (m, with n in each) are from the board to the camera, for every order that the corners may have, the
+    same orders in all images; placements are negative for an image of none, which stands alone. Returns the first image
+    of the same placement (m,), and the order in the image that goes with each order in the first one (m, n).
 
-    Returns
-    -------
-    first : ndarray of int, shape (m,)
-        The first image of the same placement.
-    partner : ndarray of int, shape (m, n)
-        The order in the image that goes with each order in the first one.
-
-    Notes
-    -----
     Between two images of one camera the head turns by less than any two orders differ. How a camera is turned against
     another is the same at all placements, which is true for one choice of the orders only.
     """
@@ -444,8 +406,12 @@ def _survey_plain(choices, view, board, models):
         )
     found = []
     for group in choices:
-        tried = ((r, view(Shown(r, ""), board, models)) for r in group if r.purpose != "intrinsics")
-        found += filter(None, [_first(tried, lambda item: not item[1].reason)])
+        tried = []
+        for record in (r for r in group if r.purpose != "intrinsics"):
+            tried.append((record, view(Shown(record, ""), board, models)))
+            if not tried[-1][1].reason:
+                break
+        found += sorted(tried, key=lambda item: item[1].reason != "")[:1]
     seen = [v for _, v in found if v.T_camera_board is not None]
     own = []
     for v in seen:
@@ -545,9 +511,20 @@ def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
     ValueError
         If no placement is seen by both cameras.
     """
-    corners = [
-        {v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0} for views in (first, second)
+    corners = [{v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0}
+               for views in (first, second)]  # fmt: skip
+    common = sorted(corners[0].keys() & corners[1].keys())
+    if not common:
+        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
+    pixels = np.array([[own[p] for p in common] for own in corners])
+    poses = [
+        RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in own])
+        for own, model in zip(pixels, models, strict=True)
     ]
-    wavy = relief is not None and bool(np.any(relief))
-    result = stereo_transform(*corners, pattern, models, intrinsics=refine, relief=wavy)
+    between = poses[1] * poses[0].inv()
+    rough = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
+    mounting = RigidTransform.concatenate([RigidTransform.identity(), rough])
+    options = {"intrinsics": refine, "relief": relief is not None and bool(np.any(relief))}
+    options["fixed"] = (8,) if all(m.distortion[4] == 0 for m in models) else ()
+    result = adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
     return result.mounting[1], result.mounting_covariance[0], result
