@@ -436,11 +436,8 @@ class PanTilt(port.Closed):
     path : str or Path
         Of the port.
     settings : HeadSettings
-    log : logging.Logger
     clock : callable, optional
         Host clock, s; time.time() of the host by default.
-    host : Host
-        Machine that the driver runs on; tests have a VirtualHost.
 
     Attributes
     ----------
@@ -586,17 +583,12 @@ class PanTilt(port.Closed):
     def move_to(self, pitch, timeout=None):
         """Move and wait until the head rests.
 
-        Parameters
-        ----------
-        pitch : float
-            rad, up positive.
-        timeout : float, optional
-            s; by default twice the time that the way takes, and 10 s. A lost line adds `reconnect_s`.
+        By default it may take twice the time that the way takes, and 10 s; a lost line adds `reconnect_s`.
 
         Returns
         -------
         float
-            Settled pitch, rad: read from the head, or dead reckoning without feedback.
+            Settled pitch, rad, up positive: read from the head, or dead reckoning without feedback.
 
         Raises
         ------
@@ -629,24 +621,11 @@ class PanTilt(port.Closed):
                     self._line.reopen()
 
     def start_sweep(self, stop_at, speed=None):
-        """Start a thread that moves the head to a pitch, notes where it is, and stops it there.
+        """Start a thread that moves the head to a pitch, rad, notes where it is, and stops it there.
 
-        Parameters
-        ----------
-        stop_at : float
-            rad.
-        speed : int, optional
-            Speed byte, 0 (very slow) to 0x3F; by default ``settings.tilt_speed``. The speed of a byte that was not
-            calibrated is taken to be in proportion.
-
-        Raises
-        ------
-        OutOfRange
-            Beyond the limits; nothing moves.
-        ValueError
-            For a speed that does not exist.
-        DeviceError
-            As :meth:`move_to`. What goes wrong later is raised by :meth:`finish_sweep`.
+        The speed byte is 0 (very slow) to 0x3F, by default ``settings.tilt_speed``; one that was not calibrated is
+        taken to be in proportion. Raises OutOfRange beyond the limits, ValueError for a speed that does not exist; what
+        goes wrong later is raised by :meth:`finish_sweep`.
         """
         step = self.settings.tilt_speed if speed is None else speed
         if step not in range(FASTEST + 1):
@@ -705,29 +684,18 @@ class PanTilt(port.Closed):
     def calibrate_speed(self, reading=None, *, travel_deg=10.0):
         """Measure the speed at ``settings.tilt_speed`` both ways, and the delay, for timed moves and sweeps.
 
-        Parameters
-        ----------
-        reading : callable, optional
-            Returns the pitch of the resting head, rad, measured otherwise (inclinometer, scan of the floor); heads
-            without feedback need it.
-        travel_deg : float
-            Length of the longer ones of the test moves.
+        ``reading()`` gives the pitch of the resting head, rad, measured otherwise (inclinometer, scan of the floor);
+        heads without feedback need it. The longer ones of the test moves are `travel_deg` long. DeviceError if nothing
+        tells the pitch, or the head does not move.
 
         Returns
         -------
-        up, down : float
-            deg/s, to be stated as ``degrees_per_second``.
-        delay_s : float
-            To be stated as ``start_delay_s``.
-
-        Raises
-        ------
-        DeviceError
-            If nothing tells the pitch, or the head does not move.
+        up, down, delay_s : float
+            To be stated as ``degrees_per_second`` (deg/s) and ``start_delay_s``.
         """
         if reading is None and not self.has_feedback:
-            raise DeviceError("the head does not tell its tilt: pass reading, which measures it otherwise, or state "
-                              "degrees_per_second")  # fmt: skip
+            remedy = "pass reading, which measures it otherwise, or state degrees_per_second"
+            raise DeviceError(f"the head does not tell its tilt: {remedy}")
         self._begin()
         with self._stopped_on_error():
             speeds = self.motion.calibrate(reading, math.radians(travel_deg))

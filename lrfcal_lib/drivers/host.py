@@ -4,8 +4,6 @@ On a :class:`VirtualHost` no time passes but what its threads wait for: devices 
 while they wait, one thread runs at a time, and every run is the same.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

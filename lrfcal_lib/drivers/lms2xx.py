@@ -1,7 +1,5 @@
 """A SICK LMS200, LMS211, LMS221 or LMS291 on a serial port: found, set up, asked, streaming."""
 
-from __future__ import annotations
-
 import logging
 import math
 

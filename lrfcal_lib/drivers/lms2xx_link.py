@@ -1,7 +1,5 @@
 """The line to an LMS2xx: telegrams with their instants, retries, the baud rate, scans on request and as a stream."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """Pelco-D: frames, angles and answers, and the half-duplex line to a head."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Ports that open with errors that say what to do, what can go wrong, and heads that stop on every exit."""
 
-from __future__ import annotations
-
 import atexit
 import errno
 import json

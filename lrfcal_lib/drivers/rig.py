@@ -1,7 +1,5 @@
 """What happens while a rig records, one event after the other."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -185,10 +183,7 @@ class Rig(Closed):
     def acquire(self, placement):
         """Record one placement: a generator of events, in the order in which things happen.
 
-        Parameters
-        ----------
-        placement : Placement
-            Of the plan, which also says how (stop-and-go or continuous).
+        The Placement is of the plan, which also says how (stop-and-go or continuous).
 
         Yields
         ------

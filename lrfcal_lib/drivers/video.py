@@ -1,7 +1,5 @@
 """Colour cameras: devices, streams and files; the newest frame with the time at which it was grabbed."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import glob
