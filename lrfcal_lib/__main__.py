@@ -9,61 +9,53 @@ FEW = 6  # placements
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 
-def _import_lasersetero(args):
-    from lrfcal_lib.session.importers import import_lasersetero
+def run(args):
+    """Do what a verb asks for; nothing is imported that another one needs."""
+    match args.verb:
+        case "import":
+            from lrfcal_lib.session.importers import import_lasersetero
 
-    miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
-    print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+            miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+            print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+        case "check":
+            from lrfcal_lib.session.read import open_session, validate
 
+            problems = validate(args.session)
+            print("\n".join(problems) or f"{args.session}: nothing to complain about")
+            if problems:
+                return 1
+            count = len(open_session(args.session).board_placements)
+            if count < FEW:
+                print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
+        case "calibrate":
+            from lrfcal_lib.evaluate.export import calibrate_session
 
-def _check(args):
-    from lrfcal_lib.session.read import open_session, validate
+            return calibrate_session(args.session)
+        case "simulate":
+            from lrfcal_lib.simulate.record import simulate
+            from lrfcal_lib.simulate.rig import SETUPS
 
-    problems = validate(args.session)
-    print("\n".join(problems) or f"{args.session}: nothing to complain about")
-    if problems:
-        return 1
-    count = len(open_session(args.session).board_placements)
-    if count < FEW:
-        print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
+            if args.setup not in SETUPS:
+                raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")
+            simulate(args.dst, SETUPS[args.setup](), workers=args.workers)
+            print(f"{args.dst}: simulated")
+        case "record":
+            from lrfcal_lib.acquire.record import main
+
+            return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
+        case "report":
+            from lrfcal_lib.report.report import main
+
+            return main(args.rest)
+        case "emulate":
+            from lrfcal_lib.emulators.rig import main
+
+            return main(args.rest)
     return 0
 
 
-def _calibrate(args):
-    from lrfcal_lib.evaluate.export import calibrate_session
-
-    return calibrate_session(args.session)
-
-
-def _simulate(args):
-    from lrfcal_lib.simulate.record import simulate
-    from lrfcal_lib.simulate.rig import SETUPS
-
-    if args.setup not in SETUPS:
-        raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")
-    simulate(args.dst, SETUPS[args.setup](), workers=args.workers)
-    print(f"{args.dst}: simulated")
-
-
-def _report(args):
-    from lrfcal_lib.report.report import main
-
-    return main(args.rest)
-
-
-def _record(args):
-    from lrfcal_lib.acquire.record import main
-
-    return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
-
-
-def _emulate(args):
-    from lrfcal_lib.emulators.rig import main
-
-    return main(args.rest)
-
-
-def _count(text):
+def how_many(text):
+    """A number of placements on the command line."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} placements: 1 or more are needed")
@@ -71,14 +63,9 @@ def _count(text):
 
 
 def parser():
-    """The command line.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-    """
+    """The command line, an ArgumentParser."""
     top = argparse.ArgumentParser(prog="python -m lrfcal_lib", description=__doc__.replace("``", ""))
-    verbs = top.add_subparsers(title="verbs", metavar="VERB", required=True)
+    verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
     kinds = verbs.add_parser("import", help="make a session of a recording by other people")
     kinds = kinds.add_subparsers(title="recordings", metavar="KIND", required=True)
     add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
@@ -86,29 +73,22 @@ def parser():
     add.add_argument("dst", help="folder of the new session")
     choices = {"choices": ("own", "published"), "default": "own"}
     add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
-    add.set_defaults(run=_import_lasersetero)
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
-    check.set_defaults(run=_check)
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
     simulate.add_argument("dst", help="folder of the new session")
     simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
-    simulate.set_defaults(run=_simulate)
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
-    calibrate.set_defaults(run=_calibrate)
     record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
     record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
     record.add_argument("session", help="folder of the new session")
     record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
-    record.add_argument("--placements", type=_count, metavar="N", help="record N placements of the plan")
+    record.add_argument("--placements", type=how_many, metavar="N", help="record N placements of the plan")
     record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
-    record.set_defaults(run=_record)
-    emulate = verbs.add_parser("emulate", help="emulate the devices of a rig (emulate -h for more)", add_help=False)
-    emulate.set_defaults(run=_emulate)
-    report = verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
-    report.set_defaults(run=_report)
+    verbs.add_parser("emulate", help="emulate the devices of a rig (emulate -h for more)", add_help=False)
+    verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
     return top
 
 
@@ -127,17 +107,16 @@ def main(argv=None):
         its own: 2 after a message that says what to do; ``calibrate`` has 3 where the verdict is 'no'.
     """
     args, args.rest = parser().parse_known_args(argv)
-    if args.rest and args.run not in (_report, _emulate):
+    if args.rest and args.verb not in ("report", "emulate"):
         parser().error(f"unrecognized arguments: {' '.join(args.rest)}")
     try:
-        result = args.run(args)
+        return run(args) or 0
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:  # before a verb that has more to say got so far
         print("\nstopped by Ctrl-C", file=sys.stderr)
         return INTERRUPTED
-    return result if isinstance(result, int) else 0
 
 
 if __name__ == "__main__":

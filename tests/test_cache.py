@@ -85,7 +85,7 @@ def missing_image(session, stage, monkeypatch):
 
 
 def other_library(session, stage, monkeypatch):
-    monkeypatch.setattr(cache, "_library", lambda: b"another version")
+    monkeypatch.setattr(cache, "library", lambda: b"another version")
     stage(session, 1)
 
 

@@ -11,7 +11,7 @@ from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
 from lrfcal_lib.preprocess.edges_in_scan import background_odds, edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
-LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot=(0.01, 0.004))
+LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)
 
 
 def cells_of(made, reach=2, lrf=LRF, change=None):

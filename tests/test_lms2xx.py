@@ -1,6 +1,5 @@
 """Telegrams of the LMS2xx: verified bytes, round trips, garbage, and recordings of a real device."""
 
-import contextlib
 import json
 
 import numpy as np
@@ -24,66 +23,33 @@ from lrfcal_lib.session.lms2xx_codec import (
 )
 
 ZEROS = " 00" * 21
-TO_DEVICE = {
-    "02 00 02 00 20 40 50 08": (0x20, "40"),
-    "02 00 02 00 20 48 58 08": (0x20, "48"),
-    "02 00 02 00 20 24 34 08": (0x20, "24"),
-    "02 00 02 00 20 25 35 08": (0x20, "25"),
-    "02 00 02 00 20 2A 3A 08": (0x20, "2A"),
-    "02 00 02 00 20 10 00 08": (0x20, "10"),
-    "02 00 03 00 20 26 05 79 3E": (0x20, "26 05"),
-    "02 00 06 00 20 27 01 00 0A 00 6C B7": (0x20, "27 01 00 0A 00"),
-    "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5": (0x20, "00" + b"SICK_LMS".hex()),
-    "02 00 0A 00 20 30 53 49 43 4B 5F 4C 4D 53 EE F5": (0x20, "30" + b"SICK_LMS".hex()),
-    "02 00 02 00 30 01 31 18": (0x30, "01"),
-    "02 00 02 00 30 08 38 18": (0x30, "08"),
-    "02 00 01 00 31 15 12": (0x31, ""),
-    "02 00 01 00 32 16 12": (0x32, ""),
-    "02 00 01 00 3A 1E 12": (0x3A, ""),
-    "02 00 01 00 74 50 12": (0x74, ""),
-    "02 00 01 00 7B 5F 12": (0x7B, ""),
-    "02 00 01 00 10 34 12": (0x10, ""),
-    "02 00 05 00 3B B4 00 32 00 3B 1F": (0x3B, "B4 00 32 00"),
-    "02 00 05 00 3B B4 00 64 00 97 49": (0x3B, "B4 00 64 00"),
-    "02 00 05 00 3B 64 00 64 00 1D 0F": (0x3B, "64 00 64 00"),
-    "02 00 05 00 3B 64 00 32 00 B1 59": (0x3B, "64 00 32 00"),
-    "02 00 05 00 3B 64 00 19 00 E7 72": (0x3B, "64 00 19 00"),
-    "02 00 02 00 66 00 9C 4E": (0x66, "00"),
-    "02 00 02 00 66 01 9D 4E": (0x66, "01"),
-    "02 00 02 00 36 02 3E 1E": (0x36, "02"),
-    "02 00 05 00 37 01 00 69 01 EB 75": (0x37, "01 00 69 01"),
-    f"02 00 23 00 77 00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00 11 88": (
-        0x77, f"00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00"),
-    f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00 94 8A": (
-        0x77, f"00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00"),
-}  # fmt: skip
-FROM_DEVICE = {
-    "02 80 03 00 A0 00 10 16 0A": (0xA0, "00", 0x10, 0x80),
-    "02 80 03 00 A0 01 10 14 0B": (0xA0, "01", 0x10, 0x80),
-    "02 81 03 00 A0 00 10 36 1A": (0xA0, "00", 0x10, 0x81),
-    "02 80 03 00 A0 00 11 17 0A": (0xA0, "00", 0x11, 0x80),
-    "02 80 02 00 91 10 79 30": (0x91, "", 0x10, 0x80),
-    "02 80 02 00 92 10 7F 33": (0x92, "", 0x10, 0x80),
-    "02 80 02 00 B2 10 3F 13": (0xB2, "", 0x10, 0x80),
-    "02 80 07 00 BB 01 B4 00 32 00 10 03 9D": (0xBB, "01 B4 00 32 00", 0x10, 0x80),
-    "02 80 07 00 BB 01 64 00 19 00 10 BB 46": (0xBB, "01 64 00 19 00", 0x10, 0x80),
-    "02 80 07 00 BB 00 B4 00 32 00 10 23 8D": (0xBB, "00 B4 00 32 00", 0x10, 0x80),
-    "02 80 17 00 BA 4C 4D 53 32 30 30 3B 33 30 31 30 36 33 3B 56 30 32 2E 31 30 20 10 22 61": (
-        0xBA, b"LMS200;301063;V02.10 ".hex(), 0x10, 0x80),
-    "02 80 17 00 BA 4C 4D 53 32 30 30 3B 53 31 38 30 36 33 3B 56 30 32 2E 31 39 20 10 85 6A": (
-        0xBA, b"LMS200;S18063;V02.19 ".hex(), 0x10, 0x80),
-    "02 80 17 00 BA 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 10 02 EB": (
-        0xBA, b"LMS221;302063;X01.27 ".hex(), 0x10, 0x80),
-    "02 80 17 00 90 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 10 43 D4": (
-        0x90, b"LMS221;302063;X01.27 ".hex(), 0x10, 0x80),
-    f"02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00 10 C5 7A": (
-        0xF7, f"01 00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00", 0x10, 0x80),
-    f"02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00 10 36 FE": (
-        0xF4, f"00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00", 0x10, 0x80),
-    "02 80 0A 00 B0 03 00 90 01 F7 1F FF 1F 10 A2 F5": (0xB0, "03 00 90 01 F7 1F FF 1F", 0x10, 0x80),
-    "02 80 0A 00 B0 03 40 D2 04 D2 24 FE 1F 10 5B 90": (0xB0, "03 40 D2 04 D2 24 FE 1F", 0x10, 0x80),
-    "02 80 04 00 E6 01 00 10 CD FC": (0xE6, "01 00", 0x10, 0x80),
-}  # fmt: skip
+TO_DEVICE = [  # verified against the listing and real devices
+    "02 00 02 00 20 40 50 08", "02 00 02 00 20 48 58 08", "02 00 02 00 20 24 34 08", "02 00 02 00 20 25 35 08",
+    "02 00 02 00 20 2A 3A 08", "02 00 02 00 20 10 00 08", "02 00 03 00 20 26 05 79 3E",
+    "02 00 06 00 20 27 01 00 0A 00 6C B7", "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5",
+    "02 00 0A 00 20 30 53 49 43 4B 5F 4C 4D 53 EE F5", "02 00 02 00 30 01 31 18", "02 00 02 00 30 08 38 18",
+    "02 00 01 00 31 15 12", "02 00 01 00 32 16 12", "02 00 01 00 3A 1E 12", "02 00 01 00 74 50 12",
+    "02 00 01 00 7B 5F 12", "02 00 01 00 10 34 12", "02 00 05 00 3B B4 00 32 00 3B 1F",
+    "02 00 05 00 3B B4 00 64 00 97 49", "02 00 05 00 3B 64 00 64 00 1D 0F", "02 00 05 00 3B 64 00 32 00 B1 59",
+    "02 00 05 00 3B 64 00 19 00 E7 72", "02 00 02 00 66 00 9C 4E", "02 00 02 00 66 01 9D 4E",
+    "02 00 02 00 36 02 3E 1E", "02 00 05 00 37 01 00 69 01 EB 75",
+    f"02 00 23 00 77 00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00 11 88",
+    f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00 94 8A",
+]  # fmt: skip
+FROM_DEVICE = [
+    "02 80 03 00 A0 00 10 16 0A", "02 80 03 00 A0 01 10 14 0B", "02 81 03 00 A0 00 10 36 1A",
+    "02 80 03 00 A0 00 11 17 0A", "02 80 02 00 91 10 79 30", "02 80 02 00 92 10 7F 33", "02 80 02 00 B2 10 3F 13",
+    "02 80 07 00 BB 01 B4 00 32 00 10 03 9D", "02 80 07 00 BB 01 64 00 19 00 10 BB 46",
+    "02 80 07 00 BB 00 B4 00 32 00 10 23 8D",
+    "02 80 17 00 BA 4C 4D 53 32 30 30 3B 33 30 31 30 36 33 3B 56 30 32 2E 31 30 20 10 22 61",
+    "02 80 17 00 BA 4C 4D 53 32 30 30 3B 53 31 38 30 36 33 3B 56 30 32 2E 31 39 20 10 85 6A",
+    "02 80 17 00 BA 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 10 02 EB",
+    "02 80 17 00 90 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 10 43 D4",
+    "02 80 0A 00 B0 03 00 90 01 F7 1F FF 1F 10 A2 F5", "02 80 0A 00 B0 03 40 D2 04 D2 24 FE 1F 10 5B 90",
+    "02 80 04 00 E6 01 00 10 CD FC",
+    f"02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02{ZEROS} 02 00 10 C5 7A",
+    f"02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02{ZEROS} 02 00 10 36 FE",
+]  # fmt: skip
 A0 = bytes.fromhex("02 80 03 00 A0 00 10 16 0A")
 
 
@@ -104,20 +70,13 @@ def random_words(rng, shape):
 # ---------------------------------------------------------------------------------------------- frame and CRC
 
 
-@pytest.mark.parametrize("text", TO_DEVICE)
-def test_commands_are_the_verified_bytes(text):
-    code, data = TO_DEVICE[text]
-    raw, data = bytes.fromhex(text), bytes.fromhex(data)
-    assert encode_telegram(code, data) == raw
-    assert parse_telegram(raw) == lms2xx_codec.Telegram(code, data)
-
-
-@pytest.mark.parametrize("text", FROM_DEVICE)
-def test_replies_are_the_verified_bytes(text):
-    code, data, status, address = FROM_DEVICE[text]
-    raw, data = bytes.fromhex(text), bytes.fromhex(data)
-    assert encode_telegram(code, data, status=status, address=address) == raw
-    assert parse_telegram(raw) == lms2xx_codec.Telegram(code, data, status, address)
+@pytest.mark.parametrize("text", TO_DEVICE + FROM_DEVICE)
+def test_telegrams_are_the_verified_bytes(text):
+    raw = bytes.fromhex(text)
+    found = parse_telegram(raw)
+    assert (found.code, found.address) == (raw[4], raw[1])
+    assert (found.data, found.status) == ((raw[5:-3], raw[-3]) if text in FROM_DEVICE else (raw[5:-2], None))
+    assert encode_telegram(found.code, found.data, status=found.status, address=found.address) == raw
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5, 7, 8, 9, 255, 256, 257, 730, 812])
@@ -143,30 +102,56 @@ def test_single_flips_are_seen_and_pairs_unless_on_a_diagonal():
     assert 0 < same.mean() < 0.01
 
 
-BAD_TELEGRAMS = {
-    "begins with 02.*got none": b"",
-    "begins with 02.*got 02 80 03": A0[:3],
-    "begins with 02.*got 03": b"\x03" + A0[1:],
-    "states 9 bytes, got 10": A0 + b"\0",
-    "states 9 bytes, got 8": A0[:-1],
-    "CRC 0A16 sent, .* computed.*ask again": A0[:5] + b"\x01" + A0[6:],
-}
+REFUSED = [
+    (parse_telegram, b"", "begins with 02.*got none"),
+    (parse_telegram, A0[:3], "begins with 02.*got 02 80 03"),
+    (parse_telegram, b"\x03" + A0[1:], "begins with 02.*got 03"),
+    (parse_telegram, A0 + b"\0", "states 9 bytes, got 10"),
+    (parse_telegram, A0[:-1], "states 9 bytes, got 8"),
+    (parse_telegram, A0[:5] + b"\x01" + A0[6:], "CRC 0A16 sent, .* computed.*ask again"),
+    (decode_scan, A0, "code A0 is no scan"),
+    (decode_scan, encode_telegram(0xB0, b"\x05\0\1\1", status=0x10), "do not fit the number of values 05 00"),
+    (decode_scan, encode_telegram(0xB0, status=0x10), "do not fit the number of values none"),
+    (decode_scan, encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10), "do not fit"),  # unit reserved
+    (lms2xx_codec.parse_status, A0, "code A0 is not the reply B1"),
+    (lms2xx_codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
+    (lms2xx_codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
+    (lms2xx_codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
+    (lms2xx_codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
+    (lambda block: lms2xx_codec.Configuration(block).unit, b"\0\0\0\0\0\0\7", "unit 7 is neither 0"),
+    (lambda values: scan_quarters(*values), (100,), "101, 181, 201, 361, 401 values, got 100"),
+    (lambda values: scan_quarters(*values), (181, 1), "partial scan 1 has 180 values, got 181"),
+]
 
 
-@pytest.mark.parametrize("message", BAD_TELEGRAMS)
-def test_what_is_no_telegram_is_refused(message):
+@pytest.mark.parametrize(("parse", "given", "message"), REFUSED)
+def test_what_is_no_telegram_or_another_one_is_refused(parse, given, message):
     with pytest.raises(TelegramError, match=message):
-        parse_telegram(BAD_TELEGRAMS[message])
+        parse(given)
 
 
-def test_what_no_telegram_can_hold_is_refused():
-    for options, message in (({"status": 256}, "status must be a byte"), ({"address": -1}, "address must be a byte")):
-        with pytest.raises(ValueError, match=message):
-            encode_telegram(0x20, **options)
-    with pytest.raises(ValueError, match="code must be a byte.*got 300"):
-        encode_telegram(300)
-    with pytest.raises(ValueError, match="up to 65535 bytes, got 65536"):
-        encode_telegram(0x20, bytes(65535))
+WRONG = [
+    (encode_telegram, {"code": 0x20, "status": 256}, "status must be a byte"),
+    (encode_telegram, {"code": 0x20, "address": -1}, "address must be a byte"),
+    (encode_telegram, {"code": 300}, "code must be a byte.*got 300"),
+    (encode_telegram, {"code": 0x20, "data": bytes(65535)}, "up to 65535 bytes, got 65536"),
+    (encode_words, {"words": [1 << 16]}, "values are 16 bits.*got 65536"),
+    (encode_scan, {"ranges": [-1.0]}, "a range is -1 m.*NaN for no return"),
+    (encode_scan, {"ranges": [1.0], "unit": "inch"}, "unit is one of cm, mm, got 'inch'"),
+    (encode_scan, {"ranges": [1.0], "mode": 0x3F}, "measuring mode 0x3f is none of"),
+    (encode_scan, {"ranges": [1.0], "flags": 8}, "flags must be 0 to 7"),
+    (encode_scan, {"ranges": [1.0], "mode": 6, "flags": 2}, "flags must be 0 to 1"),
+    (encode_scan, {"ranges": [1.0], "reasons": [7]}, r"reasons are 1 to 6.*got \[7\]"),
+    (encode_scan, {"ranges": np.ones(402)}, r"up to 401 values.*\(402,\)"),
+    (encode_scan, {"ranges": np.ones((2, 3))}, r"up to 401 values.*\(2, 3\)"),
+    (encode_scan, {"ranges": [1.0], "partial": 4}, "partial is 0 to 3.*got 4"),
+]
+
+
+@pytest.mark.parametrize(("encode", "options", "message"), WRONG)
+def test_what_no_telegram_can_hold_is_refused(encode, options, message):
+    with pytest.raises(ValueError, match=message):
+        encode(**options)
 
 
 # ------------------------------------------------------------------------------------------------------ scans
@@ -181,7 +166,7 @@ def test_the_two_scans_of_the_fact_sheet():
     raw = bytes.fromhex("02 80 0A 00 B0 03 40 D2 04 D2 24 FE 1F 10 5B 90")
     scan = decode_scan(raw)
     np.testing.assert_allclose(scan.ranges, [[1.234, 1.234, np.nan]])
-    assert scan.flags.tolist() == [[0, 1, 0]] and MODES[0].flags[0] == "field A"
+    assert scan.flags.tolist() == [[0, 1, 0]]
     assert REASONS[scan.reasons[0, 2]] == "dazzled" and scan.unit == "mm"
     assert encode_scan([1.234, 1.234, 0], flags=[0, 1, 0], reasons=[0, 0, 2]) == raw
 
@@ -237,35 +222,6 @@ def test_ranges_come_back_to_half_a_count(mode, unit):
     assert scan.reasons[0, :4].tolist() == [1, 6, 6, 0]
 
 
-def test_bad_scans_are_refused():
-    for options, message in (
-        ({"ranges": [-1.0]}, "a range is -1 m.*NaN for no return"),
-        ({"ranges": [1.0], "unit": "inch"}, "unit is one of cm, mm, got 'inch'"),
-        ({"ranges": [1.0], "mode": 0x3F}, "measuring mode 0x3f is none of"),
-        ({"ranges": [1.0], "flags": 8}, "flags must be 0 to 7"),
-        ({"ranges": [1.0], "mode": 6, "flags": 2}, "flags must be 0 to 1"),
-        ({"ranges": [1.0], "reasons": [7]}, r"reasons are 1 to 6.*got \[7\]"),
-        ({"ranges": np.ones(402)}, r"up to 401 values.*\(402,\)"),
-        ({"ranges": np.ones((2, 3))}, r"up to 401 values.*\(2, 3\)"),
-        ({"ranges": [1.0], "partial": 4}, "partial is 0 to 3.*got 4"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            encode_scan(**options)
-    with pytest.raises(ValueError, match="values are 16 bits.*got 65536"):
-        encode_words([1 << 16])
-
-
-def test_telegrams_that_hold_no_scan_are_refused():
-    with pytest.raises(TelegramError, match="code A0 is no scan"):
-        decode_scan(A0)
-    with pytest.raises(TelegramError, match="do not fit the number of values 05 00"):
-        decode_scan(encode_telegram(0xB0, b"\x05\0\1\1", status=0x10))
-    with pytest.raises(TelegramError, match="do not fit the number of values none"):
-        decode_scan(encode_telegram(0xB0, status=0x10))
-    with pytest.raises(TelegramError, match="do not fit"):  # unit reserved
-        decode_scan(encode_telegram(0xB0, b"\x01\x80\1\1", status=0x10))
-
-
 def test_bearings_are_those_of_the_variant():
     for values, first, last, step in ((101, 40, 140, 1), (201, 40, 140, 0.5), (401, 40, 140, 0.25)):
         np.testing.assert_array_equal(scan_quarters(values) / 4, np.arange(first, last + step / 2, step))
@@ -273,10 +229,6 @@ def test_bearings_are_those_of_the_variant():
         np.testing.assert_array_equal(scan_quarters(values) / 4, np.arange(0, 180 + step / 2, step))
     parts = np.concatenate([scan_quarters(181 - (p > 0), p) for p in range(4)])
     np.testing.assert_array_equal(np.sort(parts), np.arange(721))
-    with pytest.raises(TelegramError, match="101, 181, 201, 361, 401 values, got 100"):
-        scan_quarters(100)
-    with pytest.raises(TelegramError, match="partial scan 1 has 180 values, got 181"):
-        scan_quarters(181, 1)
 
 
 # ---------------------------------------------------------------------------------------------------- streams
@@ -348,7 +300,7 @@ def test_both_directions_are_told_apart():
 def test_configuration_survives_and_says_its_mode():
     raw = next(bytes.fromhex(text) for text in FROM_DEVICE if text.startswith("02 80 24 00 F4"))
     read = lms2xx_codec.parse_configuration(raw)
-    assert (read.measuring_mode, read.unit, read.realtime_indices, read.blanking_m) == (4, "mm", False, 0.0)
+    assert (read.measuring_mode, read.unit, read.realtime_indices) == (4, "mm", False)
     assert lms2xx_codec.encode_configuration(read) == raw
     changed = read.changed(measuring_mode=6, unit="cm", realtime_indices=True)
     again = lms2xx_codec.parse_configuration(lms2xx_codec.encode_configuration(changed))
@@ -363,77 +315,12 @@ def test_the_factory_configuration_is_that_of_an_outdoor_device():
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
-def test_variant_type_errors_and_status_byte():
+def test_type_and_errors():
     by_head = {text[12:17]: bytes.fromhex(text) for text in FROM_DEVICE}
-    assert lms2xx_codec.parse_variant(by_head["BB 00"]) == (False, 180.0, 0.5)
     assert lms2xx_codec.parse_type(by_head["BA 4C"]) == ("LMS221", "302063", "X01.27")
     assert lms2xx_codec.parse_errors(by_head["B2 10"]) == []
     old = encode_telegram(0xB2, bytes.fromhex("84 16 01 31 07 02"), status=0x12)
     assert lms2xx_codec.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
-    byte = lms2xx_codec.parse_status_byte
-    assert byte(0x10) == lms2xx_codec.StatusByte("ok", False, False, False)
-    assert byte(0xF3) == lms2xx_codec.StatusByte("error", True, True, True)
-
-
-def test_bad_replies_are_refused():
-    for parse, raw, message in (
-        (lms2xx_codec.parse_status, A0, "code A0 is not the reply B1"),
-        (lms2xx_codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
-        (lms2xx_codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
-        (lms2xx_codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
-        (lms2xx_codec.parse_variant, encode_telegram(0xBB, b"\1", status=16), "1 bytes of data, needs 5"),
-        (lms2xx_codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
-    ):
-        with pytest.raises(TelegramError, match=message):
-            parse(raw)
-    odd = lms2xx_codec.Configuration(b"\0\0\0\0\0\0\7")
-    with pytest.raises(TelegramError, match="unit 7 is neither 0"):
-        _ = odd.unit
-
-
-# ------------------------------------------------------------------------------------------------------- fuzz
-
-
-def test_100000_random_and_damaged_strings_never_raise():
-    """All of them in few streams; a telegram that is accepted must be one by the manual's own loop."""
-    rng = np.random.default_rng(20091001)
-    seeds = [bytes.fromhex(text) for text in FROM_DEVICE] + [encode_scan(rng.uniform(0, 9, 101), indices=(1, 2))]
-    for _ in range(10):
-        strings = []
-        for kind in rng.integers(0, len(seeds) + 5, 10_000):
-            raw = rng.bytes(rng.integers(1, 40)) if kind >= len(seeds) else bytearray(seeds[kind])
-            for _ in range(rng.integers(0, 3) if kind < len(seeds) else 0):
-                raw[rng.integers(len(raw))] = rng.integers(256)
-            strings.append(bytes(raw[: rng.integers(len(raw) + 1)]) if rng.random() < 0.1 else bytes(raw))
-        for one in strings[:200]:
-            with contextlib.suppress(TelegramError):
-                parse_telegram(one)
-        data = b"".join(strings)
-        stream = split_stream(data)
-        for group in decode_scans(data, stream.offset, stream.length, int(rng.integers(0, 7))):
-            assert group.words.shape == group.ranges.shape == group.reasons.shape
-        for row in rng.integers(0, len(stream.offset), 20):
-            raw = data[stream.offset[row] :][: stream.length[row]]
-            assert stepwise_crc(raw[:-2]) == int.from_bytes(raw[-2:], "little")
-
-
-PARSERS = {
-    "parse_status": 0xB1, "parse_type": 0xBA, "parse_errors": 0xB2, "parse_variant": 0xBB, "parse_configuration": 0xF4
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("parse", PARSERS)
-def test_replies_with_any_content_give_a_value_or_a_telegram_error(parse):
-    rng, code = np.random.default_rng(6), PARSERS[parse]
-    values = refused = 0
-    for _ in range(2000):
-        raw = encode_telegram(code, rng.bytes(rng.integers(0, 160)), status=int(rng.integers(256)))
-        try:
-            getattr(lms2xx_codec, parse)(raw)
-            values += 1
-        except TelegramError:
-            refused += 1
-    assert values > 0 and values + refused == 2000
 
 
 # --------------------------------------------------------------------------------------------- real recordings

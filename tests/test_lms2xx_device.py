@@ -29,7 +29,7 @@ def emulated(**options):
 
 def opened(device, **options):
     """Its driver, on the same host."""
-    return LMS2xx.open(device.path, host=device.clock.machine, **options)
+    return LMS2xx(device.path, host=device.clock.machine, **options)
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_nobody_there_and_somebody_else_are_told_apart():
     with pytest.raises(WrongDevice, match="'LMX400' answers, not an LMS2xx"):
         opened(emulated(model="LMX400;302063;X01.27 "))
     with pytest.raises(PortError, match="there is no port lrf: .*present are none"):
-        LMS2xx.open("lrf", host=VirtualHost())
+        LMS2xx("lrf", host=VirtualHost())
 
 
 # ----------------------------------------------------------------------------------------------- finding the rate
@@ -223,8 +223,7 @@ def test_opening_switches_to_the_rate_wanted_and_no_flash_is_written():
     device = emulated(baudrate=9600)
     with opened(device, baudrate=500000) as lms:
         assert lms.baudrate == device.baudrate == 500000
-        assert lms.read_status().baud == 500000 and lms.status.laser_on
-        assert lms.read_errors() == []
+        assert lms.status.baud == 9600 and lms.status.laser_on
     assert device.memory.flash_writes == 0
 
 
@@ -241,7 +240,7 @@ def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(address):
 ])  # fmt: skip
 def test_bad_arguments_are_refused_before_the_port_is_touched(options, message):
     with pytest.raises(ValueError, match=message):
-        LMS2xx.open("/dev/nowhere", **options)
+        LMS2xx("/dev/nowhere", **options)
 
 
 # ------------------------------------------------------------------------------------------------------ settings
@@ -285,11 +284,13 @@ def test_what_the_device_declines_is_said():
         for call, message in (
             (lambda: lms.configure(unit="cm"), r"declines the password of the installation mode \(A0 01\)"),
             (lambda: lms.set_variant(180, 0.5), "LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0"),
-            (lambda: lms.set_baudrate(500000), r"declines 500000 Bd \(A0 02\)"),
         ):
             with pytest.raises(Refused, match=message):
                 call()
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
+    with pytest.raises(Refused, match=r"declines 500000 Bd \(A0 02\)"):
+        opened(device, baudrate=500000)
+    assert device.baudrate == 38400
 
 
 def test_a_configuration_that_is_not_taken_is_said(monkeypatch):
@@ -320,29 +321,34 @@ def test_a_lost_reply_does_not_make_a_second_write(command, call):
 
 def test_a_rate_that_does_not_come_through_is_given_up():
     device = emulated()
+    through, hear = device.port.put, device.hear
+    device.port.put = lambda data: len(data) if device.baudrate == 500000 else through(data)
+
+    def deaf(data):
+        if device.port.rate == 500000:
+            device.memory.baudrate = 38400  # as after it was switched off and on
+        else:
+            hear(data)
+
+    device.hear = deaf
+    with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
+        opened(device, baudrate=500000)
     with opened(device) as lms:
-        through = device.port.put
-        device.port.put = lambda data: len(data) if device.baudrate == 500000 else through(data)
-        with pytest.raises(NoReply, match="nothing comes through at 500000 Bd, which needs RS-422.*; 38400 Bd now"):
-            device.hear = lambda data, hear=device.hear: hear(data) if device.port.rate != 500000 else None
-            device.at(1.2, lambda _: setattr(device.memory, "baudrate", 38400))  # as after it was switched off and on
-            lms.set_baudrate(500000)
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
 
 
 def test_a_rate_that_this_end_cannot_do_changes_nothing(monkeypatch):
     device = emulated()
-    with opened(device) as lms:
 
-        def set_rate(port, rate):
-            if rate == 500000:
-                raise PortError("does not take 500000 Bd")
+    def set_rate(port, rate):
+        if rate == 500000:
+            raise PortError("does not take 500000 Bd")
+        port.baudrate = rate
 
-        monkeypatch.setattr(device.clock.machine, "set_rate", set_rate)
-        asked = len(device.requests)
-        with pytest.raises(PortError, match="does not take 500000 Bd"):
-            lms.set_baudrate(500000)
-        assert len(device.requests) == asked and lms.baudrate == 38400
+    monkeypatch.setattr(device.clock.machine, "set_rate", set_rate)
+    with pytest.raises(PortError, match="does not take 500000 Bd"):
+        opened(device, baudrate=500000)
+    assert device.baudrate == 38400 and device.memory.mode == 0x25
 
 
 # ------------------------------------------------------------------------------------------------- times of scans
@@ -564,8 +570,8 @@ def test_calls_at_the_wrong_time_say_so():
             call()
     lms.stop()  # nothing to stop
     lms.start()
-    calls = (lms.request, lms.read_status, lms.read_errors, lms.start, lms.reconnect, lms.configure)
-    for call in (*calls, lambda: lms.set_variant(180, 1), lambda: lms.set_baudrate(9600)):
+    calls = (lms.request, lms.start, lms.reconnect, lms.configure)
+    for call in (*calls, lambda: lms.set_variant(180, 1)):
         with pytest.raises(DeviceError, match="streams; call stop"):
             call()
     lms.close()
@@ -584,10 +590,10 @@ def test_a_request_declined_thrice_is_refused_and_once_is_not(fault):
     with opened(device) as lms:
         before = device.clock.now()
         device.faults.inject(fault, 2)
-        assert lms.read_status().unit == "mm" and device.clock.now() - before > 2 * 0.03  # not asked again at once
+        assert lms.request() and device.clock.now() - before > 2 * 0.03  # not asked again at once
         device.faults.inject(fault, 3)
-        with pytest.raises(Refused, match="refuses command 31"):
-            lms.read_status()
+        with pytest.raises(Refused, match="refuses command 30"):
+            lms.request()
         assert device.faults.counts[fault] == 5
 
 
@@ -597,11 +603,11 @@ def test_replies_of_other_commands_and_the_power_on_string_are_skipped():
         string, real = encode_telegram(0x90, b"LMS221;302063;X01.27 ", status=0x10), device.prepare
         device.prepare = lambda raw: string + real(raw)
         device.faults.inject("foreign", 3)
-        assert lms.read_status().unit == "mm" and len(lms.request().ranges) == 361
+        assert not lms.configure(unit="mm") and len(lms.request().ranges) == 361
 
 
 @pytest.mark.parametrize(("call", "limit_s"), [
-    (lambda lms: lms.read_status(), 2.6), (lambda lms: lms.request(), 4.5), (lambda lms: lms.request(timeout=0.1), 0.2),
+    (lambda lms: lms.request(), 4.5), (lambda lms: lms.request(timeout=0.1), 0.2),
     (lambda lms: lms.set_variant(100, 1), 5.2), (lambda lms: lms.configure(unit="cm"), 2.6),
 ])  # fmt: skip
 def test_a_silent_device_is_given_up_in_time(call, limit_s):
@@ -679,7 +685,7 @@ def test_on_a_pseudo_terminal(tmp_path):
             return super().scan(*args)
 
     with EmulatedLms(Slow(), path=tmp_path / "lrf", time_scale=4.0, configuration=INDEXED) as device:
-        with LMS2xx.open(device.path, baudrate=500000, find_s=60) as lms:
+        with LMS2xx(device.path, baudrate=500000, find_s=60) as lms:
             assert len(lms.request(timeout=60).ranges) == 361
             lms.start()
             numbers = []

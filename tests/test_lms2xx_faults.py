@@ -33,7 +33,7 @@ class Campaign:
 
     def run(self, streamed, requested):
         """All faults of this device: those of a stream, then those of requests."""
-        with LMS2xx.open(self.device.path, host=self.host) as self.lms:
+        with LMS2xx(self.device.path, host=self.host) as self.lms:
             self.lms.start()
             for kind in streamed:
                 before = self.faults.counts[kind]
@@ -71,7 +71,7 @@ class Campaign:
     def some_call(self):
         """Any of the calls of a quiet device."""
         angle, unit = int(self.rng.choice([100, 180])), str(self.rng.choice(["cm", "mm"]))
-        calls = [self.request, self.request, self.request, self.lms.read_status, self.stream_a_little,
+        calls = [self.request, self.request, self.request, self.stream_a_little,
                  lambda: self.lms.set_variant(angle, 0.5), lambda: self.lms.configure(unit=unit)]  # fmt: skip
         return calls[self.rng.integers(len(calls))]
 

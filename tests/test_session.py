@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -14,11 +15,12 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import image_size, open_session, validate
 from lrfcal_lib.session.stated import (
     CameraInfo,
+    LensStated,
     LrfInfo,
     SessionError,
     board_from_json,
     board_to_json,
-    model_from_json,
+    from_json,
     model_to_json,
     transform_from_json,
     transform_to_json,
@@ -30,6 +32,8 @@ LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np
 HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
 MODEL = CameraModel(32, 24, 30.0, 31.0, 15.5, 11.5, np.array([0.1, -0.02, 0.001, 0.002, 0.003]), np.eye(9), 0.25)
 CAMERAS = (CameraInfo("left", "head", 32, 24, MODEL, HEAD), CameraInfo("right", "platform", 32, 24))
+
+CHESSBOARD = {"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 0.1}
 
 
 def pixels(seed=0):
@@ -56,14 +60,6 @@ def write(path, **options):
 @pytest.fixture
 def path(tmp_path):
     return write(tmp_path / "trip")
-
-
-def edit(path, change):
-    """Apply a change to the object in session.json."""
-    file = path / "session.json"
-    data = json.loads(file.read_text())
-    change(data)
-    file.write_text(json.dumps(data))
 
 
 def edit_scans(path, **arrays):
@@ -141,10 +137,10 @@ def test_boards_models_and_transforms_survive_json():
     assert board_from_json(json.loads(json.dumps(board_to_json(board)))) == board
     triangle = board_from_json(json.loads(json.dumps(board_to_json(triangle_board()))))
     np.testing.assert_array_equal(triangle.corners, triangle_board().corners)
-    model = model_from_json(json.loads(json.dumps(model_to_json(MODEL))), 32, 24)
+    model = from_json(LensStated, json.loads(json.dumps(model_to_json(MODEL)))).made(32, 24)
     np.testing.assert_array_equal(model.parameters, MODEL.parameters)
     np.testing.assert_array_equal(model.covariance, MODEL.covariance)
-    assert transform_from_json(transform_to_json(None)) is None and model_from_json(None, 1, 1) is None
+    assert transform_from_json(transform_to_json(None)) is None and model_to_json(None) is None
     same(transform_from_json(json.loads(json.dumps(transform_to_json(HEAD)))), HEAD)
 
 
@@ -229,207 +225,162 @@ def test_scan_lines_of_an_unknown_placement_are_listed(path):
 # ---------------------------------------------------------------------------------------------- session.json
 
 
-def test_no_session_at_all(tmp_path):
-    with pytest.raises(SessionError, match=r"session\.json: No such file"):
-        open_session(tmp_path)
+CHANGES = [  # place in session.json, what stands there instead ("gone": nothing), message
+    ("schema", "lrfcal-session/9", "schema is 'lrfcal-session/9', this version reads"),
+    ("schema", "gone", "schema is None"),
+    ("board", "gone", "json: board is missing"),
+    ("rig.cameras", "gone", r"rig\.cameras is missing"),
+    ("rig.lrf.file", "../scans.npz", "must stay inside the session's folder, got '../scans.npz'"),
+    ("rig.lrf.file", "/etc/passwd", "must stay inside the session's folder, got '/etc/passwd'"),
+    ("rig.lrf.file", "C:\\a", r"must stay inside the session's folder, got 'C:\\a'"),
+    ("rig.lrf.file", "lrf/scans.csv", "the LRF's file is one of"),
+    ("name", "../up", "name is '../up': this becomes a file name"),
+    ("rig.cameras.a/", {}, r"name is 'a/': this becomes a file name"),
+    ("placements", [1, 1], r"placements is \[1, 1\]: placements are different numbers"),
+    ("placements", [1, "o"], "placements.1 is 'o': a valid integer"),
+    ("rig.platform.T_head_lrf.translation_m", [0, 0, 157], "translation_m.2 is 157: less than .* 10 .*millimetres"),
+    ("rig.platform.T_head_lrf.translation_m", [0, 0], "translation_m.2 is missing"),
+    ("board.corners_m", [[0, 0], [315, 0], [0, 380]], "board is 380 m large: millimetres"),
+    ("board.corners_m", [[0, 0], [1, 0]], "corners_m must be one corner for each of 3 edges, got 2"),
+    ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
+    ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
+    ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
+    ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
+    ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
+    ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
+    ("board.pattern", CHESSBOARD | {"columns": 500}, "up to 1000 inner corners in all"),
+    ("board.pattern", CHESSBOARD | {"kind": "dots"}, "pattern.kind is 'dots': 'chessboard' is needed"),
+    ("rig.cameras.left.mount", "wall", "left.mount is 'wall': 'head' or 'platform' is needed"),
+    ("rig.cameras.left.width", 0, "left.width is 0: greater than or equal to 1"),
+    ("rig.cameras.left.intrinsics.fx", -1, "left.intrinsics.fx is -1: greater than 0 is needed"),
+    ("rig.cameras.left.intrinsics.distortion", [0, 0], "distortion.2 is missing"),
+    ("rig.cameras.left.intrinsics.covariance", [0.0], r"covariance.0 is 0\.0: a valid tuple"),
+    ("rig.lrf.field_of_view_deg", [120, 60], r"field_of_view_deg is \[120, 60\]: two ascending"),
+    ("rig.lrf.bearing_step_deg", 0, "bearing_step_deg is 0: greater than 0"),
+    ("rig.lrf.sigma_range_m", 5, "sigma_range_m is 5: .*millimetres"),
+    ("rig.lrf.sigma_range_m", math.nan, "sigma_range_m is nan: a finite number is needed"),
+    ("rig.lrf.spot_exit_m", 12, "spot_exit_m is 12: .*millimetres"),
+    ("rig.platform.sigma_offset_m", 5, "sigma_offset_m is 5: .*millimetres"),
+]
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"schema": "lrfcal', "\xff"])
-def test_bad_json(path, text):
-    (path / "session.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(SessionError, match="not JSON"):
-        open_session(path)
-
-
-def test_json_of_another_kind(path):
-    (path / "session.json").write_text("[1]")
-    with pytest.raises(SessionError, match="holds a list"):
-        open_session(path)
-
-
-def lens(data):
-    return data["rig"]["cameras"]["left"]["intrinsics"]
-
-
-CHANGES = {
-    "schema is 'lrfcal-session/9', this version reads": lambda d: d.update(schema="lrfcal-session/9"),
-    "schema is None": lambda d: d.pop("schema"),
-    "key 'board' is missing": lambda d: d.pop("board"),
-    "key 'cameras' is missing": lambda d: d["rig"].pop("cameras"),
-    "must stay inside the session's folder, got '../scans.npz'": lambda d: d["rig"]["lrf"].update(file="../scans.npz"),
-    "must stay inside the session's folder, got '/etc/passwd'": lambda d: d["rig"]["lrf"].update(file="/etc/passwd"),
-    r"must stay inside the session's folder, got 'C:\\a'": lambda d: d["rig"]["lrf"].update(file="C:\\a"),
-    "the LRF's file is one of": lambda d: d["rig"]["lrf"].update(file="lrf/scans.csv"),
-    "becomes a file name.* got '../up'": lambda d: d.update(name="../up"),
-    r"becomes a file name.* got 'a/\.\.'": lambda d: d["rig"]["cameras"].update({"a/..": {}}),
-    "placements are different numbers": lambda d: d.update(placements=[1, 1]),
-    "a placement is a whole number up to 1000000, got 'o'": lambda d: d.update(placements="one"),
-    "translation_m is .*millimetres": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0, 157]),
-    "translation_m must be 3 finite": lambda d: d["rig"]["platform"]["T_head_lrf"].update(translation_m=[0, 0]),
-    "board is 380 m large: millimetres": lambda d: d["board"].update(corners_m=[[0, 0], [315, 0], [0, 380]]),
-    "corners_m must be 3 x 2": lambda d: d["board"].update(corners_m=[[0, 0], [1, 0]]),
-    "three or more edges": lambda d: d["board"].update(edges=["ab", "ab", "ca"]),
-    "features are two of the edges": lambda d: d["board"].update(features=["ab", "xy"]),
-    "square_m is 77.5: millimetres": lambda d: d["board"].update(
-        pattern={"kind": "chessboard", "columns": 8, "rows": 6, "square_m": 77.5}
-    ),
-    "three or more inner corners": lambda d: d["board"].update(
-        pattern={"kind": "chessboard", "columns": 1, "rows": 6, "square_m": 0.1}
-    ),
-    "pattern kind is 'chessboard', got 'dots'": lambda d: d["board"].update(pattern={"kind": "dots"}),
-    "mount is one of head, platform, got 'wall'": lambda d: d["rig"]["cameras"]["left"].update(mount="wall"),
-    "width and height must be positive": lambda d: d["rig"]["cameras"]["left"].update(width=0),
-    "fx must be positive": lambda d: lens(d).update(fx=-1),
-    "distortion must be 5 finite": lambda d: lens(d).update(distortion=[0, 0]),
-    "covariance must be 9 x 9": lambda d: lens(d).update(covariance=[0.0]),
-    "field_of_view_deg is two ascending": lambda d: d["rig"]["lrf"].update(field_of_view_deg=[120, 60]),
-    "bearing_step_deg must be positive, got 0": lambda d: d["rig"]["lrf"].update(bearing_step_deg=0),
-    "sigma_range_m is 5: millimetres": lambda d: d["rig"]["lrf"].update(sigma_range_m=5),
-    "sigma_range_m must be one finite": lambda d: d["rig"]["lrf"].update(sigma_range_m=math.nan),
-}
-
-
-@pytest.mark.parametrize("message", CHANGES)
-def test_a_wrong_statement_is_named(path, message):
-    edit(path, CHANGES[message])
+@pytest.mark.parametrize(("place", "value", "message"), CHANGES)
+def test_a_wrong_statement_is_named(path, place, value, message):
+    file = path / "session.json"
+    data = json.loads(file.read_text())
+    *way, key = place.split(".")
+    holder = reduce(dict.__getitem__, way, data)
+    holder.pop(key) if value == "gone" else holder.update({key: value})
+    file.write_text(json.dumps(data))
     with pytest.raises(SessionError, match=message):
         open_session(path)
 
 
-# ---------------------------------------------------------------------------------------------- scan lines
+# ---------------------------------------------------------------------------------------------- damaged files
 
 
-def test_missing_scans(path):
-    (path / "lrf" / "scans.npz").unlink()
-    with pytest.raises(SessionError, match=r"scans\.npz: no such file"):
-        open_session(path)
+def arrays(**values):
+    return lambda path: edit_scans(path, **values)
 
 
-@pytest.mark.parametrize("part", [0, 10, 0.5, 0.98])
-def test_truncated_scans(path, part):
-    file = path / "lrf" / "scans.npz"
-    data = file.read_bytes()
-    file.write_bytes(data[: int(part * len(data) if part < 1 else part)])
-    with pytest.raises(SessionError, match="cannot be read.*truncated"):
-        open_session(path)
+def written(name, content):
+    """Other bytes in a file; a function makes them of those that are there."""
+
+    def change(path):
+        file = path / name
+        there = file.read_bytes() if file.exists() else b""
+        file.write_bytes(content(there) if callable(content) else content)
+
+    return change
 
 
-def test_damaged_scans(path):
-    file = path / "lrf" / "scans.npz"
-    data = bytearray(file.read_bytes())
-    data[100:160] = bytes(60)
-    file.write_bytes(data)
-    with pytest.raises(SessionError, match=r"scans\.npz: cannot be read"):
-        open_session(path)
+def gone(name):
+    return lambda path: (path / name).unlink()
 
 
-def test_pickles_are_not_read(path):
-    edit_scans(path, pitch=np.array([{}] * 6))
-    with pytest.raises(SessionError, match="cannot be read.*without pickles"):
-        open_session(path)
+def cell(column, value):
+    """Another value in the first row of images.csv."""
+
+    def change(path):
+        with (path / "images.csv").open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        rows[0][column] = value
+        with (path / "images.csv").open("w", newline="") as stream:
+            table = csv.DictWriter(stream, rows[0].keys())
+            table.writeheader()
+            table.writerows(rows)
+
+    return change
 
 
-def test_telegrams_need_their_index(path):
-    (path / "lrf" / "scans.npz").unlink()
-    (path / "lrf" / "telegrams.bin").write_bytes(b"\x02")
-    with pytest.raises(SessionError, match=r"index\.csv: No such file.*needs this file"):
-        open_session(path)
+def pick(row):
+    return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
 
 
-ARRAYS = {
-    "median range is .* m: millimetres": {"ranges": np.full((6, 61), 2000.0)},
-    r"all NaN\): nothing was recorded": {"ranges": np.full((6, 61), np.nan)},
-    "negative ranges are no measurements": {"ranges": np.r_[[[-1.0] * 61], np.ones((5, 61))]},
-    "ranges must be scan lines x beams": {"ranges": np.ones(61)},
-    "a bearing is 120 rad: degrees": {"bearings": np.arange(60.0, 121.0)},
-    "a pitch is 20 rad: degrees": {"pitch": np.linspace(-20.0, 20.0, 6)},
-    "3 values of pitch are not finite": {"pitch": np.r_[np.full(3, np.nan), 0, 0, 0]},
-    "bearings must ascend": {"bearings": BEARINGS[::-1]},
-    r"time_s has shape \(2,\)": {"time_s": np.zeros(2)},
-}
-
-
-@pytest.mark.parametrize("message", ARRAYS)
-def test_wrong_arrays_are_named(path, message):
-    edit_scans(path, **ARRAYS[message])
-    with pytest.raises(SessionError, match=r"scans\.npz: .*" + message):
-        open_session(path)
-
-
-def test_a_missing_array_is_named(path):
-    np.savez(path / "lrf" / "scans.npz", ranges=np.ones((2, 61)), bearings=BEARINGS)
-    with pytest.raises(SessionError, match="key 'placement' is missing"):
-        open_session(path)
-
-
-def test_the_writer_refuses_what_the_reader_would(tmp_path):
-    writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
-    ranges, bearings, pitch = wall()
-    with pytest.raises(SessionError, match="placement 1: the median range .*millimetres"):
-        writer.add_sweep(1, 1000 * ranges, bearings, pitch)
-    with pytest.raises(SessionError, match="pitch has shape"):
-        writer.add_sweep(1, ranges, bearings, pitch[:2])
-    writer.add_sweep(1, ranges, bearings, pitch)
-    with pytest.raises(SessionError, match="one grid a session"):
-        writer.add_sweep(2, ranges, bearings + 0.1, pitch)
-    with pytest.raises(SessionError, match="camera 'up', purpose 'board': cameras are left, right"):
-        writer.add_image("up", pixels())
-    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
-        writer.add_image("left", pixels(), purpose="fun")
-    with pytest.raises(SessionError, match="31 x 24 pixels, but camera 'left' has 32 x 24"):
-        writer.add_image("left", pixels()[:, 1:])
-    with pytest.raises(SessionError, match="mount is one of"):
-        SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
-    assert not (tmp_path / "t").exists()
-
-
-# ---------------------------------------------------------------------------------------------- images and tables
-
-
-def rewrite(path, column, value, row=0, file="images.csv"):
-    with (path / file).open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    rows[row][column] = value
-    with (path / file).open("w", newline="") as stream:
-        table = csv.DictWriter(stream, rows[0].keys())
-        table.writeheader()
-        table.writerows(rows)
-
-
-ROWS = {
-    "must stay inside the session's folder, got '../trip/session.json'": ("file", "../trip/session.json"),
-    "must stay inside the session's folder, got '/etc/passwd'": ("file", "/etc/passwd"),
-    "must stay inside the session's folder, got ''": ("file", ""),
-    r"must stay inside the session's folder, got '\.\.\\": ("file", "..\\x.png"),
-    "0009.png: No such file": ("file", "images/left/0009.png"),
-    "neither PNG nor JPEG": ("file", "session.json"),
-    "no camera 'up' in session.json, which has left, right": ("camera", "up"),
-    "purpose is one of intrinsics, board, scene, got 'fun'": ("purpose", "fun"),
-    "placement 12 is not in session.json": ("placement", "12"),
-    "line 2: invalid literal": ("placement", "first"),
-    "line 2: could not convert string to float: 'up'": ("pitch_deg", "up"),
-}
-
-
-@pytest.mark.parametrize("message", ROWS)
-def test_wrong_rows_are_named(path, message):
-    rewrite(path, *ROWS[message])
-    with pytest.raises(SessionError, match=message):
-        open_session(path)
-
-
-def test_a_link_out_of_the_session_is_refused(path, tmp_path):
-    target = path / "images" / "left" / "0001.png"
-    outside = tmp_path / "secret.png"
-    target.rename(outside)
-    target.symlink_to(outside)
-    with pytest.raises(SessionError, match=r"0001\.png: is a link, not a file"):
-        open_session(path)
-
-
-def test_an_image_of_another_size(path):
+def another_size(path):
     cv2.imwrite(str(path / "images" / "left" / "0002.png"), pixels()[:20])
-    with pytest.raises(SessionError, match=r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"):
+
+
+def telegrams_alone(path):
+    gone("lrf/scans.npz")(path)
+    written("lrf/telegrams.bin", b"\x02")(path)
+
+
+SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the session's folder, got "
+DAMAGE = [
+    (gone("session.json"), r"session\.json: No such file"),
+    (written("session.json", b""), "not JSON"),
+    (written("session.json", b"{"), "not JSON"),
+    (written("session.json", b"\xff"), "not JSON"),
+    (written("session.json", b"[1]"), "holds a list"),
+    (gone(SCANS), r"scans\.npz: no such file"),
+    (written(SCANS, b""), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[:10]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[: len(data) // 2]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[: int(0.98 * len(data))]), "cannot be read.*truncated"),
+    (written(SCANS, lambda data: data[:100] + bytes(60) + data[160:]), r"scans\.npz: cannot be read"),
+    (lambda path: np.savez(path / SCANS, ranges=np.ones((2, 61)), bearings=BEARINGS), "key 'placement' is missing"),
+    (arrays(pitch=np.array([{}] * 6)), "cannot be read.*without pickles"),
+    (arrays(ranges=np.full((6, 61), 2000.0)), r"scans\.npz: the median range is .* m: millimetres"),
+    (arrays(ranges=np.full((6, 61), np.nan)), r"all NaN\): nothing was recorded"),
+    (arrays(ranges=np.r_[[[-1.0] * 61], np.ones((5, 61))]), "negative ranges are no measurements"),
+    (arrays(ranges=np.ones(61)), "ranges must be scan lines x beams"),
+    (arrays(bearings=np.arange(60.0, 121.0)), "a bearing is 120 rad: degrees"),
+    (arrays(pitch=np.linspace(-20.0, 20.0, 6)), "a pitch is 20 rad: degrees"),
+    (arrays(pitch=np.r_[np.full(3, np.nan), 0, 0, 0]), "3 values of pitch are not finite"),
+    (arrays(bearings=BEARINGS[::-1]), "bearings must ascend"),
+    (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
+    (telegrams_alone, r"index\.csv: No such file.*needs this file"),
+    (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
+    (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
+    (cell("file", ""), OUT + "''"),
+    (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
+    (cell("file", "images/left/0009.png"), "0009.png: No such file"),
+    (cell("file", "session.json"), "neither PNG nor JPEG"),
+    (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
+    (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
+    (cell("placement", "12"), "placement 12 is not in session.json"),
+    (cell("placement", "first"), "line 2: invalid literal"),
+    (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
+    (another_size, r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"),
+    (gone(IMAGES), r"images\.csv: No such file"),
+    (written(IMAGES, b""), "got an empty file"),
+    (written(IMAGES, b"\xff\xfe"), "not a CSV file in UTF-8"),
+    (written(IMAGES, lambda data: data.replace(b"_deg", b"")), r"columns must be t_s, .*; got t_s, .*, pitch, purpose"),
+    (written(IMAGES, lambda data: data + b",left,images"), "line 7: 3 values for 6 columns; truncated"),
+    (pick("left,images/left/0009.png,ab,1,2,20,3"), "no 'images/left/0009.png' of camera 'left'"),
+    (pick("left,../0001.png,ab,1,2,20,3"), OUT),
+    (pick("left,images/left/0001.png,top,1,2,20,3"), "edge is one of ab, bc, ca, got 'top'"),
+    (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
+    (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
+    (pick("left,images/left/0001.png,ab,1,2,x,3"), "could not convert"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE)
+def test_damage_is_named(path, damage, message):
+    damage(path)
+    with pytest.raises(SessionError, match=message):
         open_session(path)
 
 
@@ -446,55 +397,27 @@ def test_truncated_images(tmp_path, kind):
 
 
 def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
-    file = path / "images" / "left" / "0001.png"
-    data = bytearray(file.read_bytes())
-    data[60:200] = bytes(140)
-    file.write_bytes(data)
+    written("images/left/0001.png", lambda data: data[:60] + bytes(140) + data[200:])(path)
     (problem,) = validate(path)
     assert "0001.png: cannot be decoded" in problem
 
 
-def test_wrong_columns(path):
-    file = path / "images.csv"
-    file.write_text(file.read_text().replace("pitch_deg", "pitch"))
-    with pytest.raises(SessionError, match=r"images\.csv: columns must be t_s, .*; got t_s, .*, pitch, purpose"):
-        open_session(path)
-    file.write_text("")
-    with pytest.raises(SessionError, match="got an empty file"):
-        open_session(path)
-
-
-def test_a_short_row(path):
-    with (path / "images.csv").open("a") as table:
-        table.write(",left,images")
-    with pytest.raises(SessionError, match="line 7: 3 values for 6 columns; truncated"):
-        open_session(path)
-
-
-def test_a_table_in_another_encoding(path):
-    (path / "images.csv").write_bytes(b"\xff\xfe")
-    with pytest.raises(SessionError, match="not a CSV file in UTF-8"):
-        open_session(path)
-
-
-def test_missing_images_table(path):
-    (path / "images.csv").unlink()
-    with pytest.raises(SessionError, match=r"images\.csv: No such file"):
-        open_session(path)
-
-
-PICKS = {
-    "no 'images/left/0009.png' of camera 'left'": "left,images/left/0009.png,ab,1,2,20,3",
-    "must stay inside": "left,../0001.png,ab,1,2,20,3",
-    "edge is one of ab, bc, ca, got 'top'": "left,images/left/0001.png,top,1,2,20,3",
-    "too close for a direction": "left,images/left/0001.png,ab,1,2,2,3",
-    "u1, v1, u2, v2 must be 4 finite": "left,images/left/0001.png,ab,1,2,nan,3",
-    "could not convert": "left,images/left/0001.png,ab,1,2,x,3",
-}
-
-
-@pytest.mark.parametrize("message", PICKS)
-def test_wrong_picks_are_named(path, message):
-    (path / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + PICKS[message] + "\n")
-    with pytest.raises(SessionError, match=message):
-        open_session(path)
+def test_the_writer_refuses_what_the_reader_would(tmp_path):
+    writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
+    ranges, bearings, pitch = wall()
+    writer.add_sweep(1, ranges, bearings, pitch)
+    for wrong, message in (
+        (lambda: writer.add_sweep(2, 1000 * ranges, bearings, pitch), "placement 2: the median range .*millimetres"),
+        (lambda: writer.add_sweep(2, ranges, bearings, pitch[:2]), "pitch has shape"),
+        (lambda: writer.add_sweep(2, ranges, bearings + 0.1, pitch), "one grid a session"),
+        (lambda: writer.add_image("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
+        (lambda: writer.add_image("left", pixels(), purpose="fun"), "purposes intrinsics, board, scene"),
+        (lambda: writer.add_image("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
+        (
+            lambda: SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)]),
+            "left.mount is 'car'",
+        ),
+    ):
+        with pytest.raises(SessionError, match=message):
+            wrong()
+    assert not (tmp_path / "t").exists()

@@ -14,7 +14,7 @@ from lrfcal_lib.calibrate.pipeline import calibrate
 from lrfcal_lib.evaluate import verdict
 from lrfcal_lib.evaluate.export import UNTRUSTED, calibrate_session
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import LrfInfo, lrf_from_json, lrf_to_json
+from lrfcal_lib.session.stated import LrfInfo, from_json, lrf_to_json
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -44,7 +44,7 @@ def joint_of(offset_mm, sigma_mm, **options):
 )
 def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted):
     assert lrf(**stated).admitted_offset == admitted
-    assert lrf_from_json(json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted
+    assert from_json(LrfInfo, json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted
 
 
 @pytest.mark.parametrize(

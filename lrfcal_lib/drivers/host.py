@@ -12,15 +12,25 @@ import time
 
 from lrfcal_lib.drivers.port import PortError, open_port, set_rate
 
+MOMENT_S = 1e-3
 LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
 
 
 class Host:
     """This machine; names and meanings are those of `time` and `threading`."""
 
-    now, time, sleep = staticmethod(time.monotonic), staticmethod(time.time), staticmethod(time.sleep)
-    event, condition, lock = threading.Event, threading.Condition, staticmethod(threading.RLock)
+    now, time = staticmethod(time.monotonic), staticmethod(time.time)
+    event, lock = threading.Event, staticmethod(threading.RLock)
     port, set_rate = staticmethod(open_port), staticmethod(set_rate)
+
+    @staticmethod
+    def sleep(seconds):
+        """Wait; moments are spent awake, since a busy machine gives the processor back late to those who sleep."""
+        end = time.monotonic() + seconds
+        if seconds > MOMENT_S:
+            time.sleep(seconds)
+        while time.monotonic() < end:
+            pass
 
     @staticmethod
     def thread(target, name):
@@ -70,10 +80,6 @@ class VirtualHost:
         """As threading.Event."""
         return _Event(self)
 
-    def condition(self):
-        """As threading.Condition, for waits with a time limit."""
-        return _Condition(self)
-
     def lock(self):
         """As threading.RLock."""
         return _Lock(self)
@@ -83,15 +89,15 @@ class VirtualHost:
         return _Thread(self, target, name)
 
     def port(self, path, baudrate, *, timeout):
-        """As :func:`serial_port.open_port`."""
+        """As :func:`port.open_port`."""
         if str(path) not in self.ports:
-            raise PortError(f"there is no port {path}: check cable and power; present are "
-                            f"{', '.join(sorted(self.ports)) or 'none'}")  # fmt: skip
+            present = ", ".join(sorted(self.ports)) or "none"
+            raise PortError(f"there is no port {path}: check cable and power; present are {present}")
         return self.ports[str(path)](baudrate, timeout)
 
     @staticmethod
     def set_rate(port, baudrate):
-        """As :func:`serial_port.set_rate`."""
+        """As :func:`port.set_rate`."""
         port.baudrate = baudrate
 
     def _pass_on(self, me=None):
@@ -140,24 +146,6 @@ class _Event:
 
     def wait(self, timeout=None):
         return self._host.wait(self.is_set, timeout)
-
-
-class _Condition:
-    def __init__(self, host):
-        self._host, self._told = host, 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass  # one thread runs at a time
-
-    def notify_all(self):
-        self._told += 1
-
-    def wait(self, timeout=None):
-        before = self._told
-        return bool(self._host.wait(lambda: self._told != before, timeout))
 
 
 class _Lock:

@@ -5,119 +5,109 @@ from __future__ import annotations
 import logging
 import math
 
+from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.lms2xx_link import (
-    CONFIGURATION,
-    CONFIGURE,
-    ERRORS,
-    MODE,
-    ON_REQUEST,
-    POINTS,
-    RATES,
-    STATUS,
-    TRIES,
-    TYPE,
-    VALUES,
-    VARIANT,
-    Assembler,
-    Link,
-    ScanClock,
-    ScanReader,
-)
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.lms2xx_link import POINTS, RATES, Assembler, Link, ScanClock, ScanReader
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
 from lrfcal_lib.session.lms2xx_codec import (
     MODES,
     SCAN,
     UNITS,
     TelegramError,
     parse_configuration,
-    parse_errors,
     parse_status,
     parse_type,
 )
 
-logger = logging.getLogger(__name__)
-INSTALLATION = b"\x00"  # data of MODE
+LOG = logging.getLogger(__name__)
+INSTALLATION, STREAM, INTERLACED = b"\x00", b"\x24", b"\x2a"  # data of MODE
+ALL_VALUES = b"\x01"  # data of VALUES
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
+REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
 CONFIGURED = ("unit", "measuring_mode", "realtime_indices")
 COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
 
 
-class LMS2xxSetup:
-    """An LMS2xx that waits for requests; `LMS2xx` adds scans and streaming and is what programs use."""
+class LMS2xx(Closed):
+    """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
-    def __init__(self, port, *, address=0, password=b"SICK_LMS", clock=None, log=logger, host=REAL):
-        self.port, self.type, self.firmware = port, "", ""
-        self.status = self.configuration = self.variant = None
-        self._address, self._password, self._host, self._log = address, bytes(password), host, log
-        self._clock = clock or host.time
-        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
-        self._link = self._assembler = self._settled = self._scan_clock = None
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
+    `counts`, `stop` and `close` may be called.
 
-    @classmethod
-    def open(
-        cls, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=logger, host=REAL,
-        **configuration,
-    ):  # fmt: skip
-        """Find the device at a port whatever it is doing, stop its stream, and read what it is.
+    Parameters
+    ----------
+    port : str or Path
+    baudrate : int, optional
+        To switch to afterwards; the one found stays by default.
+    address : int
+        Of the device; 0 reaches any.
+    password : bytes
+        Eight characters, of the installation mode; the factory's by default.
+    find_s : float
+        Longest time to find the rate.
+    clock : callable, optional
+        Seconds, for the instants of scans; time.time() of the host by default.
+    host : Host
+        Machine that the driver runs on; tests have a VirtualHost.
+    **configuration
+        Of :meth:`configure`.
 
-        Parameters
-        ----------
-        port : str or Path
-        baudrate : int, optional
-            To switch to afterwards; the one found stays by default.
-        address : int
-            Of the device; 0 reaches any.
-        password : bytes
-            Eight characters, of the installation mode; the factory's by default.
-        find_s : float
-            Longest time to find the rate.
-        clock : callable, optional
-            Seconds, for the instants of scans; time.time() of the host by default.
-        log : logging.Logger
-        host : Host
-            Machine that the driver runs on; tests have a VirtualHost.
-        **configuration
-            Of :meth:`configure`.
+    Attributes
+    ----------
+    type, firmware : str
+        Model and order number; version.
+    status : DeviceStatus
+        As read last.
+    configuration : Configuration
+        As read last.
+    variant : tuple of float
+        Field of view and resolution, degrees.
 
-        Returns
-        -------
-        LMS2xx
+    Raises
+    ------
+    PortError
+        If the port is missing, forbidden, busy, or no serial line.
+    NoReply, WrongDevice
+        If nothing, or something else answers, or a device in a measuring mode without ranges.
+    ValueError
+        For a rate or an address that no LMS2xx has, or a password of another length.
+    """
 
-        Raises
-        ------
-        PortError
-            If the port is missing, forbidden, busy, or no serial line.
-        NoReply, WrongDevice
-            If nothing, or something else answers, or a device in a measuring mode without ranges.
-        ValueError
-            For a rate or an address that no LMS2xx has, or a password of another length.
-        """
-        if baudrate is not None:
-            _code_of(baudrate)
+    def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=LOG,
+                 host=REAL, **configuration):  # fmt: skip
+        if baudrate not in (None, *RATES):
+            raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
-        device = cls(str(port), address=address, password=password, clock=clock, log=log, host=host)
+        self.port, self._password, self._host, self._log = str(port), bytes(password), host, log
+        self._clock, self._counts, self._interrupted = clock or host.time, dict.fromkeys(COUNTS, 0), host.event()
+        self._options = {"address": address, "clock": clock, "interrupted": self._interrupted, "host": host}
+        self._link = self._assembler = self._settled = self._scan_clock = self._reader = None
+        self._interlaced = False
         try:
-            device._connect(baudrate or 38400, host.now() + find_s)
-            if baudrate is not None and baudrate != device.baudrate:
-                device._set_rate(baudrate)
-            device.configure(**configuration) if configuration else device._prepare()
+            self._connect(baudrate or 38400, host.now() + find_s)
+            if baudrate is not None and baudrate != self.baudrate:
+                self._set_rate(baudrate)
+            self.configure(**configuration) if configuration else self._prepare()
         except BaseException:
-            device._release()
+            self._release()
             raise
-        return device
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
 
     def close(self):
+        """Stop streaming, close the port; never raises for a device that is gone."""
+        try:
+            self.stop()
+        except DeviceError as error:
+            self._log.warning("%s: closed without the device's consent: %s", self.port, error)
+        finally:
+            self._release()
+
+    def _release(self):
         """Close the port."""
-        self._release()
+        if self._link is not None:
+            self._link.close()
+            self._link = None
 
     @property
     def baudrate(self):
@@ -126,7 +116,7 @@ class LMS2xxSetup:
 
     @property
     def counts(self):
-        """How often what happened since `open`, a dict.
+        """How often what happened since the device was opened, a dict.
 
         'telegrams': sound ones; 'crc_errors': damaged ones; 'resyncs': stray bytes skipped; 'dropped': scans that the
         mirror made between two that came (needs real-time indices), most of them because the line is slow; 'stale':
@@ -138,14 +128,13 @@ class LMS2xxSetup:
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
-        options = {"address": self._address, "clock": self._clock, "interrupted": self._interrupted, "host": self._host}
-        self._link, self._scan_clock = Link(self.port, first, self._counts, **options), ScanClock()
+        self._link, self._scan_clock = Link(self.port, first, self._counts, **self._options), ScanClock()
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
         self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
-        model, *rest = self._told(TYPE, parse_type)
+        model, *rest = self._told(wire.TYPE, parse_type)
         if not model.startswith("LMS2"):
             raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx")
         self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
@@ -160,21 +149,17 @@ class LMS2xxSetup:
         if (mode := self.configuration.measuring_mode) not in MODES:
             text = f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are no ranges"
             raise WrongDevice(f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set")
-        self._settled = (self.baudrate, self.variant, self.configuration)
-        told = self.variant, self.configuration, self.baudrate
-        self._assembler = Assembler(*told, interlaced, self._counts, self._scan_clock)
+        self._settled = self.variant, self.configuration, self.baudrate
+        self._assembler = Assembler(*self._settled, interlaced, self._counts, self._scan_clock)
 
     def _opened(self):
         if self._link is None:
             raise LineLost(f"{self.port} is closed: open it, or call reconnect()")
         return self._link
 
-    def _ask(self, code, data=b"", **options):
-        return self._opened().ask(code, data, **options)
-
     def _told(self, code, parse):
         """What a reply says."""
-        raw = self._ask(code).raw
+        raw = self._opened().ask(code).raw
         try:
             return parse(raw)
         except TelegramError as error:
@@ -182,15 +167,11 @@ class LMS2xxSetup:
             raise WrongDevice(text) from error
 
     def _idle(self):
-        """To be overridden: raise where the device is not free for requests."""
+        if self._reader is not None:
+            raise DeviceError(f"{self.port}: the device streams; call stop() first")
 
     def reconnect(self, deadline=10.0):
-        """Find the device again after the line was lost or the device restarted, and give it the same settings.
-
-        Parameters
-        ----------
-        deadline : float
-            Seconds.
+        """Find the device again after the line was lost or it restarted, within seconds, and set it as it was.
 
         Raises
         ------
@@ -204,9 +185,15 @@ class LMS2xxSetup:
 
     def _mend(self, deadline):
         end = self._host.now() + deadline
-        rate, variant, configuration = self._settled
+        variant, configuration, rate = self._settled
         self._release()
-        self._reopen(rate, end)
+        while self._link is None:
+            try:
+                self._connect(rate, min(end, self._host.now() + FIND_S), end)
+            except (PortError, LineLost) as error:
+                self._release()
+                if self._interrupted.wait(AGAIN_S) or self._host.now() > end - AGAIN_S:
+                    raise LineLost(f"the line did not come back: {error}") from error
         if self.variant != variant:
             self._set_variant(variant)
         if self.configuration.block != configuration.block:
@@ -218,38 +205,11 @@ class LMS2xxSetup:
         self._counts["reconnects"] += 1
         self._log.warning("%s: the device is back at %d Bd", self.port, rate)
 
-    def _reopen(self, rate, end):
-        """Wait for the port and connect."""
-        while True:
-            try:
-                return self._connect(rate, min(end, self._host.now() + FIND_S), end)
-            except (PortError, LineLost) as error:
-                self._release()
-                if self._interrupted.wait(AGAIN_S) or self._host.now() > end - AGAIN_S:
-                    raise LineLost(f"the line did not come back: {error}") from error
-
-    def _release(self):
-        """Close the port."""
-        if self._link is not None:
-            self._link.close()
-            self._link = None
-
     # ------------------------------------------------------------------------------------------------- settings
 
-    def read_status(self):
-        """Read the status reply.
-
-        Returns
-        -------
-        DeviceStatus
-        """
-        self._idle()
-        return self._read_status()
-
     def _read_status(self):
-        self.status = self._told(STATUS, parse_status)
+        self.status = self._told(wire.STATUS, parse_status)
         self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
-        return self.status
 
     def _read_configuration(self):
         def parse(raw):
@@ -257,42 +217,17 @@ class LMS2xxSetup:
             _ = found.unit  # a unit that no manual lists is seen here
             return found
 
-        self.configuration = self._told(CONFIGURATION, parse)
-
-    def read_errors(self):
-        """The list of errors: tuples of severity, whether it is over, number (manual, 10.11)."""
-        self._idle()
-        return self._told(ERRORS, parse_errors)
-
-    def set_baudrate(self, rate):
-        """Change the rate of both ends; flash is not written.
-
-        Parameters
-        ----------
-        rate : int
-            9600, 19200, 38400 or 500000.
-
-        Raises
-        ------
-        PortError
-            If the line of this machine cannot; nothing has changed.
-        Refused, NoReply
-            If the device declines, or does not come through at the new rate; the old one holds again.
-        """
-        _code_of(rate)
-        self._idle()
-        if rate != self.baudrate:
-            self._set_rate(rate)
-            self._prepare()
+        self.configuration = self._told(wire.CONFIGURATION, parse)
 
     def _set_rate(self, rate):
+        """Change the rate of both ends; flash is not written. Where it does not come through the old one holds."""
         old = self.baudrate
         self._link.set_rate(rate)  # before the device is told: raises where this end cannot
         self._link.set_rate(old)
-        self._mode(bytes([_code_of(rate)]), f"{rate} Bd")
+        self._mode(bytes([RATES[rate]]), f"{rate} Bd")
         self._link.set_rate(rate)
         try:
-            self._ask(TYPE)
+            self._link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
             self._link.find([old, *(r for r in RATES if r not in (old, rate)), rate], FIND_S)
             need = "RS-422 (a jumper in the plug of the device)" if rate == 500000 else "a shorter cable"
@@ -301,17 +236,12 @@ class LMS2xxSetup:
 
     def _mode(self, data, what, sign=None):
         """Change the operating mode; replies A0 other than 00 are refusals."""
-        reply = self._ask(MODE, data, sign=sign)
+        reply = self._opened().ask(wire.MODE, data, sign=sign)
         if reply.code != sign and reply.raw[5]:
             raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
 
     def set_variant(self, fov_deg, resolution_deg):
-        """Change field of view and resolution, only if they differ.
-
-        Parameters
-        ----------
-        fov_deg, resolution_deg : float
-            180 with 1 or 0.5; 100 with 1, 0.5 or 0.25.
+        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg, if they differ.
 
         Returns
         -------
@@ -333,7 +263,7 @@ class LMS2xxSetup:
     def _set_variant(self, wanted):
         words = b"".join(round(v).to_bytes(2, "little") for v in (wanted[0], 100 * wanted[1]))
         try:
-            self._ask(VARIANT, words)
+            self._opened().ask(wire.VARIANT, words)
         except NoReply as error:  # the reply may be lost and the variant set
             self._log.warning("%s; reading the variant", error)
         self._read_status()
@@ -348,7 +278,7 @@ class LMS2xxSetup:
         ----------
         unit : {'cm', 'mm'}, optional
         measuring_mode : int, optional
-            Key of `lms2xx.MODES`; tells the largest range, too.
+            Key of `lms2xx_codec.MODES`; tells the largest range, too.
         realtime_indices : bool, optional
             Whether scans carry their indices; without them dropped and repeated scans cannot be seen.
 
@@ -380,89 +310,30 @@ class LMS2xxSetup:
         """Write a configuration in installation mode, and read it back."""
         try:
             self._mode(INSTALLATION + self._password, "the password of the installation mode")
-            self._ask(CONFIGURE, wanted.block)
+            self._link.ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
             self._log.warning("%s; reading the configuration", error)
         finally:
-            self._mode(ON_REQUEST, "to leave the installation mode")
+            self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
         if self.configuration.block != wanted.block:
             raise Refused(f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}")
 
-
-def _code_of(rate):
-    """Data of command 20 that sets a rate."""
-    if rate not in RATES:
-        raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {rate}")
-    return RATES[rate]
-
-
-REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
-STREAM, INTERLACED, ALL_VALUES = b"\x24", b"\x2a", b"\x01"
-
-
-class LMS2xx(LMS2xxSetup):
-    """An LMS2xx; made by :meth:`open`, a context manager.
-
-    Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
-    `counts`, `stop` and `close` may be called.
-
-    Attributes
-    ----------
-    port : str
-    type : str
-        Model and order number.
-    firmware : str
-    status : DeviceStatus
-        As read last.
-    configuration : Configuration
-        As read last.
-    variant : tuple of float
-        Field of view and resolution, degrees.
-    """
-
-    def __init__(self, *args, **options):
-        super().__init__(*args, **options)
-        self._reader, self._interlaced = None, False
-
-    def _idle(self):
-        if self._reader is not None:
-            raise DeviceError(f"{self.port}: the device streams; call stop() first")
-
-    def close(self):
-        """Stop streaming, close the port; never raises for a device that is gone."""
-        try:
-            self.stop()
-        except DeviceError as error:
-            self._log.warning("%s: closed without the device's consent: %s", self.port, error)
-        finally:
-            self._release()
+    # ---------------------------------------------------------------------------------------------------- scans
 
     def request(self, timeout=None):
-        """One scan.
-
-        Parameters
-        ----------
-        timeout : float, optional
-            Seconds; what three tries need by default.
-
-        Returns
-        -------
-        Reading
-        """
+        """One scan, a Reading, within so many seconds; by default what three tries need."""
         self._idle()
-        end = self._host.now() + (self._patience() if timeout is None else timeout)
-        for _ in range(TRIES):
+        patience = wire.TRIES * (0.5 + 2 * self._assembler.interval_s)
+        end = self._host.now() + (patience if timeout is None else timeout)
+        for _ in range(wire.TRIES):
             left = max(0.0, end - self._host.now())
-            arrival = self._ask(VALUES, ALL_VALUES, limit_s=left)
+            arrival = self._opened().ask(wire.VALUES, ALL_VALUES, limit_s=left)
             late = arrival.time_s - self._link.asked_s > REPLY_S + self._assembler.duration_s
             reading = None if late else self._scan(arrival)  # nobody knows the instant of a scan that came late
             if reading is not None:
                 return reading
         raise NoReply(f"{self.port}: scans arrive, but too late, not new, or not of the variant {self.variant}")
-
-    def _patience(self):
-        return TRIES * (0.5 + 2 * self._assembler.interval_s)
 
     def _scan(self, arrival):
         return self._assembler.feed(arrival.raw, arrival.time_s) if arrival.code == SCAN else None
@@ -470,80 +341,75 @@ class LMS2xx(LMS2xxSetup):
     def start(self, interlaced=False):
         """Stream: a thread reads every scan from now on.
 
-        Parameters
-        ----------
-        interlaced : bool
-            Merge partial scans to 180 deg in steps of 0.25 deg; the variant becomes 100/0.25, which such scans need.
+        With `interlaced` partial scans are merged to 180 deg in steps of 0.25 deg; the variant becomes 100/0.25, which
+        such scans need.
         """
         self._idle()
         self._interlaced = interlaced
         if interlaced:
             self.set_variant(100, 0.25)
         self._stream()
+
+        def receive():
+            return [(one.code, self._scan(one)) for one in self._opened().receive()]
+
+        def recover(seconds):
+            self._mend(seconds)
+            self._stream()
+
         interval_s = (4 if interlaced else 1) * self._assembler.interval_s
-        self._reader = ScanReader(self._receive, self._resume, self._clock, interval_s, self._log, self._host)
-        self._reader.start()
+        self._reader = ScanReader(receive, recover, interval_s, self._log, self._host)
 
     def _stream(self):
         self._prepare(self._interlaced)
         self._mode(INTERLACED if self._interlaced else STREAM, "to stream", sign=SCAN)
 
-    def _receive(self):
-        return [(one.code, self._scan(one)) for one in self._opened().receive()]
-
-    def _resume(self, seconds):
-        self._mend(seconds)
-        self._stream()
+    def _streaming(self):
+        if self._reader is None:
+            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
+        return self._reader
 
     def newest(self, after=None, timeout=2.0):
-        """The newest scan of the stream.
+        """The newest scan of the stream, a Reading, within so many seconds.
 
-        Parameters
-        ----------
-        after : float, optional
-            Only a scan whose first beam is later, by the host's clock. By default one that was not handed out
-            before and is not older than the stream needs.
-        timeout : float
-
-        Returns
-        -------
-        Reading
+        Its first beam is later than `after` by the host's clock; by default it is one that was not handed out before
+        and is not older than the stream needs.
 
         Raises
         ------
         NoReply
             If there is none in time; the message tells what is wrong with the stream.
         """
-        return self._streaming().newest(after, timeout)
+        reader = self._streaming()
+
+        def find(readings):
+            oldest_s = max(reader.handed_s, self._clock() - 3 * reader.interval_s - wire.LEAST_QUIET_S)
+            fresh = readings and readings[-1].time_s > (oldest_s if after is None else after)
+            return readings[-1] if fresh else None
+
+        return reader.wait(find, timeout)
 
     def take(self, count, after=None, timeout=None):
-        """Consecutive scans of the stream.
+        """Consecutive scans of the stream, all later than an instant, by default that of the call.
 
-        Parameters
-        ----------
-        count : int
-        after : float, optional
-            Instant that all must be later than; the call by default. The last 256 scans are kept, so that with the
-            instant of the last scan of one call the next call goes on without a gap.
-        timeout : float, optional
-            For all of them; what the line needs and 2 s by default.
+        The last 256 scans are kept, so that with the instant of the last scan of one call the next call goes on
+        without a gap. By default it lasts as long as the line needs and 2 s.
 
         Returns
         -------
         list of Reading
         """
-        reader, after = self._streaming(), self._clock() if after is None else after
+        reader, found = self._streaming(), []
         limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout
-        end, found = self._host.now() + limit, []
-        while len(found) < count:
-            found.append(reader.next(after, max(0.0, end - self._host.now())))
-            after = found[-1].time_s
-        return found
+        begin_s, end = self._clock() if after is None else after, self._host.now() + limit
 
-    def _streaming(self):
-        if self._reader is None:
-            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
-        return self._reader
+        def find(readings):
+            last_s = found[-1].time_s if found else begin_s
+            return next((one for one in readings if one.time_s > last_s), None)
+
+        while len(found) < count:
+            found.append(reader.wait(find, max(0.0, end - self._host.now())))
+        return found
 
     def stop(self):
         """Stop streaming; nothing happens where the device does not."""
@@ -555,5 +421,6 @@ class LMS2xx(LMS2xxSetup):
         self._interrupted.clear()
         if self._link is None:
             raise LineLost(f"{self.port}: the line is lost; the device may still stream")
-        self._link.stop()
+        self._link.ask(wire.MODE, wire.ON_REQUEST)
+        self._link.hush()
         self._prepare()

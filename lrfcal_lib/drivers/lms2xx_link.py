@@ -13,7 +13,6 @@ from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session.lms2xx_codec import (
     OVERHEAD,
-    UNITS,
     TelegramError,
     decode_scan,
     encode_telegram,
@@ -68,19 +67,8 @@ def interval_s(size, baudrate, scan_s):
 class Link:
     """An open port with an LMS2xx at its other end.
 
-    Parameters
-    ----------
-    path : str
-    baudrate : int
-    counts : dict
-        Numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up.
-    address : int
-        Of the device; 0 reaches any.
-    clock : callable, optional
-        ``host.time`` by default.
-    interrupted : threading.Event, optional
-        Once set, whoever waits here gets NoReply.
-    host : Host
+    `counts` has the numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up; address 0 reaches any device; once
+    the event `interrupted` is set, whoever waits here gets NoReply.
 
     Attributes
     ----------
@@ -92,11 +80,6 @@ class Link:
         By the clock, when the last request was sent for the first time.
     heard : int
         Bytes of any kind.
-
-    Raises
-    ------
-    PortError
-        See :func:`serial_port.open_port`.
     """
 
     def __init__(self, path, baudrate, counts, *, address=0, clock=None, interrupted=None, host=REAL):
@@ -137,39 +120,23 @@ class Link:
                 self.host.sleep(PACE_S)
 
     def receive(self):
-        """Telegrams that came in; waits 20 ms at most, longer only while more bytes keep coming.
+        """The device's telegrams, often none; waits 20 ms at most, longer only while more bytes keep coming.
 
-        Returns
-        -------
-        list of Arrival
-            Those of the device, whatever their code; often none.
-
-        Raises
-        ------
-        LineLost
-            If the port vanished.
-        NoReply
-            If somebody set `interrupted`.
+        The bytes after a telegram tell how much earlier it came. Raises LineLost if the port vanished, NoReply if
+        somebody set `interrupted`.
         """
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
         if self._kept:
             kept, self._kept = self._kept, []
             return kept
+        whole = int.from_bytes(self._rest[2:4], "little") + OVERHEAD if len(self._rest) >= 4 else 0
         with line_lost(self.path):
-            data = self._port.read(self._missing())
+            data = self._port.read(max(1, whole - len(self._rest)))
             data += self._port.read(self._port.in_waiting)
-        return self._cut(data, self.clock()) if data else []
-
-    def _missing(self):
-        """Bytes until the telegram that has begun is whole."""
-        if len(self._rest) < 4:
-            return 1
-        return max(1, int.from_bytes(self._rest[2:4], "little") + OVERHEAD - len(self._rest))
-
-    def _cut(self, data, now):
-        """Take the telegrams out of what is there; the bytes after a telegram tell how much earlier it came."""
-        self._last = self.host.now()
+        if not data:
+            return []
+        now, self._last = self.clock(), self.host.now()
         self.heard += len(data)
         data = self._rest + data
         stream = split_stream(data)
@@ -180,9 +147,8 @@ class Link:
         self.counts["telegrams"] += len(ends)
         self.counts["crc_errors"] += int((stream.rejected < stream.pending).sum())
         self.counts["resyncs"] += stream.skipped > 1  # one byte is an acknowledgement
-        byte_s = 10 / self.baudrate
         spans = zip(stream.offset.tolist(), ends, strict=True)
-        found = [Arrival(data[begin:end], now - (len(data) - end) * byte_s) for begin, end in spans]
+        found = [Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate) for begin, end in spans]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]
 
     @property
@@ -203,24 +169,10 @@ class Link:
     # ---------------------------------------------------------------------------------------------- requests
 
     def ask(self, code, data=b"", *, limit_s=math.inf, sign=None):
-        """Send a request until its reply comes.
+        """Send a request until its reply comes, within `limit_s` and what the manual allows this request.
 
-        Parameters
-        ----------
-        code : int
-        data : bytes
-        limit_s : float
-            The call returns or raises within this time, and within what the manual allows this request.
-        sign : int, optional
-            A reply of this code, too, shows that the request was obeyed; it stays to be received.
-
-        Returns
-        -------
-        Arrival
-
-        Raises
-        ------
-        NoReply, Refused, LineLost
+        A reply of the code `sign`, too, shows that the request was obeyed; it stays to be received. Raises NoReply,
+        Refused or LineLost.
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
         end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
@@ -228,9 +180,8 @@ class Link:
         for _ in range(TRIES):
             self.send(code, data)
             reply, said = self._await({code | 0x80, sign}, again_s, end)
-            if reply is not None and reply.code == sign:
-                self._kept.insert(0, reply)
             if reply is not None:
+                self._kept = [reply, *self._kept] if reply.code == sign else self._kept
                 return reply
             if self.host.now() > end - NAK_PAUSE_S:
                 break
@@ -262,20 +213,9 @@ class Link:
     # ------------------------------------------------------------------------------------------ finding the rate
 
     def find(self, rates, limit_s):
-        """Set the rate at which the device answers, and stop whatever it does.
+        """Set the rate, of those to try in their order, at which the device answers, and stop whatever it does.
 
-        Parameters
-        ----------
-        rates : iterable of int
-            In the order to try.
-        limit_s : float
-
-        Raises
-        ------
-        NoReply
-            If nothing was heard at any rate.
-        WrongDevice
-            If only bytes that make no telegram were heard.
+        Raises NoReply if nothing was heard at any rate, WrongDevice if only bytes that make no telegram.
         """
         end, heard, windows = self.host.now() + limit_s, self.heard, itertools.cycle(WINDOWS_S)
         while self.host.now() < end:
@@ -284,14 +224,10 @@ class Link:
                 return
         tried = f"{', '.join(map(str, rates))} Bd, address {self.address}" + " (any)" * (self.address == 0)
         if self.heard > heard:
-            raise WrongDevice(
-                f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
-                "another device, wires that echo, or a line that damages everything"
-            )
-        raise NoReply(
-            f"{self.path}: no reply at {tried}: check power (ready up to 60 s after switching on), "
-            "the address, whether RX and TX are crossed, and the jumper for RS-422 in the plug"
-        )
+            raise WrongDevice(f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
+                              "another device, wires that echo, or a line that damages everything")  # fmt: skip
+        raise NoReply(f"{self.path}: no reply at {tried}: check power (ready up to 60 s after switching on), "
+                      "the address, whether RX and TX are crossed, and the jumper for RS-422 in the plug")  # fmt: skip
 
     def _answers(self, rate, window, end):
         """Whether the device confirms at a rate that it stops streaming; once it acknowledges it gets 3 s for that."""
@@ -312,18 +248,8 @@ class Link:
                 until = begin + 3.2
         return False
 
-    def stop(self):
-        """Stop streaming and see that it stopped; raises as `ask` and `hush`."""
-        self.ask(MODE, ON_REQUEST)
-        self.hush()
-
     def hush(self):
-        """See that nothing comes in; ask again to stop streaming where something does.
-
-        Raises
-        ------
-        NoReply, Refused, LineLost
-        """
+        """See that nothing comes in, else ask again to stop streaming; raises NoReply, Refused or LineLost."""
         for _ in range(TRIES):
             begin, heard = self.host.now(), self.heard
             while self.host.now() < begin + 5 * SILENCE_S and self.heard == heard:
@@ -387,56 +313,35 @@ class ScanClock:
         self._seen, self._refused, self._told = deque(), 0, -np.inf
 
     def place(self, index, time_s):
-        """Instant of a scan.
+        """Instant of a scan, and turns since the last one.
 
-        Parameters
-        ----------
-        index : int
-            Turns of the mirror modulo 256; -1 where the device does not send it.
-        time_s : float
-            Instant as of its arrival.
-
-        Returns
-        -------
-        instant : float or None
-            Rising from scan to scan; None for a telegram that is not newer than the last one.
-        step : int
-            Turns since the last one; 0 where that is not known.
+        `index` counts the turns of the mirror modulo 256 and is -1 where the device does not send it, `time_s` is the
+        instant as of its arrival. Instants rise from scan to scan; that of a scan that is not newer is None. The turns
+        are 0 where they are not known.
         """
         if index < 0:
             return time_s, 0
-        step = 0
+        turn, step = index, 0
         if self._seen:
-            turn, last_s = self._seen[-1][0], self._instant()
-            step = self._step(index - turn, time_s - last_s)
-            if step is None:
-                return None, 0
-        turn = self._seen[-1][0] + step if step else index
+            elapsed_s = time_s - self._instant()
+            if elapsed_s > FORGET_S or self._refused >= STUBBORN:
+                self._seen.clear()
+            else:
+                step = (index - self._seen[-1][0]) % 256
+                step += 256 * round((elapsed_s / TURN_S - step) / 256)
+                if step <= 0 or abs(elapsed_s - step * TURN_S) >= OFF_S:
+                    self._refused += 1
+                    return None, 0
+                turn = self._seen[-1][0] + step
         self._refused = 0
         self._seen.append((turn, time_s))
         while self._seen[0][1] < time_s - WINDOW_S and len(self._seen) > 1:
             self._seen.popleft()
-        return self._rising(self._instant()), step
-
-    def _rising(self, instant):
-        """An instant after the last one told, or None where the clock was found to be far ahead."""
-        if instant < self._told - JITTER_S:
-            return None
+        instant = self._instant()
+        if instant < self._told - JITTER_S:  # the clock was found to be far ahead
+            return None, step
         self._told = max(instant, self._told + LEAST_S)
-        return self._told
-
-    def _step(self, ahead, elapsed_s):
-        """Turns since the last scan; None where the index does not fit the time that passed, 0 after a new start."""
-        if elapsed_s > FORGET_S or self._refused >= STUBBORN:
-            self._seen.clear()
-            return 0
-        step = ahead % 256
-        step += 256 * round((elapsed_s / TURN_S - step) / 256)
-        late = elapsed_s - step * TURN_S
-        if step > 0 and abs(late) < OFF_S:
-            return step
-        self._refused += 1
-        return None
+        return self._told, step
 
     def _instant(self):
         """Of the last scan, by the earliest arrival of the window."""
@@ -444,99 +349,57 @@ class ScanClock:
 
 
 class Assembler:
-    """Readings out of telegrams, one by one.
+    """Readings out of the telegrams of a variant (field of view and resolution, degrees), one by one.
 
-    Parameters
-    ----------
-    variant : tuple
-        Field of view and resolution, degrees.
-    configuration : Configuration
-    baudrate : int
-    interlaced : bool
-        Merge four partial scans of 180 deg into one of 721 values.
-    counts : dict
-        'dropped' (scans between two telegrams that were not sent or got lost) and 'stale' are counted up.
-    clock : ScanClock, optional
-        Of the scans before, where the mirror went on turning: an old telegram that comes first is then known as such.
+    With `interlaced` four partial scans of 180 deg are merged into one of 721 values. 'dropped' (scans between two
+    telegrams that were not sent or got lost) and 'stale' are counted up. The clock is that of the scans before, where
+    the mirror went on turning: an old telegram that comes first is then known as such. One turn in `turns` begins a
+    telegram, which takes `duration_s` from its beginning to its last byte; `interval_s` is that of a stream.
     """
 
     def __init__(self, variant, configuration, baudrate, interlaced, counts, clock=None):
         self.variant, self.configuration, self.baudrate, self.interlaced = variant, configuration, baudrate, interlaced
         self.counts, self._clock, self._parts, self._first = counts, clock or ScanClock(), [], True
-
-    @property
-    def turns(self):
-        """Turns of the mirror for one telegram."""
-        return 1 if self.interlaced else round(1 / self.variant[1])
-
-    @property
-    def size(self):
-        """Bytes of a telegram."""
-        values = 181 if self.interlaced else POINTS[self.variant]
-        return 10 + 2 * values + 2 * self.configuration.realtime_indices
-
-    @property
-    def duration_s(self):
-        """Seconds from the start of a scan to its last byte."""
-        return self.turns * TURN_S + transfer_s(self.size, self.baudrate)
-
-    @property
-    def interval_s(self):
-        """Seconds between two telegrams of a stream."""
-        return interval_s(self.size, self.baudrate, self.turns * TURN_S)
+        self.turns = 1 if interlaced else round(1 / variant[1])
+        size = 10 + 2 * (181 if interlaced else POINTS[variant]) + 2 * configuration.realtime_indices
+        self.duration_s = self.turns * TURN_S + transfer_s(size, baudrate)
+        self.interval_s = interval_s(size, baudrate, self.turns * TURN_S)
 
     def feed(self, raw, arrival_s):
-        """A telegram that came in.
+        """The Reading that a telegram with a sound checksum completes, whose last byte came at an instant.
 
-        Parameters
-        ----------
-        raw : bytes
-            With a sound checksum.
-        arrival_s : float
-            Instant of its last byte.
-
-        Returns
-        -------
-        Reading or None
-            None for a part of a set, and for what is no scan of this variant, unit and kind or is not new.
+        None for a part of a set, and for what is no scan of this variant, unit and kind or is not new.
         """
+        own = self.configuration
         try:
-            scan = decode_scan(raw, self.configuration.measuring_mode)
+            scan = decode_scan(raw, own.measuring_mode)
         except TelegramError:
             return None
-        if not self._fits(scan):
+        count, index, partial = scan.words.shape[1], int(scan.scan_index[0]), int(scan.partial[0])
+        wanted = 181 - (partial > 0) if self.interlaced else POINTS[self.variant]
+        if (count, scan.unit, index >= 0, partial >= 0) != (wanted, own.unit, own.realtime_indices, self.interlaced):
             return None
         start_s = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * TURN_S
-        start_s, step = self._clock.place(int(scan.scan_index[0]), start_s)
+        start_s, step = self._clock.place(index, start_s)
         if start_s is None:
             self.counts["stale"] += 1
             return None
         self.counts["dropped"] += 0 if self._first else max(0, step // self.turns - 1)
         self._first = False
-        reading = self._reading(raw, scan, start_s)
-        return self._merge(int(scan.partial[0]), reading) if self.interlaced else reading
-
-    def _fits(self, scan):
-        """Whether a scan is one of those that were asked for."""
-        partial, indexed = int(scan.partial[0]), scan.scan_index[0] >= 0
-        values = 181 - (partial > 0) if self.interlaced else POINTS[self.variant]
-        kind = (scan.words.shape[1], UNITS.index(scan.unit), indexed, partial >= 0)
-        own = self.configuration
-        return kind == (values, UNITS.index(own.unit), own.realtime_indices, self.interlaced)
-
-    def _reading(self, raw, scan, start_s):
-        """A telegram alone; `start_s` is the begin of its first turn at bearing 0."""
-        partial = int(scan.partial[0])
-        quarters = scan_quarters(scan.words.shape[1], partial)
-        turn = np.arange(len(quarters)) % self.turns
-        times = start_s + (turn + quarters / 1440) * TURN_S
+        quarters = scan_quarters(count, partial)
+        times = start_s + (np.arange(count) % self.turns + quarters / 1440) * TURN_S  # the first turn begins at 0 deg
         ranges = np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan)
-        indices = [None if i < 0 else int(i) for i in (scan.scan_index[0], scan.telegram_index[0])]
-        return Reading((raw,), ranges, scan.reasons[0], np.radians(quarters / 4), float(times[0]), times, *indices)
+        indices = [None if i < 0 else int(i) for i in (index, scan.telegram_index[0])]
+        one = Reading((raw,), ranges, scan.reasons[0], np.radians(quarters / 4), float(times[0]), times, *indices)
+        return self._merged(partial, one) if self.interlaced else one
 
-    def _merge(self, partial, part):
-        """The set of four that a part completes, or None."""
-        if partial != len(self._parts) or not self._follows(part):
+    def _merged(self, partial, part):
+        """The set of four that a part completes, or None; a missing telegram ends a set."""
+        if self._parts and part.telegram_index is not None:
+            follows = (part.telegram_index - self._parts[-1].telegram_index) % 256 == 1
+        else:
+            follows = not self._parts or part.time_s - self._parts[-1].time_s < 1.5 * self.interval_s
+        if partial != len(self._parts) or not follows:
             self._parts = []
         if partial == len(self._parts):
             self._parts.append(part)
@@ -545,81 +408,54 @@ class Assembler:
         parts, self._parts = self._parts, []
         columns = {}
         for name in ("ranges", "reasons", "bearings", "beam_times_s"):
-            columns[name] = np.empty(721, getattr(parts[0], name).dtype)
+            columns[name] = np.empty(721, getattr(part, name).dtype)
             for first, one in enumerate(parts):
                 columns[name][first::4] = getattr(one, name)
         return replace(parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns)
-
-    def _follows(self, part):
-        """Whether no telegram is missing between a part and the one before."""
-        if not self._parts:
-            return True
-        last = self._parts[-1]
-        if part.telegram_index is not None:
-            return (part.telegram_index - last.telegram_index) % 256 == 1
-        return part.time_s - last.time_s < 1.5 * self.interval_s
 
 
 KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6
 RECOVERY_S = 8.0  # one attempt; there are more until the stream is stopped
+AGAIN_S = 0.1
 
 
 class ScanReader:
-    """Reads scans until `quit`.
+    """A thread that reads scans until `quit`.
 
-    Parameters
+    ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
+    ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
+    `interval_s` is that between two readings.
+
+    Attributes
     ----------
-    receive : callable
-        () -> list of (code, Reading or None); waits a moment for the next telegrams.
-    recover : callable
-        (seconds) finds the device and starts the stream again, or raises DeviceError.
-    clock : callable
-    interval_s : float
-        Between two readings.
-    log : logging.Logger
-    host : Host
+    readings : list of Reading
+        The last 256; replaced, never changed.
+    handed_s : float
+        Instant of the newest reading that somebody waited for.
     """
 
-    def __init__(self, receive, recover, clock, interval_s, log, host):
-        self._host, self._thread = host, host.thread(self._run, "LMS2xx reader")
-        self._receive, self._recover, self._clock, self.interval_s, self._log = receive, recover, clock, interval_s, log
-        self._readings, self._handed_s, self._news = deque(maxlen=KEPT), -float("inf"), host.condition()
-        self._leave, self._trouble = host.event(), None
-
-    # ---------------------------------------------------------------------------------------------- for the caller
-
-    def start(self):
-        """Begin to read."""
+    def __init__(self, receive, recover, interval_s, log, host):
+        self._receive, self._recover, self.interval_s, self._log, self._host = receive, recover, interval_s, log, host
+        self.readings, self.handed_s, self._trouble = [], -math.inf, None
+        self._news, self._leave = host.event(), host.event()
+        self._thread = host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
-    def newest(self, after, timeout):
-        """See :meth:`LMS2xx.newest`."""
-        return self._wait(lambda: self._fresh(after), timeout)
-
-    def next(self, after, timeout):
-        """The first scan later than `after`."""
-        return self._wait(lambda: next((r for r in self._readings if r.time_s > after), None), timeout)
-
-    def _wait(self, find, timeout):
+    def wait(self, find, timeout):
+        """The reading that ``find(readings)`` gives as soon as it is not None; NoReply if there is none in time."""
         end = self._host.now() + timeout
-        with self._news:
-            while (found := find()) is None:
-                left = end - self._host.now()
-                if left <= 0 or not self._thread.is_alive():
-                    state = "the reader thread ended" if not self._thread.is_alive() else "the stream is silent"
-                    raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
-                self._news.wait(min(left, 0.2))
-            self._handed_s = max(self._handed_s, found.time_s)
-            return found
-
-    def _fresh(self, after):
-        """The newest scan if it is later than `after`; without that, if it was not handed out and is not old."""
-        if not self._readings:
-            return None
-        newest = self._readings[-1]
-        oldest_s = max(self._handed_s, self._clock() - 3 * self.interval_s - LEAST_QUIET_S)
-        return newest if newest.time_s > (oldest_s if after is None else after) else None
+        while True:
+            self._news.clear()
+            alive, found = self._thread.is_alive(), find(self.readings)
+            if found is not None:
+                self.handed_s = max(self.handed_s, found.time_s)
+                return found
+            left = end - self._host.now()
+            if left <= 0 or not alive:
+                state = "the stream is silent" if alive else "the reader thread ended"
+                raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
+            self._news.wait(min(left, 0.2))
 
     def quit(self):
         """End the thread."""
@@ -627,15 +463,20 @@ class ScanReader:
         if self._thread.is_alive():
             self._thread.join()
 
-    # ---------------------------------------------------------------------------------------------- the thread
-
     def _run(self):
         """Read; whatever goes wrong with the line, find the device again."""
+        lost = False
         while not self._leave.is_set():
             try:
+                if lost:
+                    self._recover(RECOVERY_S)
+                    lost = False
                 self._read()
             except DeviceError as error:
-                self._mend(error)
+                if lost:
+                    self._leave.wait(AGAIN_S)
+                self._trouble, lost = str(error), True
+                self._log.warning("LMS2xx: %s; looking for the device", error)
             except Exception as error:  # told to whoever waits, who would wait for nothing
                 self._trouble = f"the reader thread failed: {error!r}"
                 self._log.exception("LMS2xx reader thread")
@@ -650,20 +491,8 @@ class ScanReader:
                 raise NoReply("the device started anew")
             fresh = [reading for _, reading in found if reading is not None]
             if fresh:
-                with self._news:
-                    self._readings.extend(fresh)
-                    self._trouble = None
-                    self._news.notify_all()
+                self.readings, self._trouble = [*self.readings, *fresh][-KEPT:], None
+                self._news.set()
                 last = self._host.now()
             if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
                 raise NoReply("the stream fell silent")
-
-    def _mend(self, error):
-        while not self._leave.is_set():
-            self._trouble = str(error)
-            self._log.warning("LMS2xx: %s; looking for the device", error)
-            try:
-                return self._recover(RECOVERY_S)
-            except DeviceError as again:
-                error = again
-                self._leave.wait(0.1)

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import serial
+from serial.tools.list_ports import comports
 
 
 class DeviceError(RuntimeError):
@@ -45,18 +46,22 @@ class OutOfRange(DeviceError, ValueError):
     """A device was asked for more than it can do, such as a pitch beyond the limits of its head."""
 
 
+class Closed:
+    """Something that is closed at the end of a with statement."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
 _moving_things = weakref.WeakSet()
 _before = {}
 
 
 def guard(device):
-    """Call ``device.emergency_stop()`` at exit, and on SIGTERM and SIGHUP if this is the main thread.
-
-    Parameters
-    ----------
-    device
-        Kept by a weak reference, until :func:`release`.
-    """
+    """Call ``device.emergency_stop()`` at exit, and in the main thread on SIGTERM and SIGHUP, until `release`."""
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -95,20 +100,7 @@ WRITE_S = 1.0  # longest time a write may block
 
 
 def open_port(path, baudrate, *, timeout):
-    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit, no flow control.
-
-    Parameters
-    ----------
-    path : str or Path
-        Such as /dev/ttyUSB0.
-    baudrate : int
-    timeout : float
-        Seconds that a read waits for its bytes.
-
-    Returns
-    -------
-    serial.Serial
-        A write blocks for 1 s at most.
+    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit; reads wait `timeout` seconds.
 
     Raises
     ------
@@ -119,72 +111,23 @@ def open_port(path, baudrate, *, timeout):
     try:
         port = serial.Serial(path, 9600, timeout=timeout, write_timeout=WRITE_S, exclusive=True)
     except (OSError, ValueError, termios.error) as error:
-        raise PortError(_reason(path, error)) from error
+        number = getattr(error, "errno", None)
+        if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+            present = ", ".join(sorted(one.device for one in comports())) or "none"
+            reason = f"there is no port {path}: check cable and power; present are {present}"
+        elif number in (errno.EACCES, errno.EPERM):
+            reason = f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
+        elif number in (errno.EBUSY, errno.EAGAIN):
+            reason = f"the port {path} is busy, held by {_holder(path)}: close that program"
+        else:
+            reason = f"{path} is no serial line ({error}): name the port of the device"
+        raise PortError(reason) from error
     try:
         set_rate(port, baudrate)
     except BaseException:
         port.close()
         raise
     return port
-
-
-def set_rate(port, baudrate):
-    """Change the rate of an open port and read it back.
-
-    Parameters
-    ----------
-    port : serial.Serial
-    baudrate : int
-
-    Raises
-    ------
-    PortError
-        If the line cannot do this rate; the old one holds.
-    LineLost
-        If the port vanished.
-    """
-    old = port.baudrate
-    try:
-        with line_lost(port.port):
-            port.baudrate = baudrate
-            got = set(termios.tcgetattr(port.fd)[4:6])
-    except ValueError as error:
-        port.baudrate = old
-        raise PortError(f"{port.port} cannot do {baudrate} Bd: {error}") from error
-    if got != {getattr(termios, f"B{baudrate}", None)}:
-        port.baudrate = old
-        raise PortError(
-            f"{port.port} does not take {baudrate} Bd: its driver set another rate; "
-            "500000 Bd needs an RS-422 interface whose clock divides to it, else use 38400"
-        )
-
-
-@contextmanager
-def line_lost(path):
-    """Turn what pyserial raises when a port vanishes into LineLost."""
-    try:
-        yield
-    except (OSError, termios.error) as error:
-        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
-
-
-def _reason(path, error):
-    """Why a port could not be opened, and what to do."""
-    number = getattr(error, "errno", None)
-    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"there is no port {path}: check cable and power; present are {', '.join(_present()) or 'none'}"
-    if number in (errno.EACCES, errno.EPERM):
-        return f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
-    if number in (errno.EBUSY, errno.EAGAIN):
-        return f"the port {path} is busy, held by {_holder(path)}: close that program"
-    return f"{path} is no serial line ({error}): name the port of the device"
-
-
-def _present():
-    """Ports of this machine."""
-    from serial.tools.list_ports import comports
-
-    return sorted(one.device for one in comports())
 
 
 def _holder(path):
@@ -199,20 +142,33 @@ def _holder(path):
     return ", ".join(sorted(found)) or "another program"
 
 
+def set_rate(port, baudrate):
+    """Change the rate of an open port and read it back; PortError if it cannot (the old one holds), or LineLost."""
+    old = port.baudrate
+    try:
+        with line_lost(port.port):
+            port.baudrate = baudrate
+            if set(termios.tcgetattr(port.fd)[4:6]) == {getattr(termios, f"B{baudrate}", None)}:
+                return
+    except ValueError as error:
+        port.baudrate = old
+        raise PortError(f"{port.port} cannot do {baudrate} Bd: {error}") from error
+    port.baudrate = old
+    raise PortError(f"{port.port} does not take {baudrate} Bd: its driver set another rate; "
+                    "500000 Bd needs an RS-422 interface whose clock divides to it, else use 38400")  # fmt: skip
+
+
+@contextmanager
+def line_lost(path):
+    """Turn what pyserial raises when a port vanishes into LineLost."""
+    try:
+        yield
+    except (OSError, termios.error) as error:
+        raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
+
+
 def ask(path, line, timeout=10.0):
-    """Send one command to the control socket of an emulated rig.
-
-    Parameters
-    ----------
-    path : path-like
-        Of the socket.
-    line : str or dict
-    timeout : float
-        Seconds.
-
-    Returns
-    -------
-    dict
+    """Send one command, str or dict, to the control socket of an emulated rig; its answer.
 
     Raises
     ------
@@ -224,7 +180,7 @@ def ask(path, line, timeout=10.0):
     line = json.dumps(line) if isinstance(line, dict) else line
     with socket.socket(socket.AF_UNIX) as link:
         link.settimeout(timeout)
-        link.connect(str(path))
+        link.connect(os.fspath(path))
         link.sendall(line.encode() + b"\n")
         answer = json.loads(link.makefile().readline())
     if not answer.pop("ok"):

@@ -10,27 +10,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, ask
+from lrfcal_lib.drivers.lms2xx import CONFIGURED, LMS2xx
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, ask
 from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.drivers.video import Camera
 from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of
 
 
 @dataclass(frozen=True)
 class Moved:
-    """The head rests at a stop.
+    """The head rests at a stop, number so many of so many; what is recorded at it is later than its host time.
 
-    Attributes
-    ----------
-    placement : int
-    time_s : float
-        Host clock; what is recorded at this stop is later.
-    commanded, pitch : float
-        Radians.
-    measured : bool
-        False where the head does not tell its pitch: dead reckoning.
-    number, of : int
-        This stop and how many there are.
+    Pitch in radians, as commanded and as it is: measured, or dead reckoning where the head does not tell it.
     """
 
     placement: int
@@ -44,17 +37,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """Scans, each with its pitch.
-
-    Attributes
-    ----------
-    placement : int
-    readings : tuple of Reading
-    pitch : ndarray, shape (len(readings),)
-        Radians.
-    share : float
-        Of a continuous sweep that is done, 0 to 1; NaN at a stop.
-    """
+    """Readings, each with its pitch in radians; `share` is what is done of a continuous sweep, NaN at a stop."""
 
     placement: int
     readings: tuple
@@ -64,18 +47,7 @@ class Scanned:
 
 @dataclass(frozen=True, eq=False)
 class Photographed:
-    """An image.
-
-    Attributes
-    ----------
-    placement : int
-        -1 for the board held close.
-    camera : str
-    frame : Frame
-    pitch : float
-        Radians.
-    purpose : {'board', 'scene', 'intrinsics'}
-    """
+    """An image of a placement, -1 for the board held close; purpose 'board', 'scene' or 'intrinsics'."""
 
     placement: int
     camera: str
@@ -86,16 +58,7 @@ class Photographed:
 
 @dataclass(frozen=True)
 class Tracked:
-    """The pitch over a continuous sweep.
-
-    Attributes
-    ----------
-    placement : int
-    commanded : float
-        Where the sweep was sent, radians.
-    track : tuple of (float, float, bool)
-        Host time, pitch in radians, measured.
-    """
+    """The pitch over a continuous sweep to a commanded one, a tuple of host time, radians, whether it was measured."""
 
     placement: int
     commanded: float
@@ -118,23 +81,14 @@ def host_clock():
     return lambda: zero + time.monotonic()
 
 
-class Rig:
-    """The devices of a rig file; a context manager that stops the head and closes all of them.
+class Rig(Closed):
+    """The devices of a RigFile, all with the same host clock, s; a context manager that stops the head and closes them.
 
-    Parameters
-    ----------
-    stated : RigFile
-    lrf : LMS2xx
-    head : PanTilt
-    cameras : dict of str to Camera
-    clock : callable
-        Host clock, s, of all of them.
-    host : Host
-        Machine that the drivers run on.
+    :meth:`open` opens them.
     """
 
-    def __init__(self, stated, lrf, head, cameras=None, *, clock=time.time, host=REAL):
-        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras or {}, clock
+    def __init__(self, stated, lrf, head, cameras, *, clock=time.time, host=REAL):
+        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras, clock
         self._closing, self._now = contextlib.ExitStack(), host.now
 
     @classmethod
@@ -161,24 +115,26 @@ class Rig:
         DeviceError
             With the device in the message; those opened before are closed again.
         """
-        clock = clock or host_clock()
+        common = {"log": log, "clock": clock or host_clock()}
         with contextlib.ExitStack() as stack:
-            options = {"log": log, "clock": clock}
-            head = stack.enter_context(_named("head", _open_head, stated, host=host, **options))
-            lrf = stack.enter_context(_named("lrf", _open_lrf, stated, host=host, **options))
-            cameras, opener = {}, _open_camera if camera is None else lambda _, name, **options: camera(name)
-            for name in stated.cameras:
-                cameras[name] = _named(f"camera '{name}'", opener, stated, name, **options)
-                stack.callback(cameras[name].close)
-            rig = cls(stated, lrf, head, cameras, clock=clock, host=host)
+            with _named(stated, "head"):
+                head = stack.enter_context(PanTilt(stated.head_device, stated.head_settings, host=host, **common))
+            with _named(stated, "lrf"):
+                asked = stated.lrf_device
+                options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
+                if "password" in asked:
+                    options["password"] = asked["password"].encode()
+                lrf = stack.enter_context(LMS2xx(asked["port"], host=host, **options, **common))
+                if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
+                    lrf.set_variant(*asked["variant"])
+            cameras = {}
+            for name, info in stated.cameras.items():
+                with _named(stated, f"camera '{name}'"):
+                    cameras[name] = _camera(stated, info, common) if camera is None else camera(name)
+                    stack.callback(cameras[name].close)
+            rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
             rig._closing = stack.pop_all()
         return rig
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def close(self):
         """Stop the head and close all devices; a second call does nothing."""
@@ -189,12 +145,14 @@ class Rig:
         """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
         view, step = (180, 0.25) if self.stated.lrf_device.get("interlaced") else self.lrf.variant
         unit = METRES[self.lrf.configuration.unit]
-        longest = mode_of(self.lrf.configuration.measuring_mode).largest * unit
-        ends = tuple(math.radians(90 + side * view / 2) for side in (-1, 1))
-        model = self.stated.lrf.model or self.lrf.type
-        found = {"field_of_view": ends, "bearing_step": math.radians(step), "range_resolution": unit, "model": model,
-                 "max_range": longest}  # fmt: skip
-        return replace(self.stated.lrf, **found)
+        return replace(
+            self.stated.lrf,
+            model=self.stated.lrf.model or self.lrf.type,
+            field_of_view=(math.radians(90 - view / 2), math.radians(90 + view / 2)),
+            bearing_step=math.radians(step),
+            range_resolution=unit,
+            max_range=mode_of(self.lrf.configuration.measuring_mode).largest * unit,
+        )
 
     def begin_telegrams(self):
         """Telegrams with which a recording begins: the configuration, which states the measuring mode."""
@@ -203,13 +161,7 @@ class Rig:
     # -------------------------------------------------------------------------------------------- the board
 
     def move_board(self, placement):
-        """Put the board of an emulated rig at a placement.
-
-        Returns
-        -------
-        bool
-            False where nobody but the user can: a real rig.
-        """
+        """Put the board of an emulated rig at a placement; False where nobody but the user can: a real rig."""
         return self._control("place", placement)
 
     def hold_close(self, camera, view):
@@ -284,29 +236,29 @@ class Rig:
                 LOG.error("the %s could not be stopped (%s): cut its power if it moves", name, error)
 
     def _stop_and_go(self, placement):
-        stops, interlaced = _stops(placement), bool(self.stated.lrf_device.get("interlaced"))
+        interlaced, scans, images = self.stated.lrf_device.get("interlaced"), placement.pitch, placement.image_pitch
+        alone = [image for image in images if np.abs(scans - image).min() >= SAME_STOP]
+        stops = sorted([*scans.tolist(), *alone], reverse=placement.direction < 0)
         if interlaced:
             self.lrf.start(interlaced=True)
-        for number, (pitch, scan, photo) in enumerate(stops, 1):
+        for number, pitch in enumerate(stops, 1):
             moved = self._move(placement.number, pitch, number, len(stops))
             yield moved
-            if scan:
-                readings = self._take(moved.time_s) if interlaced else self._request(moved.time_s)
+            if pitch not in alone:
+                readings = self._scans(moved.time_s, interlaced)
                 _later(readings[0].time_s, moved, "scan")
                 yield Scanned(placement.number, tuple(readings), np.full(len(readings), moved.pitch))
-            if photo:
+            if any(abs(pitch - image) < SAME_STOP for image in images):
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
         self.lrf.stop()
 
-    def _take(self, after):
-        """Scans of a stream, all later than an instant."""
+    def _scans(self, after, interlaced):
+        """Scans of a stream, or one by one, later than an instant; a line that was lost has one chance to come back."""
         count = self.stated.plan.scans_per_stop
-        return self.lrf.take(count, after=after, timeout=SCAN_S * count)
-
-    def _request(self, after):
-        """Scans one by one, all later than an instant; a line that was lost is given one chance to come back."""
+        if interlaced:
+            return self.lrf.take(count, after=after, timeout=SCAN_S * count)
         found, mended, end = [], False, self._now() + SCAN_S
-        while len(found) < self.stated.plan.scans_per_stop:
+        while len(found) < count:
             try:
                 reading = self.lrf.request()
             except (LineLost, NoReply) as error:
@@ -333,7 +285,7 @@ class Rig:
             yield Photographed(placement, name, frame, moved.pitch, purpose)
 
     def _continuous(self, placement):
-        first, last = placement.pitch[[0, -1]]
+        first, last = placement.pitch[[0, -1]].tolist()
         images = sorted(placement.image_pitch, reverse=placement.direction < 0)
         for number, pitch in enumerate([*images, first], 1):
             moved = self._move(placement.number, float(pitch), number, len(images) + 1)
@@ -343,22 +295,24 @@ class Rig:
         self.lrf.start()
         held = [self.lrf.newest(timeout=SCAN_S)]
         heard, newest = self._now(), held[-1].time_s
-        self.head.start_sweep(float(last), self.stated.plan.sweep_speed)
+        self.head.start_sweep(last, self.stated.plan.sweep_speed)
         while self.head.moving():
             fresh = self._since(newest)
             if fresh:
                 heard, newest = self._now(), fresh[-1].time_s
             elif self._now() - heard > GAP_S:
                 raise NoReply(f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder")
-            known, held = self._placed(held + fresh, self._usable(self.head.track))
+            sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
+            known, held = _placed(held + fresh, sure)  # what is not measured may change until the next reading
             if known:
-                yield Scanned(placement.number, *known, _share(known[1][-1], first, last))
+                share = float(np.clip((known[1][-1] - first) / (last - first), 0, 1))
+                yield Scanned(placement.number, *known, share)
         track = self.head.finish_sweep()
-        known, _ = self._placed(held + self._since(newest), track)
+        known, _ = _placed(held + self._since(newest), track)
         self.lrf.stop()
         if known:
             yield Scanned(placement.number, *known, 1.0)
-        yield Tracked(placement.number, float(last), tuple(track))
+        yield Tracked(placement.number, last, tuple(track))
 
     def _since(self, instant):
         """All scans after an instant that come within the time of a batch."""
@@ -369,26 +323,27 @@ class Rig:
                 instant = found[-1].time_s
         return found
 
-    def _usable(self, track):
-        """What of a growing track will not change any more."""
-        return [point for point in track if point[2]] if self.head.has_feedback else track
 
-    @staticmethod
-    def _placed(readings, track):
-        """Scans within a track with their pitch (None without any), and those that are later."""
-        if len(track) < 2:
-            return None, readings
-        times, pitch = np.array([point[:2] for point in track], float).T
-        instants = np.array([np.mean(one.beam_times_s[[0, -1]]) for one in readings])
-        inside = [i for i, t in enumerate(instants) if times[0] <= t <= times[-1]]
-        later = [one for one, t in zip(readings, instants, strict=True) if t > times[-1]]
-        if not inside:
-            return None, later
-        return (tuple(readings[i] for i in inside), np.interp(instants[inside], times, pitch)), later
+def _placed(readings, track):
+    """Scans within a track with their pitch (None without any), and those that are later."""
+    if len(track) < 2:
+        return None, readings
+    times, pitch = np.array([point[:2] for point in track], float).T
+    middle = [float(np.mean(one.beam_times_s[[0, -1]])) for one in readings]
+    inside = [(one, t) for one, t in zip(readings, middle, strict=True) if times[0] <= t <= times[-1]]
+    later = [one for one, t in zip(readings, middle, strict=True) if t > times[-1]]
+    if not inside:
+        return None, later
+    found, instants = zip(*inside, strict=True)
+    return (found, np.interp(instants, times, pitch)), later
 
 
 def unchanged(scans):
     """Whether scans differ by noise alone, as those of a head at rest do.
+
+    By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
+    something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same wall
+    at any pitch: a head that moves is never accused, one that does not is believed where much else moves.
 
     Parameters
     ----------
@@ -398,9 +353,6 @@ def unchanged(scans):
     Returns
     -------
     bool
-        By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
-        something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same
-        wall at any pitch: a head that moves is never accused, one that does not is believed where much else moves.
         False where no beam has a range in all scans.
     """
     ranges = np.array(scans)
@@ -410,70 +362,32 @@ def unchanged(scans):
     return ratio.size > 0 and bool(ratio.mean() > STILL)
 
 
-def _stops(placement):
-    """Stops of a sweep in the order of motion: pitch, whether scans are taken there, whether images."""
-    scans, images = list(placement.pitch), list(placement.image_pitch)
-    stops = [[p, True, any(abs(p - i) < SAME_STOP for i in images)] for p in scans]
-    stops += [[i, False, True] for i in images if all(abs(p - i) >= SAME_STOP for p in scans)]
-    return sorted(([float(p), *what] for p, *what in stops), reverse=placement.direction < 0)
-
-
 def _later(instant, moved, what):
     """Refuse what was recorded while the head still moved, whatever a driver says."""
     if instant <= moved.time_s:
         raise DeviceError(f"the {what} is {moved.time_s - instant:.3f} s older than the stop it belongs to")
 
 
-def _share(pitch, first, last):
-    return float(np.clip((pitch - first) / (last - first), 0, 1))
-
-
-def _named(device, opener, *arguments, **options):
-    """Open a device; its name stands before the message of whatever goes wrong."""
+@contextlib.contextmanager
+def _named(stated, device):
+    """The name of a device stands before the message of whatever goes wrong with it, for wrong values the file's."""
     try:
-        return opener(*arguments, **options)
+        yield
     except DeviceError as error:
         error.args = (f"{device}: {error}", *error.args[1:])
         raise
     except ValueError as error:
-        raise RigFileError(f"{arguments[0].path}: {device}: {error}") from error
+        raise RigFileError(f"{stated.path}: {device}: {error}") from error
 
 
-def _open_head(stated, **options):
-    from lrfcal_lib.drivers.head import PanTilt
-
-    return PanTilt.open(stated.head_device, stated.head_settings, **options)
-
-
-def _open_lrf(stated, **given):
-    from lrfcal_lib.drivers.lms2xx import CONFIGURED, LMS2xx
-
-    asked = stated.lrf_device
-    options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
-    if "password" in asked:
-        options["password"] = asked["password"].encode()
-    lrf = LMS2xx.open(asked["port"], **options, **given)
-    try:
-        if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
-            lrf.set_variant(*asked["variant"])
-    except BaseException:
-        lrf.close()
-        raise
-    return lrf
-
-
-def _open_camera(stated, name, **given):
-    from lrfcal_lib.drivers.video import Camera
-
-    asked, info = stated.camera_devices[name], stated.cameras[name]
+def _camera(stated, info, common):
+    """A camera that gives images of the size stated."""
+    asked, size = stated.camera_devices[info.name], (info.width, info.height)
     options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
-    size = (info.width, info.height)
-    camera = Camera.open(asked["source"], name=name, size=size, **options, **given)
+    camera = Camera(asked["source"], name=info.name, size=size, **options, **common)
     got = camera.settings["size"]["got"]
-    if got is not None and tuple(got) != (info.width, info.height):
+    if got is not None and tuple(got) != size:
         camera.close()
-        raise ValueError(
-            f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {info.width} x {info.height}: "
-            "state a size that it can do"
-        )
+        raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{info.name} states {size[0]} x {size[1]}: "
+                         "state a size that it can do")  # fmt: skip
     return camera

@@ -1,46 +1,97 @@
 """The rig file: what is stated about a rig, where its devices are, and what is to be recorded (JSON)."""
 
-from __future__ import annotations
-
 import json
 import math
-from dataclasses import dataclass, field, replace
-from functools import reduce
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, StrictBool, model_validator
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.drivers.head import ANGLE, HEAD, HeadSettings
-from lrfcal_lib.drivers.stated import FLAG, OBJECT, TEXT, Kind, check, either, listed, need, number, one_of, whole
+from lrfcal_lib.drivers.head import HeadSettings
+from lrfcal_lib.drivers.stated import Angle, Stated, Text, number, several, whole
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, parse_session
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, from_json, parse_session, refused
 
-MODES = ("stop-and-go", "continuous")
 PURPOSES = ("board", "scene")
-MOST_STOPS, FINEST_DEG, MOST_BYTES = 5000, 1e-3, 10_000_000
-DEVICES = {"lrf": OBJECT, "head": OBJECT, "cameras": OBJECT, "control": TEXT}
-LRF = {
-    "port": TEXT, "baudrate": one_of(9600, 19200, 38400, 500000), "address": whole(0, 127),
-    "password": Kind("a text of 8 ASCII characters", lambda v: TEXT.fits(v) and v.isascii() and len(v) == 8),
-    "variant": listed(number(0.25, 180, "deg"), 2), "unit": one_of("mm", "cm"), "measuring_mode": whole(0, 6),
-    "realtime_indices": FLAG, "interlaced": FLAG,
-}  # fmt: skip
-CAMERA = {
-    "source": either(TEXT, whole(0, 255)), "size": listed(whole(1, 100_000), 2), "exposure": number(1e-6, 60, "s"),
-    "fps": number(0.01, 10_000, "Hz"), "silence_s": number(0.1, 3600, "s"),
-}  # fmt: skip
-SWEEP, IMAGES, NUMBER = listed(ANGLE, 3), listed(ANGLE), whole(0, 999_999)
-PLACEMENT = {"number": NUMBER, "pitch_deg": SWEEP, "image_pitch_deg": IMAGES, "board": FLAG}
-PLAN = {
-    "pitch_deg": SWEEP, "image_pitch_deg": IMAGES, "mode": one_of(*MODES), "scans_per_stop": whole(1, 1000),
-    "sweep_speed": HEAD["tilt_speed"], "count": whole(1, 1000), "intrinsics_images": whole(0, 1000),
-    "placements": Kind("a list of at most 1000 objects", lambda v: isinstance(v, list | tuple) and len(v) <= 1000),
-}  # fmt: skip
+MOST_STOPS, FINEST_DEG, MOST_BYTES, MOST_PLACEMENTS = 5000, 1e-3, 10_000_000, 1000
+STOPS = f"first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops are needed"
 
 
 class RigFileError(ValueError):
     """A rig file that cannot be used: the message names the file, the key, the value and what to do about it."""
+
+
+class LrfDevice(Stated):
+    """Where the laser range finder is, and how it is to be set."""
+
+    port: Text
+    baudrate: Literal[9600, 19200, 38400, 500000] = None
+    address: whole(0, 127) = None
+    password: Annotated[Text, refused(lambda text: len(text.encode()) != 8, "8 ASCII characters are needed")] = None
+    variant: several(number(0.25, 180, "deg"), 2) = None
+    unit: Literal["mm", "cm"] = None
+    measuring_mode: whole(0, 6) = None
+    realtime_indices: StrictBool = None
+    interlaced: StrictBool = None
+
+
+class HeadDevice(HeadSettings):
+    """Where the head is, and its settings."""
+
+    port: Text
+    feedback: Literal["auto", True, False] = True
+
+
+class CameraDevice(Stated):
+    """Where a camera is, and how it is to be set."""
+
+    source: Annotated[
+        Any,
+        refused(lambda v: not (type(v) is int and 0 <= v <= 255 or type(v) is str and v and v.isprintable()),
+                "a text, or a whole number from 0 to 255 is needed"),
+    ]  # fmt: skip
+    size: several(whole(1, 100_000), 2) = None
+    exposure: number(1e-6, 60, "s") = None
+    fps: number(0.01, 10_000, "Hz") = None
+    silence_s: number(0.1, 3600, "s") = None
+
+
+class Devices(Stated):
+    """The devices of a rig, and the control socket of an emulated one."""
+
+    lrf: LrfDevice
+    head: HeadDevice
+    cameras: dict[str, CameraDevice] = {}
+    control: Text = None
+
+    @model_validator(mode="after")
+    def ports(self):
+        """Each device has a port of its own."""
+        if self.lrf.port == self.head.port:
+            raise ValueError(f"lrf.port and head.port are both {self.lrf.port}: each device has its own")
+        return self
+
+
+def stops_of(sweep):
+    """Pitch angles of a sweep (first, last, step; deg), radians: its ends are met, its step is not exceeded."""
+    first, last, step = sweep
+    count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step >= FINEST_DEG else 0
+    return np.radians(np.linspace(first, last, count if count <= MOST_STOPS else 0))
+
+
+Sweep = Annotated[several(Angle, 3), refused(lambda sweep: len(stops_of(sweep)) < 2, STOPS)]
+
+
+class ListedPlacement(Stated):
+    """A placement of the plan; a board of false is a scene without one, what is left out is as in the plan."""
+
+    number: whole(0, 999_999) = None
+    pitch_deg: Sweep = None
+    image_pitch_deg: tuple[Angle, ...] = None
+    board: StrictBool = True
 
 
 @dataclass(frozen=True)
@@ -69,68 +120,42 @@ class Placement:
         return 1 if self.pitch[-1] >= self.pitch[0] else -1
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(Stated):
     """What is to be recorded.
 
-    Attributes
-    ----------
-    pitch_deg : (float, float, float)
-        First and last pitch and the step between the stops of a sweep.
-    image_pitch_deg : tuple of float
-    mode : {'stop-and-go', 'continuous'}
-    scans_per_stop : int
-    sweep_speed : int or None
-        Speed byte of the head in continuous sweeps; None for the head's `tilt_speed`.
-    count : int
-        Of placements, where none are listed; every other one is swept the other way, which shows the play of the gear.
-    intrinsics_images : int
-        Of the board held close to each camera, before the placements.
-    placements : tuple of dict
-        Listed placements: number, pitch_deg, image_pitch_deg, board (false: a scene without a board).
+    Of `count` placements, where none are listed, every other one is swept the other way, which shows the play of the
+    gear; `sweep_speed` is the speed byte of the head in continuous sweeps, by default its `tilt_speed`;
+    `intrinsics_images` are those of the board held close to each camera, before the placements.
     """
 
-    pitch_deg: tuple[float, float, float] = (-30.0, 10.0, 0.5)
-    image_pitch_deg: tuple[float, ...] = (0.0,)
-    mode: str = "stop-and-go"
-    scans_per_stop: int = 1
-    sweep_speed: int | None = None
-    count: int = 12
-    intrinsics_images: int = 0
-    placements: tuple[dict, ...] = ()
+    pitch_deg: Sweep = (-30.0, 10.0, 0.5)
+    image_pitch_deg: tuple[Angle, ...] = (0.0,)
+    mode: Literal["stop-and-go", "continuous"] = "stop-and-go"
+    scans_per_stop: whole(1, 1000) = 1
+    sweep_speed: whole(0, 63) = None
+    count: whole(1, 1000) = 12
+    intrinsics_images: whole(0, 1000) = 0
+    placements: Annotated[tuple[ListedPlacement, ...], Field(fail_fast=True, max_length=MOST_PLACEMENTS)] = ()
 
-    def __post_init__(self):
-        check(vars(self), PLAN, "plan")
-        self.to_do()
+    @model_validator(mode="after")
+    def numbered(self):
+        """Placements have different numbers."""
+        numbers = [one.number for one in self.to_do()]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError(f"placements: numbers must differ, got {numbers}")
+        return self
 
     def to_do(self, count=None):
-        """The placements to record, in order.
-
-        Parameters
-        ----------
-        count : int, optional
-            Only so many of them.
-
-        Returns
-        -------
-        list of Placement
-        """
-        if self.placements:
-            listed = [self._listed(one, i) for i, one in enumerate(self.placements)]
-            if len({one.number for one in listed}) < len(listed):
-                raise ValueError(f"plan.placements: numbers must differ, got {[one.number for one in listed]}")
-            return listed[:count]
-        stops, images = _stops(self.pitch_deg, "plan.pitch_deg"), _angles(self.image_pitch_deg)
-        way = {0: slice(None, None, -1), 1: slice(None)}
-        return [Placement(n, stops[way[n % 2]], images) for n in range(1, 1 + (count or self.count))]
-
-    def _listed(self, one, i):
-        where = f"plan.placements[{i}]"
-        one = check(one, PLACEMENT, where)
-        stops = _stops(one.get("pitch_deg", self.pitch_deg), f"{where}.pitch_deg")
-        images = _angles(one.get("image_pitch_deg", self.image_pitch_deg))
-        number = one.get("number", i + 1)
-        return Placement(number, stops, images, PURPOSES[not one.get("board", True)])
+        """The placements to record, in order, a list of Placement; only so many of them if that is given."""
+        listed = self.placements or [ListedPlacement()] * (count or self.count)
+        found = []
+        for i, one in enumerate(listed[:count], 1):
+            stops = stops_of(one.pitch_deg or self.pitch_deg)
+            images = self.image_pitch_deg if one.image_pitch_deg is None else one.image_pitch_deg
+            stops = stops if self.placements or i % 2 else stops[::-1]
+            number = i if one.number is None else one.number
+            found.append(Placement(number, stops, tuple(map(math.radians, images)), PURPOSES[not one.board]))
+        return found
 
 
 @dataclass(frozen=True)
@@ -139,25 +164,18 @@ class RigFile:
 
     Attributes
     ----------
-    path : Path
     about : dict
         licence, source, simulated.
-    board : Board
-    lrf : LrfInfo
-    T_head_lrf : RigidTransform or None
     platform_sigma : (float, float)
-        How well it is known: direction (radians) and offset (metres).
-    cameras : dict of str to CameraInfo
+        How well the platform is known: direction (radians) and offset (metres).
     lrf_device : dict
-        Keys of `LRF`.
+        What is stated of an LrfDevice.
     head_device : str
         Its port.
-    head_settings : HeadSettings
     camera_devices : dict of str to dict
-        Keys of `CAMERA`, by camera.
+        What is stated of each CameraDevice.
     control : str or None
         Control socket of an emulated rig.
-    plan : Plan
     """
 
     path: Path
@@ -171,20 +189,16 @@ class RigFile:
     head_device: str
     head_settings: HeadSettings
     camera_devices: dict[str, dict]
-    control: str | None = None
-    plan: Plan = field(default_factory=Plan)
+    control: str | None
+    plan: Plan
 
     def with_mode(self, mode):
         """The same with another mode of the plan (None: its own)."""
-        return self if mode is None else checked(replace(self, plan=replace(self.plan, mode=mode)))
+        return self if mode is None else checked(replace(self, plan=self.plan.model_copy(update={"mode": mode})))
 
 
 def read_rig_file(path):
     """Read and check a rig file.
-
-    Parameters
-    ----------
-    path : path-like
 
     Returns
     -------
@@ -207,47 +221,43 @@ def read_rig_file(path):
         raise RigFileError(f"{path}: not JSON ({error})") from error
     try:
         return checked(rig_of(data, path))
-    except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error
 
 
+class Asked(Stated):
+    """What a rig file states besides what session.json does."""
+
+    devices: Devices
+    plan: Plan = Plan()
+
+
 def rig_of(data, path=Path("rig.json")):
-    """A RigFile of parsed JSON; TypeError, ValueError or ArithmeticError for a wrong one.
-
-    Parameters
-    ----------
-    data : dict
-    path : Path
-        For messages.
-
-    Returns
-    -------
-    RigFile
-    """
-    need(OBJECT, data, "the file")
-    about = {"name": "rig", "licence": "", "source": "", "simulated": False, "placements": ()}
-    data = _named({**about, **data})
-    for where in ("board", "rig", "rig.lrf", "rig.platform", "rig.cameras"):
-        need(OBJECT, reduce(lambda at, key: at[key], where.split("."), data), where)
-    stated = parse_session(data)
-    devices = check(data["devices"], DEVICES, "devices", ("lrf", "head"))
-    lrf = check(devices["lrf"], LRF, "devices.lrf", ("port",))
-    head = check(devices["head"], {"port": TEXT, **HEAD}, "devices.head", ("port",))
-    if lrf["port"] == head["port"]:
-        raise ValueError(f"devices.lrf.port and devices.head.port are both {lrf['port']}: each device has its own")
-    cameras = {name: check(one, CAMERA, f"devices.cameras.{name}", ("source",))
-               for name, one in devices.get("cameras", {}).items()}  # fmt: skip
-    _same_cameras(cameras, stated["cameras"])
+    """A RigFile of parsed JSON, with a path for messages; ValueError for a wrong one."""
+    if not isinstance(data, dict):
+        raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
+    about = {"name": "rig", "licence": "", "source": "", "simulated": False}
+    stated = parse_session(about | data | {"placements": ()})
+    asked = from_json(Asked, {key: data.get(key) for key in Asked.model_fields})
+    devices, cameras = asked.devices, stated["cameras"]
+    if set(devices.cameras) != set(cameras):
+        raise ValueError(f"devices.cameras are {', '.join(devices.cameras) or 'none'}, rig.cameras "
+                         f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip
+    for name, info in cameras.items():
+        size, known = devices.cameras[name].size, (info.width, info.height)
+        if size not in (None, known):
+            raise ValueError(f"devices.cameras.{name}.size is {list(size)}, rig.cameras.{name} states {list(known)}: "
+                             "leave it out")  # fmt: skip
     return RigFile(
         path=Path(path),
         about={key: stated[key] for key in ("licence", "source", "simulated")},
         **{key: stated[key] for key in ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras")},
-        lrf_device=lrf,
-        head_device=head.pop("port"),
-        head_settings=HeadSettings(**_tuples({"feedback": True, **head})),
-        camera_devices=cameras,
-        control=devices.get("control"),
-        plan=Plan(**_tuples(check(data.get("plan") or {}, PLAN, "plan"))),
+        lrf_device=devices.lrf.model_dump(exclude_none=True),
+        head_device=devices.head.port,
+        head_settings=devices.head,
+        camera_devices={name: one.model_dump(exclude_none=True) for name, one in devices.cameras.items()},
+        control=devices.control,
+        plan=asked.plan,
     )
 
 
@@ -267,52 +277,3 @@ def checked(rig):
             "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
         )
     return rig
-
-
-class _Named(dict):
-    """An object of a file that says where it stands when a key is missing."""
-
-    def __missing__(self, key):
-        raise ValueError(f"{self.where}{key} is missing")
-
-
-def _named(value, where=""):
-    """Parsed JSON whose objects know where they stand."""
-    if isinstance(value, list):
-        return [_named(one, f"{where[:-1]}[{i}].") for i, one in enumerate(value)]
-    if not isinstance(value, dict):
-        return value
-    named = _Named((key, _named(one, f"{where}{key}.")) for key, one in value.items())
-    named.where = where
-    return named
-
-
-def _tuples(values):
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-
-
-def _same_cameras(devices, stated):
-    if set(devices) != set(stated):
-        raise ValueError(
-            f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras {', '.join(stated) or 'none'}: "
-            "every camera stands in both"
-        )
-    for name, info in stated.items():
-        size, known = devices[name].get("size"), [info.width, info.height]
-        if size is not None and size != known:
-            raise ValueError(f"devices.cameras.{name}.size is {size}, rig.cameras.{name} states {known}: leave it out")
-
-
-def _stops(values, where):
-    """Pitch angles of a sweep, radians: its ends are met, its step is not exceeded."""
-    first, last, step = values
-    count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step >= FINEST_DEG else 0
-    if not 1 < count <= MOST_STOPS:
-        raise ValueError(
-            f"{where} is {list(values)}: first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops"
-        )
-    return np.radians(np.linspace(first, last, count))
-
-
-def _angles(values):
-    return tuple(math.radians(v) for v in values)

@@ -1,88 +1,40 @@
-"""What users state about devices: kinds of values with their ranges, one message for whatever is not of its kind."""
+"""What users state about devices: pydantic types with their ranges in words."""
 
-from __future__ import annotations
+from typing import Annotated, Any
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from pydantic import BaseModel, StrictStr, model_validator
 
-
-@dataclass(frozen=True)
-class Kind:
-    """What a value must be: in words, and as a test that takes anything JSON can hold."""
-
-    words: str
-    fits: Callable
+from lrfcal_lib.session.stated import refused
 
 
-def number(least, most, unit=""):
-    """A number within limits; NaN is in none."""
-    words = f"a number from {least:g} to {most:g} {unit}".rstrip()
-    return Kind(words, lambda v: isinstance(v, int | float) and not isinstance(v, bool) and least <= v <= most)
+class Stated(BaseModel, frozen=True):
+    """An object of a rig file: null is as good as left out, and keys that it does not have are refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def known(cls, data):
+        """The values that are stated."""
+        for key in data if isinstance(data, dict) else ():
+            if key not in cls.model_fields:
+                raise ValueError(f"{key} is not known; known are {', '.join(cls.model_fields)}")
+        return {k: v for k, v in data.items() if v is not None} if isinstance(data, dict) else data
+
+
+def number(least, most, unit="", kinds=(int, float), what="a number"):
+    """A number within limits; NaN is in none, and true is no number."""
+    words = f"{what} from {least} to {most} {unit}".rstrip() + " is needed"
+    return Annotated[Any, refused(lambda value: type(value) not in kinds or not least <= value <= most, words)]
 
 
 def whole(least, most):
     """A whole number within limits."""
-    words = f"a whole number from {least} to {most}"
-    return Kind(words, lambda v: isinstance(v, int) and not isinstance(v, bool) and least <= v <= most)
+    return number(least, most, kinds=(int,), what="a whole number")
 
 
-def one_of(*choices):
-    """One of some texts, numbers, true and false; 1 is not true."""
-    words = " or ".join(repr(c) if isinstance(c, str) else str(c).lower() for c in choices)
-    return Kind(words, lambda v: any(type(v) is type(c) and v == c for c in choices))
+def several(kind, count):
+    """So many values of a kind."""
+    return Annotated[tuple[kind, ...], refused(lambda values: len(values) != count, f"a list of {count} is needed")]
 
 
-def either(*kinds):
-    """A value of one of some kinds."""
-    return Kind(", or ".join(kind.words for kind in kinds), lambda v: any(kind.fits(v) for kind in kinds))
-
-
-def listed(kind, count=None):
-    """A list of values of a kind."""
-    words = f"a list of {count or 'any number'}, each {kind.words}"
-    return Kind(words, lambda v: isinstance(v, list | tuple) and len(v) == (count or len(v)) and all(map(kind.fits, v)))
-
-
-TEXT = Kind("a text", lambda v: isinstance(v, str) and v.isprintable() and v != "")
-FLAG = one_of(True, False)
-OBJECT = Kind("an object with keys", lambda v: isinstance(v, dict))
-
-
-def check(values, kinds, where, needed=()):
-    """The values that are stated: null is as good as left out.
-
-    Parameters
-    ----------
-    values : dict
-    kinds : dict of str to Kind
-    where : str
-        Path of the object, for messages.
-    needed : sequence of str
-        Keys that must be stated.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    ValueError
-        For no object, an unknown or missing key, or a value of another kind.
-    """
-    need(OBJECT, values, where)
-    for key, value in values.items():
-        if key not in kinds:
-            raise ValueError(f"{where}.{key} is not known; known are {', '.join(kinds)}")
-        if value is not None:
-            need(kinds[key], value, f"{where}.{key}")
-    for key in needed:
-        if values.get(key) is None:
-            raise ValueError(f"{where}.{key} is missing")
-    return {key: value for key, value in values.items() if value is not None}
-
-
-def need(kind, value, where):
-    """A ValueError names a value that is not of its kind, and where it stands."""
-    if not kind.fits(value):
-        text = ascii(value)
-        raise ValueError(f"{where} is {text if len(text) < 100 else text[:80] + ' ...'}: {kind.words} is needed")
+Text = Annotated[StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")]
+Angle = number(-180, 180, "deg")

@@ -14,27 +14,28 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
 import cv2
 import numpy as np
 
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError
 
+LOG = logging.getLogger(__name__)
 END = b"\xff\xd9"  # of a JPEG file; inside of its image data it cannot occur
 CHUNK, LONGEST = 1 << 16, 1 << 26
 LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
+EXPOSURE_UNIT_S = 1e-4  # of V4L2
+MANUAL = 1  # exposure mode of V4L2
+WIDTH, HEIGHT, FPS = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS
+IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
+AGAIN_S = 0.25  # between attempts to find a lost device
+CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 
 
 class MjpegStream:
-    """Reads like cv2.VideoCapture.
-
-    Parameters
-    ----------
-    url : str
-        http or https, a user and password may stand before the host.
-    timeout : float
-        s, to connect and between any two bytes.
+    """Reads like cv2.VideoCapture; `timeout` in s, to connect and between any two bytes.
 
     Attributes
     ----------
@@ -52,22 +53,24 @@ class MjpegStream:
     def __init__(self, url, timeout):
         self._buffer, self._image, self._held, self.waited = b"", None, False, False
         try:
-            parts = urlsplit(url)
+            parts, headers = urlsplit(url), {}
             kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
             self._connection = kind(parts.hostname or "", parts.port, timeout=timeout)
+            if parts.username is not None:
+                words = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
+                headers["Authorization"] = "Basic " + base64.b64encode(words.encode()).decode()
         except (ValueError, http.client.HTTPException) as error:
             raise OSError(f"no address of a stream: {error}") from error
         try:
             self._connection.connect()
             self._socket = self._connection.sock
             target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-            self._connection.request("GET", target, headers=_authorisation(parts))
+            self._connection.request("GET", target, headers=headers)
             self._answer = self._connection.getresponse()
         except (OSError, ValueError, http.client.HTTPException) as error:  # ValueError: names that no host can have
             self._connection.close()
             raise OSError(f"no answer: {error}") from error
-        self.status = self._answer.status
-        self.multipart = self.status == 200 and self._answer.headers.get_content_maintype() == "multipart"
+        self.multipart = self._answer.status == 200 and self._answer.headers.get_content_maintype() == "multipart"
 
     def grab(self):
         """Read one whole image; False at the end of the stream, or after a silence."""
@@ -76,9 +79,9 @@ class MjpegStream:
             self._held = False
             return True
         try:
-            head = self._upto(b"\r\n\r\n")
-            while not (fields := head.strip(b"\r\n")) or b":" not in fields:
-                head = self._upto(b"\r\n\r\n")
+            fields = b""
+            while b":" not in fields:
+                fields = self._upto(b"\r\n\r\n").strip(b"\r\n")
             stated = LENGTH.search(fields)
             self._image = self._count(int(stated[1])) if stated else self._upto(END)
         except (OSError, EOFError, ValueError, http.client.HTTPException):  # ValueError: the answer was closed
@@ -94,9 +97,7 @@ class MjpegStream:
         """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for what is unknown."""
         if self._image is None:
             self._held = self.grab()
-        done, image = self.retrieve()
-        height, width = image.shape[:2] if done else (0, 0)
-        return float({cv2.CAP_PROP_FRAME_WIDTH: width, cv2.CAP_PROP_FRAME_HEIGHT: height}.get(key, 0))
+        return _size_of(self.retrieve()[1], key)
 
     def release(self):
         """Close the connection."""
@@ -127,194 +128,102 @@ class MjpegStream:
         return taken
 
 
-def _authorisation(parts):
-    if parts.username is None:
-        return {}
-    words = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
-    return {"Authorization": "Basic " + base64.b64encode(words.encode()).decode()}
-
-
-EXPOSURE_UNIT_S = 1e-4  # of V4L2
-MANUAL = 1  # exposure mode of V4L2
-IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
-
-
-def find_source(source, silence_s):
-    """What kind of source is meant.
-
-    Parameters
-    ----------
-    source : int, str or Path
-        As of :meth:`lrfcal_lib.drivers.video.Camera.open`.
-    silence_s : float
-        Longest wait for a stream to open, and for its next frame.
-
-    Returns
-    -------
-    object
-        Has ``path``, ``live``, ``remedy`` and the methods ``open()``, ``set(capture, asked)`` and
-        ``got(capture)``.
-    """
-    text = os.fspath(source) if not isinstance(source, int) else str(source)
-    if text.isdigit():
-        text = f"/dev/video{text}"
-    if "://" in text:
-        return _Stream(text, silence_s)
-    if text.startswith("/dev/"):
-        return _Device(text)
-    if os.path.isdir(text) or glob.has_magic(text) and not os.path.exists(text) or _is_image(text):
-        return _Images(text)
-    return _Video(text)
-
-
-def _is_image(path):
-    return Path(path).suffix.lower() in IMAGES
-
-
-class _Source:
-    """What the kinds of source have in common."""
-
-    live = False
-    remedy = "look at its file"
+class Files:
+    """Image files that are read like cv2.VideoCapture, in the order of their names."""
 
     def __init__(self, path):
-        self.path = path
+        paths = Path(path).iterdir() if os.path.isdir(path) else map(Path, glob.glob(path))
+        self._left = sorted(one for one in paths if one.suffix.lower() in IMAGES)
+        if not self._left:
+            raise PortError(f"there are no images in {path}: name a folder or pattern with some")
 
-    def set(self, capture, asked):
-        """Nothing can be set."""
+    def grab(self):
+        """Take the next file, if there is one."""
+        self._path, *self._left = self._left or [None]
+        return self._path is not None
 
-    def got(self, capture):
-        size = tuple(int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        return {"size": size if all(size) else None, "exposure": None, "fps": capture.get(cv2.CAP_PROP_FPS) or None}
-
-
-class _Device(_Source):
-    """A V4L2 device."""
-
-    live = True
-
-    @property
-    def remedy(self):
-        return f"check the plug of {self.path}, and what 'v4l2-ctl --list-devices' shows"
-
-    def open(self):
-        """Open the device; a PortError says what is in the way."""
-        if not os.path.exists(self.path):
-            there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
-            raise PortError(f"there is no camera {self.path}: check its plug; present are {there}")
-        if not os.access(self.path, os.R_OK | os.W_OK):
-            raise PortError(f"no permission for {self.path}: run 'sudo usermod -aG video $USER', then log in again")
-        capture = cv2.VideoCapture(self.path, cv2.CAP_V4L2)
-        if not capture.isOpened():
-            capture.release()
-            raise PortError(f"{self.path} gives no video: close other programs that use it, or name another device")
-        return capture
-
-    def set(self, capture, asked):
-        """Ask for size, frames a second and exposure; what came of it is read back by `got`."""
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        if asked["size"] is not None:
-            for key, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), asked["size"], strict=True):
-                capture.set(key, value)
-        if asked["fps"] is not None:
-            capture.set(cv2.CAP_PROP_FPS, asked["fps"])
-        self.exposure_set = True
-        if asked["exposure"] is not None:
-            capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
-            self.exposure_set = capture.set(cv2.CAP_PROP_EXPOSURE, round(asked["exposure"] / EXPOSURE_UNIT_S))
-
-    def got(self, capture):
-        ticks = capture.get(cv2.CAP_PROP_EXPOSURE) if self.exposure_set else 0
-        return super().got(capture) | {"exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None}
-
-
-class _Stream(_Source):
-    """A stream from the network."""
-
-    live = True
-
-    def __init__(self, path, silence_s):
-        super().__init__(path)
-        self.silence_s = silence_s
-
-    @property
-    def remedy(self):
-        return f"open {self.path} in a browser, and check network and power of the camera"
-
-    def open(self):
-        """Connect: MJPEG over HTTP with our own reader, anything else with FFmpeg."""
-        if self.path.startswith("http"):
-            with contextlib.suppress(OSError):
-                stream = MjpegStream(self.path, self.silence_s)
-                if stream.multipart:
-                    return stream
-                stream.release()
-        wait = round(1000 * self.silence_s)
-        waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, wait, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait]
-        capture = cv2.VideoCapture(self.path, cv2.CAP_FFMPEG, waits)
-        if not capture.isOpened():
-            capture.release()
-            raise PortError(f"{self.path} gives no video: {self.remedy}")
-        return capture
-
-
-class _Video(_Source):
-    """A video file."""
-
-    def open(self):
-        """Open the file; a PortError says what is wrong with it."""
-        if not os.path.exists(self.path):
-            raise PortError(f"there is no video {self.path}: name a file, a device, a folder of images or a URL")
-        capture = cv2.VideoCapture(self.path)
-        if not capture.isOpened():
-            capture.release()
-            raise PortError(f"{self.path} is no video that OpenCV can read")
-        return capture
-
-
-class _Images(_Source):
-    """Images in the order of their names."""
-
-    def open(self):
-        paths = sorted(Path(self.path).iterdir()) if os.path.isdir(self.path) else map(Path, glob.glob(self.path))
-        paths = sorted(path for path in paths if _is_image(path))
-        if not paths:
-            raise PortError(f"there are no images in {self.path}: name a folder or pattern with some")
-        return _Files(paths)
-
-    def got(self, capture):
-        return {"size": capture.size(), "exposure": None, "fps": None}
-
-
-class _Files:
-    """Image files that are read like a video."""
-
-    def __init__(self, paths):
-        self.paths, self.row = paths, 0
-
-    def read(self):
-        """Next image, as VideoCapture.read."""
-        if self.row == len(self.paths):
-            return False, None
-        image = cv2.imread(os.fspath(self.paths[self.row]))
+    def retrieve(self):
+        """Decode it: (True, image)."""
+        image = cv2.imread(os.fspath(self._path))
         if image is None:
-            raise PortError(f"{self.paths[self.row]} is no image that OpenCV can read")
-        self.row += 1
+            raise PortError(f"{self._path} is no image that OpenCV can read")
         return True, image
 
-    def size(self):
-        """Width and height of the first one."""
-        image = cv2.imread(os.fspath(self.paths[0]))
-        return None if image is None else (image.shape[1], image.shape[0])
+    def get(self, key):
+        """Size of the next image; 0 for what is unknown."""
+        return _size_of(cv2.imread(os.fspath(self._left[0])), key)
 
     def release(self):
         """Nothing is open."""
-        self.row = len(self.paths)
+        self._left = []
 
 
-LOG = logging.getLogger(__name__)
-AGAIN_S = 0.25  # between attempts to find a lost device
-CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
+def _size_of(image, key):
+    height, width = (0, 0) if image is None else image.shape[:2]
+    return float({WIDTH: width, HEIGHT: height}.get(key, 0))
+
+
+def _opened(message, *arguments):
+    """An OpenCV capture; a PortError with the message if it cannot be opened."""
+    capture = cv2.VideoCapture(*arguments)
+    if not capture.isOpened():
+        capture.release()
+        raise PortError(message)
+    return capture
+
+
+def _open_device(source):
+    if not os.path.exists(source.path):
+        there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
+        raise PortError(f"there is no camera {source.path}: check its plug; present are {there}")
+    if not os.access(source.path, os.R_OK | os.W_OK):
+        raise PortError(f"no permission for {source.path}: run 'sudo usermod -aG video $USER', then log in again")
+    busy = f"{source.path} gives no video: close other programs that use it, or name another device"
+    return _opened(busy, source.path, cv2.CAP_V4L2)
+
+
+def _open_stream(source):
+    """MJPEG over HTTP with our own reader, anything else with FFmpeg."""
+    if source.path.startswith("http"):
+        with contextlib.suppress(OSError):
+            stream = MjpegStream(source.path, source.silence_s)
+            if stream.multipart:
+                return stream
+            stream.release()
+    wait = round(1000 * source.silence_s)
+    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, wait, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait]
+    return _opened(f"{source.path} gives no video: {source.remedy}", source.path, cv2.CAP_FFMPEG, waits)
+
+
+def _open_video(source):
+    if not os.path.exists(source.path):
+        raise PortError(f"there is no video {source.path}: name a file, a device, a folder of images or a URL")
+    return _opened(f"{source.path} is no video that OpenCV can read", source.path)
+
+
+class Source(NamedTuple):
+    """Where images come from: ``open(source)`` gives what reads like cv2.VideoCapture; live ones can be lost."""
+
+    path: str
+    open: object
+    live: bool = False
+    remedy: str = "look at its file"
+    silence_s: float = 0.0
+
+
+def find_source(source, silence_s):
+    """The Source that is meant by an int, str or Path, see :class:`Camera`."""
+    path = os.fspath(source) if not isinstance(source, int) else str(source)
+    path = f"/dev/video{path}" if path.isdigit() else path
+    if "://" in path:
+        remedy = f"open {path} in a browser, and check network and power of the camera"
+        return Source(path, _open_stream, True, remedy, silence_s)
+    if path.startswith("/dev/"):
+        return Source(path, _open_device, True, f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows")
+    pattern = glob.has_magic(path) and not os.path.exists(path)
+    if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
+        return Source(path, lambda source: Files(source.path))
+    return Source(path, _open_video)
 
 
 @dataclass(frozen=True)
@@ -336,82 +245,59 @@ class Frame:
     index: int
 
 
-class Camera:
-    """A camera; a context manager.
+class Camera(Closed):
+    """A camera, set to what is asked for; what came of it is read back. A context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
     source again when it is lost. A recorded one (video file, images) gives its next image each time it is asked.
 
+    Parameters
+    ----------
+    source : int, str or Path
+        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such as
+        ``"images/*.png"``.
+    name : str
+    size : (int, int), optional
+        Width and height, pixels.
+    exposure : float, optional
+        s; by default the camera's automatic exposure is left alone.
+    fps : float, optional
+    silence_s : float
+        A stream that sends nothing for so long is taken for lost and opened again.
+    clock : callable
+        Host clock, s.
+
     Attributes
     ----------
-    name : str
     settings : dict
         'size' (width, height) in pixels, 'exposure' in s and 'fps', each a dict of 'asked' and 'got' (None where it is
-        unknown), and 'warnings', a list of str.
+        unknown), and 'warnings', a list of str: what could not be set.
     lost : bool
         A live source gave no frame when it should have, and was not found again yet; a recorded one is at its end.
+
+    Raises
+    ------
+    PortError
+        If the source is missing, forbidden, busy, or no camera.
     """
 
-    def __init__(self, source, name, asked, log, clock):
-        self.name, self.lost = name, False
+    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0, log=LOG, clock=time.time):
+        asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
+        self.name, self.lost, self._log, self._clock = name, False, log, clock
         self.settings = {key: {"asked": value, "got": None} for key, value in asked.items()} | {"warnings": []}
-        self._source, self._log, self._clock = source, log, clock
+        self._source = find_source(source, silence_s)
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
-        self._capture = source.open()
+        self._capture = self._source.open(self._source)
         self._apply()
-        self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True) if source.live else None
-        if self._thread:
+        self._thread = None
+        if self._source.live:
+            self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
             self._thread.start()
 
-    @classmethod
-    def open(cls, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0, log=LOG, clock=time.time):
-        """Open a camera, set what is asked for, and read back what became of it.
-
-        Parameters
-        ----------
-        source : int, str or Path
-            V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such as
-            ``"images/*.png"``.
-        name : str
-        size : (int, int), optional
-            Width and height, pixels.
-        exposure : float, optional
-            s; by default the camera's automatic exposure is left alone.
-        fps : float, optional
-        silence_s : float
-            A stream that sends nothing for so long is taken for lost and opened again.
-        log : logging.Logger
-        clock : callable
-            Host clock, s.
-
-        Returns
-        -------
-        Camera
-            What could not be set is a warning in the log and in :attr:`settings`.
-
-        Raises
-        ------
-        PortError
-            If the source is missing, forbidden, busy, or no camera.
-        """
-        asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
-        return cls(find_source(source, silence_s), name, asked, log, clock)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
-
     def newest(self, after=None, timeout=5.0):
-        """The newest frame.
+        """The newest frame within so many seconds, grabbed later than `after` by the host's clock if that is given.
 
-        Parameters
-        ----------
-        after : float, optional
-            Host time, s: a frame grabbed later, which is waited for. A recorded source gives its next image.
-        timeout : float
-            s.
+        A recorded source gives its next image.
 
         Returns
         -------
@@ -426,13 +312,22 @@ class Camera:
         DeviceError
             If the camera was closed.
         """
-        if self._thread is None:
-            return self._next()
+
+        def there():
+            return self._frame is not None and (after is None or self._frame.time_s > after)
+
         with self._new:
-            self._new.wait_for(lambda: self._quit.is_set() or self._later(after), timeout)
+            if self._thread is not None:
+                self._new.wait_for(lambda: self._quit.is_set() or there(), timeout)
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
-            if self._later(after):
+            if self._thread is None:
+                self.lost = not self._capture.grab() or not self._keep(self._clock())
+                if self.lost:
+                    raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: "
+                                   "open it again")  # fmt: skip
+                return self._frame
+            if there():
                 return self._frame
         if self.lost:
             raise LineLost(f"camera {self.name} is lost: {self._source.remedy}")
@@ -445,14 +340,15 @@ class Camera:
             self._new.notify_all()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
-        elif self._capture is not None:
-            self._capture.release()
-            self._capture = None
+        else:
+            self._release()
 
     # ------------------------------------------------------------------------------------------------- grabbing
 
-    def _later(self, after):
-        return self._frame is not None and (after is None or self._frame.time_s > after)
+    def _release(self):
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
 
     def _grab(self):
         """Keep the newest frame; this thread alone touches the source."""
@@ -460,23 +356,24 @@ class Camera:
             if self._capture is None or not self._capture.grab():
                 self._lose()
                 continue
-            now = self._clock()
-            done, image = self._capture.retrieve()
-            if done:  # what was there at once may have come at any time since the frame before
-                self._put(image, now if getattr(self._capture, "waited", True) else self._before)
+            now = self._clock()  # what was there at once may have come at any time since the frame before
+            self._keep(now if getattr(self._capture, "waited", True) else self._before)
             self._before = now
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
+        self._release()
 
-    def _put(self, image, instant):
-        with self._new:
-            self._frame = Frame(_colour(image), instant, self._count)
-            self._count += 1
-            if self.lost:
-                self._log.warning("camera %s is back", self.name)
-            self.lost = False
-            self._new.notify_all()
+    def _keep(self, instant):
+        """Decode what was grabbed, three channels of it; whether that was an image."""
+        done, image = self._capture.retrieve()
+        if done:
+            grey = image.ndim == 2 or image.shape[2] == 1
+            with self._new:
+                self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
+                self._count += 1
+                if self.lost:
+                    self._log.warning("camera %s is back", self.name)
+                self.lost = False
+                self._new.notify_all()
+        return done
 
     def _lose(self):
         """Forget the last frame, and look for the source."""
@@ -484,47 +381,36 @@ class Camera:
             if not self.lost:
                 self._log.warning("camera %s is lost: %s", self.name, self._source.remedy)
             self.lost, self._frame = True, None
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
-        if self._quit.wait(AGAIN_S):
-            return
-        with contextlib.suppress(PortError):
-            self._capture = self._source.open()
-            self._apply()
-
-    def _next(self):
-        if self._capture is None:
-            raise DeviceError(f"camera {self.name} is closed: open it again")
-        done, image = self._capture.read()
-        if not done:
-            self.lost = True
-            raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: open it again")
-        self._count += 1
-        return Frame(_colour(image), self._clock(), self._count - 1)
-
-    # ------------------------------------------------------------------------------------------------- settings
+        self._release()
+        if not self._quit.wait(AGAIN_S):
+            with contextlib.suppress(PortError):
+                self._capture = self._source.open(self._source)
+                self._apply()
 
     def _apply(self):
-        """Set what was asked for, read it back, and say what is different."""
-        self._before = self._clock()
-        asked = {key: value["asked"] for key, value in self.settings.items() if key != "warnings"}
-        self._source.set(self._capture, asked)
+        """Set what was asked for, of devices, read it back, and say what is different."""
+        self._before, capture, ticks = self._clock(), self._capture, 0
+        asked = {key: self.settings[key]["asked"] for key in ("size", "exposure", "fps")}
+        if self._source.open is _open_device:
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+            for key, value in zip((WIDTH, HEIGHT, FPS), (*(asked["size"] or (None, None)), asked["fps"]), strict=True):
+                if value is not None:
+                    capture.set(key, value)
+            done = True
+            if asked["exposure"] is not None:
+                capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
+                done = capture.set(cv2.CAP_PROP_EXPOSURE, round(asked["exposure"] / EXPOSURE_UNIT_S))
+            ticks = capture.get(cv2.CAP_PROP_EXPOSURE) if done else 0
+        size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
+        found = {"size": size if all(size) else None, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
+                 "fps": capture.get(FPS) or None}  # fmt: skip
         warnings = []
-        for key, got in self._source.got(self._capture).items():
+        for key, got in found.items():
             self.settings[key]["got"] = got
-            if asked[key] is not None and not _same(asked[key], got):
+            if asked[key] is not None and (got is None or not np.allclose(asked[key], got, rtol=0.05, atol=0)):
                 told = "cannot be set" if got is None else f"is {got}"
                 warnings.append(f"camera {self.name}: {key} {told}, asked {asked[key]}")
         for text in warnings:
             if text not in self.settings["warnings"]:
                 self._log.warning(text)
         self.settings["warnings"] = warnings
-
-
-def _same(asked, got):
-    return got is not None and bool(np.allclose(asked, got, rtol=0.05, atol=0))
-
-
-def _colour(image):
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 or image.shape[2] == 1 else image

@@ -165,7 +165,7 @@ class EmulatedRig:
         lrf = stated.LrfInfo(
             f"{beam.name} (emulated)", (float(bearings[0]), float(bearings[-1])), math.radians(beam.resolution / 100),
             beam.sigma_range, range_resolution=beam.unit, max_range=LARGEST_WORD * beam.unit,
-            spot=(beam.spot_exit, beam.divergence),
+            spot_exit=beam.spot_exit, spot_divergence=beam.divergence,
         )  # fmt: skip
         cameras = [c for c in rig.cameras if c.name in self.camera_urls]
         infos = [stated.CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in cameras]

@@ -1,10 +1,9 @@
 """Stages that several notebooks begin with, worked out once.
 
-Every notebook runs alone, from the recording on, so most of them begin with the same work. Where the environment
-variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there, and whoever asks for the same
-again reads it. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs; without the
-variable nothing is kept. Results are pickles, which can run code when they are read: a folder that others may write to
-is refused.
+Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there for
+whoever asks for the same again. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs.
+Results are pickles: they hold nested dataclasses with arrays and transforms of SciPy, for which no plain format is as
+short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root).
 """
 
 from __future__ import annotations
@@ -41,49 +40,35 @@ def cached(stage):
 
     @wraps(stage)
     def look_first(session, *args, **options):
-        folder = os.environ.get(VARIABLE)
-        if not folder:
+        """The kept result of the same call, or else what the stage makes now."""
+        if not os.environ.get(VARIABLE):
             return stage(session, *args, **options)
-        _check_private(Path(folder))
-        file = Path(folder) / f"{stage.__name__}-{_key(stage, session, args, options)}.pickle"
+        folder = Path(os.environ[VARIABLE])
+        found = folder.stat() if folder.exists() else None
+        if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
+            may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
+            raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
+        key = hashlib.sha256(pickle.dumps((stage.__qualname__, session, args, sorted(options.items()))))
+        for file in (Path(record.file) for record in session.image_records):
+            key.update(file.read_bytes() if file.is_file() else b"missing")
+        key.update(library())
+        file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if file.is_file():
-            return pickle.loads(file.read_bytes())
+            return pickle.loads(file.read_bytes())  # only we write there, see above
         result = stage(session, *args, **options)
-        _write(file, pickle.dumps(result))
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=folder, delete=False) as part:
+            part.write(pickle.dumps(result))
+        os.replace(part.name, file)  # whole or not at all: other notebooks read at the same time
         return result
 
     return look_first
 
 
-def _check_private(folder):
-    """Whoever may write to the folder could have what they put there run."""
-    found = folder.stat() if folder.exists() else None
-    if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
-        may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
-        raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
-
-
-def _key(stage, session, args, options):
-    """Everything that the result depends on, as a number of 256 bits."""
-    key = hashlib.sha256(pickle.dumps((stage.__qualname__, session, args, sorted(options.items()))))
-    for file in (Path(record.file) for record in session.image_records):
-        key.update(file.read_bytes() if file.is_file() else b"missing")
-    key.update(_library())
-    return key.hexdigest()
-
-
 @lru_cache
-def _library():
+def library():
     """What stands for this library and those it works out its results with."""
     digest = hashlib.sha256("".join(module.__version__ for module in (np, scipy, cv2)).encode())
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.digest()
-
-
-def _write(file, data):
-    """Whole or not at all: other notebooks read at the same time."""
-    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=file.parent, delete=False) as part:
-        part.write(data)
-    os.replace(part.name, file)

@@ -12,7 +12,7 @@ from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import image_size
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, reading, transform_to_json
 from lrfcal_lib.session.write import SessionWriter
 
 # LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder ZED_STEREO_LASER_SWEEP.
@@ -26,6 +26,7 @@ LASERSETERO_STEP_DEG = 0.1
 LASERSETERO_VIEW_DEG = (55.0, 125.0)  # the LMS400 sees 70 deg
 LASERSETERO_COUNT = 0.001  # metres, one count of the LMS400
 LASERSETERO_SQUARE = 0.0775
+LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
 
 
@@ -52,20 +53,34 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     SessionError
         For missing or truncated files, an existing target, or if rebuilding misses by more than 0.01 mm.
     """
-    src = Path(src)
     if intrinsics not in ("own", "published"):
         raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
-    clouds = _numbered(src, "plane_*.pcd")
-    published = {name: read_bouguet(src / f"Calib_Results_{name}.m") for name in ("left", "right")}
-    images = {name: _numbered(src, f"{name}_*.png") for name in published}
+    clouds = numbered(src, "plane_*.pcd")
+    published = {name: read_bouguet(Path(src) / f"Calib_Results_{name}.m") for name in ("left", "right")}
+    images = {name: numbered(src, f"{name}_*.png") for name in published}
+    sizes = {name: image_size(next(iter(files.values()))) for name, files in images.items()}
     models = {name: result["model"] if intrinsics == "published" else None for name, result in published.items()}
-    cameras = [CameraInfo(name, "platform", *_size(images[name]), models[name]) for name in published]
-    misses = []
-    about = _about(published) | {"platform_sigma": LASERSETERO_PLATFORM_SIGMA}
-    with SessionWriter(dst, _lasersetero_board(), _lms400(), cameras, LASERSETERO_HEAD, **about) as writer:
+    cameras = [CameraInfo(name, "platform", *sizes[name], models[name]) for name in published]
+    pattern, view = Chessboard(8, 6, LASERSETERO_SQUARE), tuple(np.radians(LASERSETERO_VIEW_DEG))
+    board = Board("chessboard 9 x 7", ("top", "right", "bottom", "left"), None, pattern, ("left", "top"))
+    lrf = LrfInfo("SICK LMS400", view, np.radians(LASERSETERO_STEP_DEG), 0.005, 0.0, LASERSETERO_COUNT, 3.0)
+    # the authors' result is printed with four digits, so made orthonormal again
+    turn = Rotation.from_matrix([[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]])
+    T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
+    reference = {
+        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b is "
+        "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes).",
+        "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
+        "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
+        "cameras": {name: result["reference"] for name, result in published.items()},
+    }
+    about = {"licence": "none stated by the authors", "source": LASERSETERO, "reference": reference}
+    about |= {"platform_sigma": LASERSETERO_PLATFORM_SIGMA}
+    with SessionWriter(dst, board, lrf, cameras, LASERSETERO_HEAD, **about) as writer:
+        misses = []
         for placement, file in clouds.items():
-            ranges, bearings, pitch, miss = recover_polar(read_pcd(file), file)
-            writer.add_sweep(placement, ranges, bearings, pitch)
+            *sweep, miss = recover_polar(read_pcd(file), file)
+            writer.add_sweep(placement, *sweep)
             misses.append(miss)
         for name, files in images.items():
             for placement, file in files.items():
@@ -73,45 +88,13 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     return max(misses)
 
 
-def _numbered(folder, pattern):
-    numbered = ((re.search(r"_(\d+)\.", file.name), file) for file in sorted(folder.glob(pattern)))
-    found = {int(number[1]): file for number, file in numbered if number}
+def numbered(folder, pattern):
+    """Files by the number in their names."""
+    names = ((re.search(r"_(\d+)\.", file.name), file) for file in sorted(Path(folder).glob(pattern)))
+    found = {int(number[1]): file for number, file in names if number}
     if not found:
         raise SessionError(f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?")
     return found
-
-
-def _size(files):
-    return image_size(next(iter(files.values())))
-
-
-def _lasersetero_board():
-    pattern = Chessboard(8, 6, LASERSETERO_SQUARE)
-    return Board("chessboard 9 x 7", ("top", "right", "bottom", "left"), None, pattern, ("left", "top"))
-
-
-def _lms400():
-    view = tuple(np.radians(LASERSETERO_VIEW_DEG))
-    return LrfInfo("SICK LMS400", view, np.radians(LASERSETERO_STEP_DEG), 0.005, 0.0, LASERSETERO_COUNT, 3.0)
-
-
-def _about(published):
-    reference = {
-        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b is "
-        "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes).",
-        "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
-        "T_left_platform": transform_to_json(_published_left()),
-        "cameras": {name: result["reference"] for name, result in published.items()},
-    }
-    source = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
-    return {"licence": "none stated by the authors", "source": source, "reference": reference}
-
-
-def _published_left():
-    """The authors' result (printed with four digits, so made orthonormal again), for our platform frame."""
-    phi = [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
-    T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], Rotation.from_matrix(phi))
-    return T_left_cloud * LASERSETERO_CLOUD
 
 
 def recover_polar(points, name="points"):
@@ -126,19 +109,10 @@ def recover_polar(points, name="points"):
 
     Returns
     -------
-    ranges : ndarray, shape (L, B)
-        Metres on the sensor's grid of 1 mm, NaN outside the published part.
-    bearings : ndarray, shape (B,)
-        Ours, ascending, radians: the sensor's whole field of view in steps of 0.1 deg.
-    pitch : ndarray, shape (L,)
-        Ours, radians, one value a scan line.
+    ranges, bearings, pitch : ndarray, shapes (L, B), (B,) and (L,)
+        Metres on the sensor's grid of 1 mm, NaN outside the published part; ours, radians, in steps of 0.1 deg.
     miss : float
-        Largest distance between published and rebuilt points, metres.
-
-    Raises
-    ------
-    SessionError
-        If `miss` exceeds 0.01 mm: then the points are not what the authors' model makes.
+        Largest distance between published and rebuilt points, metres; SessionError for more than 0.01 mm.
 
     Notes
     -----
@@ -165,46 +139,34 @@ def recover_polar(points, name="points"):
             f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than {1000 * LARGEST_MISS:g} mm; "
             "not points of this rig?"
         )
-    return *_on_grid(ranges, steps, line), pitch, miss
-
-
-def _on_grid(ranges, steps, line):
     first, last = (round(v / LASERSETERO_STEP_DEG) for v in LASERSETERO_VIEW_DEG)
     if steps.min() < first or steps.max() > last:
-        reached = LASERSETERO_STEP_DEG * steps.min(), LASERSETERO_STEP_DEG * steps.max()
-        raise SessionError(f"bearings reach {reached[0]:.1f} .. {reached[1]:.1f} deg, the LMS400 sees 55 .. 125 deg")
+        low, high = LASERSETERO_STEP_DEG * steps.min(), LASERSETERO_STEP_DEG * steps.max()
+        raise SessionError(f"bearings reach {low:.1f} .. {high:.1f} deg, the LMS400 sees 55 .. 125 deg")
     grid = np.full((line[-1] + 1, last - first + 1), np.nan)
     grid[line, steps.astype(int) - first] = ranges
-    return grid, np.radians(np.arange(first, last + 1) * LASERSETERO_STEP_DEG)
+    return grid, np.radians(np.arange(first, last + 1) * LASERSETERO_STEP_DEG), pitch, miss
+
+
+def source_text(file):
+    """Text of somebody else's file."""
+    try:
+        return Path(file).read_text(errors="replace")
+    except OSError as error:
+        raise SessionError(f"{file}: {error.strerror}") from error
 
 
 def read_pcd(file):
-    """Points of an ASCII PCD file with the fields x y z.
+    """Points of an ASCII PCD file with the fields x y z, shape (n, 3).
 
-    Parameters
-    ----------
-    file : path-like
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-
-    Raises
-    ------
-    SessionError
-        For a missing file, other fields, binary data, or fewer points than the header states.
+    SessionError for a missing file, other fields, binary data, or fewer points than the header states.
     """
-    try:
-        head, _, body = Path(file).read_text(errors="replace").partition("DATA ascii")
-    except OSError as error:
-        raise SessionError(f"{file}: {error.strerror}") from error
+    head, _, body = source_text(file).partition("DATA ascii")
     fields, count = (re.search(rf"^{key} (.*)$", head, re.MULTILINE) for key in ("FIELDS", "POINTS"))
     if not body or not fields or not count or fields[1].split() != ["x", "y", "z"]:
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
-    try:
+    with reading(file, "{}; damaged?"):
         points = np.array(body.split(), dtype=float)
-    except ValueError as error:
-        raise SessionError(f"{file}: {error}; damaged?") from error
     if points.size != 3 * int(count[1]) or points.size == 0:
         raise SessionError(f"{file}: {points.size / 3:g} points, the header states {count[1]}; truncated?")
     return points.reshape(-1, 3)
@@ -228,23 +190,15 @@ def read_bouguet(file):
     SessionError
         If the file or a value in it is missing.
     """
-    try:
-        text = Path(file).read_text(errors="replace")
-    except OSError as error:
-        raise SessionError(f"{file}: {error.strerror}") from error
-    found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", text, re.MULTILINE)
+    found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
     need = ("fc", "cc", "kc", "nx", "ny", "fc_error", "cc_error", "kc_error")
     lacking = [key for key in need if key not in values]
     if lacking:
         raise SessionError(f"{file}: no value of {', '.join(lacking)}; is this a Calib_Results.m?")
     intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
+    sigma = sigma / 3
     model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
-    model = model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2))
-    return {"model": model, "reference": _bouguet_reference(intrinsics, sigma / 3, values)}
-
-
-def _bouguet_reference(intrinsics, sigma, values):
     poses = {}
     for key in values:
         if (number := re.fullmatch(r"omc_(\d+)", key)) and f"Tc_{number[1]}" in values:
@@ -252,4 +206,5 @@ def _bouguet_reference(intrinsics, sigma, values):
             poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
     both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma}
-    return {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
+    reference = {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
+    return {"model": model.with_parameters(intrinsics, np.diag(sigma**2)), "reference": reference}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
 import numpy as np
@@ -66,15 +67,7 @@ class Stream:
 
 
 def crc16(data):
-    """The device's checksum of one byte string, or of each row of an array.
-
-    Parameters
-    ----------
-    data : bytes-like, or ndarray of uint8, shape (n, L)
-
-    Returns
-    -------
-    int, or ndarray of uint16, shape (n,)
+    """The device's checksum of one byte string (int), or of each row of an array of uint8, shape (n, L).
 
     Notes
     -----
@@ -93,16 +86,16 @@ def crc16(data):
     while (n := words.shape[1]) > 1:
         last = 1 << ((n - 1).bit_length() - 1)
         rest = words[:, n - last :].copy()
-        rest[:, 2 * last - n :] ^= _times_power(last)[words[:, : n - last]]
+        rest[:, 2 * last - n :] ^= times_power(last)[words[:, : n - last]]
         words = rest
     return words[:, 0]
 
 
 @lru_cache
-def _times_power(power):
+def times_power(power):
     """Table of every 16-bit polynomial times ``x^power``, shape (65536,); for powers of two."""
     if power > 1:
-        root = _times_power(power // 2)
+        root = times_power(power // 2)
         return root[root]
     table = np.arange(1 << 16, dtype=np.uint16)
     return (table << 1) ^ np.where(table & 0x8000, 0x8005, 0).astype(np.uint16)
@@ -131,26 +124,18 @@ def encode_telegram(code, data=b"", *, status=None, address=None):
         For numbers that are no bytes, or more than 65535 bytes of data.
     """
     address = address if address is not None else HOST if status is None else DEVICE
-    body = bytes([_byte(code, "code")]) + bytes(data) + (b"" if status is None else bytes([_byte(status, "status")]))
+    for what, value in (("code", code), ("status", status or 0), ("address", address)):
+        if not 0 <= value <= 0xFF:
+            raise ValueError(f"{what} must be a byte, 0 to 255, got {value}")
+    body = bytes([code]) + bytes(data) + (b"" if status is None else bytes([status]))
     if len(body) > 0xFFFF:
         raise ValueError(f"a telegram holds up to 65535 bytes, got {len(body)}: send several")
-    head = bytes([STX, _byte(address, "address")]) + len(body).to_bytes(2, "little")
-    return head + body + crc16(head + body).to_bytes(2, "little")
-
-
-def _byte(value, what):
-    if not 0 <= value <= 0xFF:
-        raise ValueError(f"{what} must be a byte, 0 to 255, got {value}")
-    return int(value)
+    raw = bytes([STX, address]) + len(body).to_bytes(2, "little") + body
+    return raw + crc16(raw).to_bytes(2, "little")
 
 
 def parse_telegram(raw):
-    """Take the frame off one telegram.
-
-    Parameters
-    ----------
-    raw : bytes-like
-        From the start byte to the CRC, nothing else.
+    """Take the frame off one telegram (from the start byte to the CRC, nothing else).
 
     Returns
     -------
@@ -193,56 +178,42 @@ def split_stream(data, *, replies=True):
     in 65536 of the places inside other bytes passes.
     """
     data = np.frombuffer(data, np.uint8)
-    offset, length = _candidates(data, replies)
+    offset = np.flatnonzero(data[: max(len(data) - 3, 0)] == STX)
+    offset = offset[(data[offset + 1] >= DEVICE) == replies]
+    length = word(data, offset + 2) + OVERHEAD
+    plausible = (length > OVERHEAD) & (length <= LONGEST)
+    offset, length = offset[plausible], length[plausible]
     ends = offset + length
     whole = ends <= len(data)
     good = np.zeros(len(offset), bool)
     good[whole] = check_crc(data, offset[whole], length[whole])
-    good[good] = _first_of_overlapping(offset[good], ends[good])
-    inside = _covered(offset, offset[good], ends[good])
-    rejected = offset[whole & ~good & ~inside]
-    begun = offset[~whole & (offset >= ends[good].max(initial=0))]
-    pending = int(begun[0]) if len(begun) else _begun_head(data, ends[good].max(initial=0))
-    skipped = pending - int(length[good].sum())
-    return Stream(offset[good], length[good], data[offset[good] + 4], rejected, skipped, pending)
+    if np.any(offset[good][1:] < ends[good][:-1]):  # seldom
+        free = 0
+        for row in np.flatnonzero(good):
+            good[row] = offset[row] >= free
+            free = ends[row] if good[row] else free
+    used, before = ends[good].max(initial=0), np.searchsorted(offset[good], offset, side="right") - 1
+    inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
+    begun = offset[~whole & (offset >= used)]
+    tail = max(len(data) - 3, int(used))  # too few bytes to state a length
+    begun = [*begun.tolist(), *(tail + np.flatnonzero(data[tail:] == STX)).tolist(), len(data)][0]
+    skipped = begun - int(length[good].sum())
+    return Stream(offset[good], length[good], data[offset[good] + 4], offset[whole & ~good & ~inside], skipped, begun)
 
 
-def _begun_head(data, used):
-    """Where the last bytes, too few to state a length, may begin a telegram; the number of bytes if nowhere."""
-    first = max(len(data) - 3, int(used))
-    starts = np.flatnonzero(data[first:] == STX)
-    return first + int(starts[0]) if len(starts) else len(data)
-
-
-def _candidates(data, replies):
-    """Offsets where a telegram may begin, and the lengths stated there."""
-    offset = np.flatnonzero(data == STX)
-    offset = offset[offset + 4 <= len(data)]
-    offset = offset[(data[offset + 1] >= DEVICE) == replies]
-    length = data[offset + 2] + (data[offset + 3].astype(int) << 8) + OVERHEAD
-    plausible = (length > OVERHEAD) & (length <= LONGEST)
-    return offset[plausible], length[plausible]
+def word(data, at):
+    """16-bit numbers at places in an array of bytes."""
+    return data[at] | (data[at + 1].astype(int) << 8)
 
 
 def check_crc(data, offset, length):
-    """Which telegrams have the right CRC.
-
-    Parameters
-    ----------
-    data : ndarray of uint8, shape (n,)
-    offset, length : ndarray of int, shape (m,)
-        Whole telegrams inside of `data`.
-
-    Returns
-    -------
-    ndarray of bool, shape (m,)
-    """
+    """Which of the whole telegrams in an array of uint8 have the right CRC, shape (m,)."""
     good = np.zeros(len(offset), bool)
     for rows in alike(length):
         for first in range(0, len(rows), CHUNK):
             some = rows[first : first + CHUNK]
             raw = cut(data, offset[some], length[some[0]])
-            good[some] = crc16(raw[:, :-2]) == _word(raw, -2)
+            good[some] = crc16(raw[:, :-2]) == word(data, offset[some] + length[some[0]] - 2)
     return good
 
 
@@ -260,29 +231,6 @@ def cut(data, offset, length):
     return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
 
 
-def _word(raw, at):
-    return raw[:, at].astype(np.uint16) | (raw[:, at + 1].astype(np.uint16) << 8)
-
-
-def _first_of_overlapping(offset, ends):
-    """Mask of the intervals that do not begin inside of one kept before."""
-    if np.all(offset[1:] >= ends[:-1]):
-        return np.ones(len(offset), bool)
-    keep, free = np.zeros(len(offset), bool), 0
-    for row, (first, last) in enumerate(zip(offset.tolist(), ends.tolist(), strict=True)):
-        if first >= free:
-            keep[row], free = True, last
-    return keep
-
-
-def _covered(points, first, last):
-    """Which points lie in one of the ordered intervals [first, last)."""
-    if not len(first):
-        return np.zeros(len(points), bool)
-    before = np.searchsorted(first, points, side="right") - 1
-    return (before >= 0) & (points < last[before])
-
-
 SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
 UNITS = ("cm", "mm")
@@ -291,24 +239,15 @@ REASONS = (
 )  # fmt: skip
 BEYOND = REASONS.index("larger than maximum")
 # index: how far a value is below the largest one its bits can hold
-_REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
-_BELOW_TOP = {1: 0, 2: 1, 3: 2, 4: 4, 5: 5, BEYOND: 8}
+REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
+BELOW_TOP = np.array([np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)])  # the other way
 
 
 @dataclass(frozen=True)
 class Mode:
-    """How a measuring mode shares the 16 bits of a value.
-
-    Attributes
-    ----------
-    bits : int
-        Lower bits, the range.
-    flags : tuple of str
-        Names of the upper bits, lowest first; 'reflector' where they hold a level instead.
-    """
+    """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper ones flags."""
 
     bits: int
-    flags: tuple[str, ...]
 
     @property
     def top(self):
@@ -321,15 +260,8 @@ class Mode:
         return self.top - 9
 
 
-MODES = {
-    0: Mode(13, ("field A", "field B", "dazzled")),
-    1: Mode(13, ("reflector",)),
-    2: Mode(13, ("field A", "field B", "field C")),
-    3: Mode(14, ("reflector",)),
-    4: Mode(14, ("field A", "field B")),
-    5: Mode(15, ("reflector",)),
-    6: Mode(15, ("field A",)),
-}
+# flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others: level of a reflector
+MODES = dict(enumerate(map(Mode, (13, 13, 13, 14, 14, 15, 15))))
 
 
 @dataclass(frozen=True)
@@ -350,8 +282,7 @@ class Scans:
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
         Real-time indices, modulo 256; -1 where the device does not send them.
-    status : ndarray of uint8, shape (n,)
-    address : ndarray of uint8, shape (n,)
+    status, address : ndarray of uint8, shape (n,)
     """
 
     rows: np.ndarray
@@ -368,7 +299,10 @@ class Scans:
     @property
     def reasons(self):
         """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        return value_reasons(self.words, self.mode)
+        special, found = special_values(self.words, self.mode)
+        reasons = np.zeros(self.words.shape, np.uint8)
+        reasons[special] = found
+        return reasons
 
     @property
     def flags(self):
@@ -377,16 +311,25 @@ class Scans:
 
 
 def mode_of(number):
-    """The measuring mode of a number.
-
-    Raises
-    ------
-    ValueError
-        For modes that send no range with special values.
-    """
+    """The measuring mode of a number; ValueError for modes that send no range with special values."""
     if number not in MODES:
         raise ValueError(f"measuring mode {number:#04x} is none of 0x00 to 0x06: set one of those (command 77)")
     return MODES[number]
+
+
+def metres_of(unit):
+    """Metres of a count; ValueError for an unknown unit."""
+    if unit not in METRES:
+        raise ValueError(f"unit is one of {', '.join(METRES)}, got {unit!r}")
+    return METRES[unit]
+
+
+def special_values(words, mode):
+    """Where values are no ranges, and why; they are few."""
+    mode = MODES[mode]
+    counts = words & np.uint16(mode.top)
+    special = np.nonzero(counts > mode.largest)
+    return special, REASON_BELOW_TOP[mode.top - counts[special]]
 
 
 def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
@@ -416,25 +359,17 @@ def encode_values(ranges, *, unit="mm", mode=0, reasons=None, flags=0):
         For negative ranges, flags that the mode has no bits for, an unknown unit, mode or reason.
     """
     ranges, mode, flags = np.asarray(ranges, float), mode_of(mode), np.asarray(flags)
+    reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons, int)
     if np.any(ranges < 0):
         raise ValueError(f"a range is {np.nanmin(ranges):g} m: ranges are positive, use NaN for no return")
     if np.any(flags < 0) or np.any(flags >> (16 - mode.bits)):
         raise ValueError(f"flags must be 0 to {(1 << (16 - mode.bits)) - 1} in this mode, got up to {flags.max()}")
-    counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[_unit(unit)])
-    words = np.where(counts > mode.largest, mode.top - _BELOW_TOP[BEYOND], counts).astype(np.uint16)
-    words = np.where(np.isnan(ranges), np.uint16(mode.top), words)
-    reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons)
-    if unknown := set(np.unique(reasons).tolist()) - {0, *_BELOW_TOP}:
+    if unknown := set(np.unique(reasons).tolist()) - {*range(1 + BEYOND)}:
         raise ValueError(f"reasons are 1 to {BEYOND}, 0 for a range, got {sorted(unknown)}")
-    for reason, below in _BELOW_TOP.items():
-        words = np.where(reasons == reason, np.uint16(mode.top - below), words)
+    counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / metres_of(unit))
+    reasons = np.where(reasons > 0, reasons, np.where(np.isnan(ranges), 1, BEYOND * (counts > mode.largest)))
+    words = np.where(reasons > 0, mode.top - BELOW_TOP[reasons], counts).astype(np.uint16)
     return words | (flags.astype(np.uint16) << np.uint16(mode.bits))
-
-
-def _unit(unit):
-    if unit not in METRES:
-        raise ValueError(f"unit is one of {', '.join(METRES)}, got {unit!r}")
-    return unit
 
 
 def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE):
@@ -466,7 +401,7 @@ def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, add
         raise ValueError(f"a scan has up to 401 values in one row, got shape {words.shape}")
     if partial not in (-1, 0, 1, 2, 3):
         raise ValueError(f"partial is 0 to 3, or -1 for a whole scan, got {partial}")
-    count = len(words) | UNITS.index(_unit(unit)) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
+    count = len(words) | (metres_of(unit) == 0.001) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
     tail = b"" if indices is None else bytes(i % 256 for i in indices)
     data = count.to_bytes(2, "little") + words.astype("<u2").tobytes() + tail
     return encode_telegram(SCAN, data, status=status, address=address)
@@ -533,103 +468,44 @@ def decode_scans(data, offset, length, mode=0):
     data, length = np.frombuffer(data, np.uint8), np.asarray(length)
     rows = np.flatnonzero(length >= 10)
     rows = rows[data[offset[rows] + 4] == SCAN]
-    at = offset[rows]
-    word = data[at + 5] | (data[at + 6].astype(int) << 8)
-    extra = length[rows] - 10 - 2 * (word & 0x3FF)
-    sound = ((extra == 0) | (extra == 2)) & (word < 1 << 15)
-    rows, word, extra = rows[sound], word[sound], extra[sound]
-    groups = alike(word & 0xE3FF, extra)
-    return [_decode_alike(data, offset, rows[g], word[g], bool(extra[g[0]]), mode) for g in groups]
-
-
-def _decode_alike(data, offset, rows, word, indexed, mode):
-    values, unit = int(word[0] & 0x3FF), UNITS[word[0] >> 14]
-    words, ranges = np.empty((len(rows), values), np.uint16), np.empty((len(rows), values))
-    for first in range(0, len(rows), CHUNK):
-        some = slice(first, first + CHUNK)
-        words[some] = cut(data, offset[rows[some]] + 7, 2 * values).view("<u2")
-        ranges[some] = decode_values(words[some], unit=unit, mode=mode)
-    last = offset[rows] + 7 + 2 * values + 2 * indexed
-    scan, telegram = (data[last - k].astype(int) if indexed else np.full(len(rows), -1) for k in (2, 1))
-    partial = np.where(word >> 13 & 1, word >> 11 & 3, -1)
-    return Scans(rows, words, ranges, unit, mode, partial, scan, telegram, data[last], data[offset[rows] + 1])
-
-
-def decode_values(words, *, unit="mm", mode=0):
-    """Ranges of values as a device sends them.
-
-    Parameters
-    ----------
-    words : ndarray of uint16
-    unit : {'cm', 'mm'}
-    mode : int
-
-    Returns
-    -------
-    ndarray
-        Metres; inf where larger than maximum, NaN for all other special values.
-    """
-    mode = mode_of(mode)
-    counts = words & np.uint16(mode.top)
-    ranges = counts * METRES[_unit(unit)]
-    special = np.nonzero(counts > mode.largest)  # few, so they are looked up one by one
-    ranges[special] = np.where(_REASON_BELOW_TOP[mode.top - counts[special]] == BEYOND, np.inf, np.nan)
-    return ranges
-
-
-def value_reasons(words, mode=0):
-    """Why values are no ranges.
-
-    Parameters
-    ----------
-    words : ndarray of uint16
-    mode : int
-
-    Returns
-    -------
-    ndarray of uint8
-        Index into `REASONS`; 0 for a range.
-    """
-    mode = mode_of(mode)
-    counts = words & np.uint16(mode.top)
-    reasons = np.zeros(counts.shape, np.uint8)
-    special = np.nonzero(counts > mode.largest)
-    reasons[special] = _REASON_BELOW_TOP[mode.top - counts[special]]
-    return reasons
+    head = word(data, offset[rows] + 5)
+    extra = length[rows] - 10 - 2 * (head & 0x3FF)
+    sound = ((extra == 0) | (extra == 2)) & (head < 1 << 15)
+    rows, head, extra, out = rows[sound], head[sound], extra[sound], []
+    for group in alike(head & 0xE3FF, extra):
+        at, head_of, indexed = offset[rows[group]], head[group], extra[group[0]] > 0
+        values, unit = int(head_of[0] & 0x3FF), UNITS[head_of[0] >> 14]
+        words, ranges = np.empty((len(at), values), np.uint16), np.empty((len(at), values))
+        for first in range(0, len(at), CHUNK):
+            some = slice(first, first + CHUNK)
+            words[some] = cut(data, at[some] + 7, 2 * values).view("<u2")
+            ranges[some] = (words[some] & np.uint16(MODES[mode].top)) * METRES[unit]
+            special, reasons = special_values(words[some], mode)
+            ranges[some][special] = np.where(reasons == BEYOND, np.inf, np.nan)
+        last = at + 7 + 2 * values + 2 * indexed
+        indices = (data[last - k].astype(int) if indexed else np.full(len(at), -1) for k in (2, 1))
+        partial = np.where(head_of >> 13 & 1, head_of >> 11 & 3, -1)
+        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices, data[last], data[at + 1]))
+    return out
 
 
 # values of a whole scan -> first bearing and step in quarters of a degree
-_GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
+GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
 
 
 def scan_quarters(values, partial=-1):
-    """Bearings of the values of a scan, in quarters of a degree.
+    """Bearings of the values of a scan in quarters of a degree, shape (values,): 0 at the right, 360 ahead; ascending.
 
-    Parameters
-    ----------
-    values : int
-        How many there are; tells the variant (angle and resolution) of the device.
-    partial : int
-        -1 for a whole scan.
-
-    Returns
-    -------
-    ndarray of int, shape (values,)
-        0 at the right, 360 ahead; ascending. The 100 deg variants begin at 40 deg.
-
-    Raises
-    ------
-    TelegramError
-        If no variant sends that many values.
+    The number of values tells the variant (angle and resolution) of the device. TelegramError if none sends that many.
     """
     if partial >= 0:
         if values != 181 - (partial > 0):
             raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
         return 4 * np.arange(values) + partial
-    if values not in _GRIDS:
-        known = ", ".join(map(str, sorted(_GRIDS)))
+    if values not in GRIDS:
+        known = ", ".join(map(str, sorted(GRIDS)))
         raise TelegramError(f"a whole scan has {known} values, got {values}: only a sub-range was asked for?")
-    first, step = _GRIDS[values]
+    first, step = GRIDS[values]
     return first + step * np.arange(values)
 
 
@@ -639,75 +515,52 @@ BAUD = {0x8067: 9600, 0x8033: 19200, 0x8019: 38400, 0x8001: 500000}
 CONFIGURATION_BYTES = 34
 
 
-@dataclass(frozen=True)
-class StatusByte:
-    """Last byte of every reply.
+def whole(raw):
+    """Bytes as a number, the least first."""
+    return int.from_bytes(raw, "little")
 
-    Attributes
-    ----------
-    severity : str
-        One of `SEVERITIES`, or 'unknown'.
-    restart_input, implausible, polluted : bool
-        Level of the RESTART input; measured values not plausible; window dirty.
-    """
 
-    severity: str
-    restart_input: bool
-    implausible: bool
-    polluted: bool
+def text(raw):
+    """Bytes as text."""
+    return raw.decode("ascii", "replace").strip(" \0")
+
+
+def unit_of(raw):
+    """'cm' or 'mm'."""
+    if raw[0] >= len(UNITS):
+        raise TelegramError(f"unit {raw[0]} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)")
+    return UNITS[raw[0]]
+
+
+def at(first, size, meaning):
+    """A value of a reply: where its bytes are (as in the manual, which counts the code as 0), and what they mean."""
+    return field(metadata={"bytes": slice(first, first + size), "meaning": meaning})
 
 
 @dataclass(frozen=True)
 class DeviceStatus:
-    """The parts of the status reply 0xB1 that a recording needs.
+    """The parts of the status reply 0xB1 that a recording needs."""
 
-    Attributes
-    ----------
-    firmware, serial : str
-    operating_mode : int
-        As of command 0x20; 0x24 streams, 0x25 waits for requests.
-    fault : int
-        0 for a sound device.
-    measuring_mode : int
-    scan_angle_deg, resolution_deg : float
-    baud : int or None
-        None for a rate that no manual lists.
-    address : int
-    unit : {'cm', 'mm'}
-    laser_on : bool
-    mirror_hz : float
-        Turns of the mirror per second; NaN where the motor does not turn.
-    """
-
-    firmware: str
-    serial: str
-    operating_mode: int
-    fault: int
-    measuring_mode: int
-    scan_angle_deg: float
-    resolution_deg: float
-    baud: int | None
-    address: int
-    unit: str
-    laser_on: bool
-    mirror_hz: float
+    firmware: str = at(1, 7, text)
+    serial: str = at(10, 8, text)
+    operating_mode: int = at(8, 1, whole)  # as of command 0x20; 0x24 streams, 0x25 waits for requests
+    fault: int = at(9, 1, whole)  # 0 for a sound device
+    measuring_mode: int = at(102, 1, whole)
+    scan_angle_deg: float = at(107, 2, lambda raw: float(whole(raw)))
+    resolution_deg: float = at(109, 2, lambda raw: whole(raw) / 100)
+    baud: int | None = at(116, 2, lambda raw: BAUD.get(whole(raw)))  # None for a rate that no manual lists
+    address: int = at(120, 1, whole)
+    unit: str = at(122, 1, unit_of)
+    laser_on: bool = at(123, 1, any)
+    # turns a second; NaN where the motor does not turn
+    mirror_hz: float = at(67, 2, lambda raw: 1e6 / (90 * whole(raw)) if any(raw) else math.nan)
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """The 34 bytes of configuration part 1 (0xF4, 0xF7, 0x77); older firmware sends fewer.
-
-    Attributes
-    ----------
-    block : bytes
-    """
+    """The 34 bytes of configuration part 1 (0xF4, 0xF7, 0x77); older firmware sends fewer."""
 
     block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
-
-    @property
-    def blanking_m(self):
-        """Ranges below are not measured, metres."""
-        return int.from_bytes(self.block[:2], "little") / 100
 
     @property
     def realtime_indices(self):
@@ -716,21 +569,16 @@ class Configuration:
 
     @property
     def measuring_mode(self):
-        """Key of `lms2xx.MODES`."""
+        """Key of `MODES`."""
         return self.block[5]
 
     @property
     def unit(self):
         """'cm' or 'mm'."""
-        return _unit_of(self.block[6])
+        return unit_of(self.block[6:])
 
     def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
-        """The same with other values; what is None stays.
-
-        Returns
-        -------
-        Configuration
-        """
+        """The same Configuration with other values; what is None stays."""
         block = bytearray(self.block)
         if realtime_indices is not None:
             block[4] = block[4] & ~2 | 2 * bool(realtime_indices)
@@ -744,24 +592,8 @@ def encode_configuration(configuration, status=0x10):
     return encode_telegram(CONFIGURATION, configuration.block, status=status)
 
 
-def parse_status_byte(status):
-    """Meaning of the last byte of a reply.
-
-    Parameters
-    ----------
-    status : int
-
-    Returns
-    -------
-    StatusByte
-    """
-    level = status & 7
-    severity = SEVERITIES[level] if level < len(SEVERITIES) else "unknown"
-    return StatusByte(severity, bool(status & 0x20), bool(status & 0x40), bool(status & 0x80))
-
-
-def _data(raw, code, shortest):
-    """Data of a telegram that must have a code and a least number of bytes."""
+def reply_data(raw, code, shortest):
+    """Data of a reply that must have a code and a least number of bytes; TelegramError otherwise."""
     telegram = parse_telegram(raw)
     if telegram.code != code:
         raise TelegramError(f"code {telegram.code:02X} is not the reply {code:02X} asked for")
@@ -770,104 +602,29 @@ def _data(raw, code, shortest):
     return telegram.data
 
 
-def _unit_of(value):
-    if value >= len(UNITS):
-        raise TelegramError(f"unit {value} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)")
-    return UNITS[value]
-
-
 def parse_status(raw):
-    """Status reply 0xB1.
-
-    Parameters
-    ----------
-    raw : bytes-like
-        The whole telegram.
-
-    Returns
-    -------
-    DeviceStatus
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another reply, or too short.
-    """
-    data = b"\xb1" + _data(raw, STATUS, 123)  # offsets as in the manual, which counts the code as 0
-    number = {at: int.from_bytes(data[at : at + 2], "little") for at in (67, 107, 109, 116)}
-    return DeviceStatus(
-        firmware=_text(data[1:8]),
-        serial=_text(data[10:18]),
-        operating_mode=data[8],
-        fault=data[9],
-        measuring_mode=data[102],
-        scan_angle_deg=float(number[107]),
-        resolution_deg=number[109] / 100,
-        baud=BAUD.get(number[116]),
-        address=data[120],
-        unit=_unit_of(data[122]),
-        laser_on=bool(data[123]),
-        mirror_hz=1e6 / (90 * number[67]) if number[67] else float("nan"),
-    )
-
-
-def _text(data):
-    return data.decode("ascii", "replace").strip(" \0")
+    """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or too short."""
+    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
+    of = {f.name: f.metadata for f in fields(DeviceStatus)}
+    return DeviceStatus(**{name: how["meaning"](data[how["bytes"]]) for name, how in of.items()})
 
 
 def parse_type(raw):
     """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063', 'V02.10')."""
-    return tuple(part.strip() for part in _text(_data(raw, TYPE, 1)).split(";"))
+    return tuple(part.strip() for part in text(reply_data(raw, TYPE, 1)).split(";"))
 
 
 def parse_errors(raw):
-    """Error reply 0xB2.
-
-    Returns
-    -------
-    list of tuple
-        Severity (one of `SEVERITIES`, 'unknown'), whether it is over, number of the error.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged or another reply.
-    """
-    data = _data(raw, ERRORS, 0)
+    """Error reply 0xB2: list of severity (one of `SEVERITIES`, 'unknown'), whether it is over, number of the error."""
+    data, words = reply_data(raw, ERRORS, 0), dict(enumerate(SEVERITIES))
     pairs = zip(data[::2], data[1::2], strict=False)
-    return [(parse_status_byte(kind).severity, kind >= 0x80, number) for kind, number in pairs]
-
-
-def parse_variant(raw):
-    """Variant reply 0xBB.
-
-    Returns
-    -------
-    accepted : bool
-    scan_angle_deg, resolution_deg : float
-        What holds now.
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another reply, or too short.
-    """
-    data = _data(raw, VARIANT, 5)
-    return bool(data[0]), float(int.from_bytes(data[1:3], "little")), int.from_bytes(data[3:5], "little") / 100
+    return [(words.get(kind & 7, "unknown"), kind >= 0x80, number) for kind, number in pairs]
 
 
 def parse_configuration(raw):
     """Configuration out of the replies 0xF4 (read) or 0xF7 (written).
 
-    Returns
-    -------
-    Configuration
-
-    Raises
-    ------
-    TelegramError
-        If it is damaged, another reply, or shorter than the measuring mode and the unit need.
+    TelegramError if it is damaged, another reply, or shorter than the measuring mode and the unit need.
     """
-    if bytes(raw[4:5]) == bytes([CONFIGURED]):
-        return Configuration(_data(raw, CONFIGURED, 8)[1:])
-    return Configuration(_data(raw, CONFIGURATION, 7))
+    written = bytes(raw[4:5]) == bytes([CONFIGURED])
+    return Configuration(reply_data(raw, CONFIGURED, 8)[1:] if written else reply_data(raw, CONFIGURATION, 7))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 import re
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
@@ -22,7 +22,6 @@ from lrfcal_lib.session.stated import (
     check_amount,
     listed,
     naming,
-    numbers,
     opened,
     parse_session,
     read_bytes,
@@ -30,7 +29,6 @@ from lrfcal_lib.session.stated import (
     read_table,
     reading,
     short,
-    whole,
 )
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
@@ -91,70 +89,48 @@ class EdgePick:
     ends: np.ndarray
 
 
-def read_scans(path, file=None):
+SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
+
+
+def read_scans(path, file):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     if file is None:
-        file = next((name for name in _READERS if os.path.lexists(path / name)), "lrf/scans.npz")
+        file = next((name for name in SOURCES if os.path.lexists(path / name)), SOURCES[0])
     target = inside(path, file, "session.json: file of the LRF")
-    if file not in _READERS:
-        raise SessionError(f"{path}: the LRF's file is one of {short(_READERS)}, got '{file}'")
-    lexists, lrf = os.path.lexists, path / "lrf"
-    if not lexists(target) and lexists(lrf) and any(PART.fullmatch(name) for name in listed(lrf, path)):
+    if file not in SOURCES:
+        raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
+    lrf, lexists = path / "lrf", os.path.lexists
+    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, listed(lrf, path))):
         raise SessionError(
             f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') completes it"
         )
-    return _READERS[file](target, path)
+    if file == "lrf/scans.npz":
+        return read_npz(target, path), None
+    scans, log = read_telegrams(target, path)
+    with naming(target):
+        return check_scans(scans), log
 
 
 def read_npz(file, within):
     """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
     if not os.path.lexists(file):
         raise SessionError(f"{file}: no such file; a session needs the scan lines")
-    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
-        with zipfile.ZipFile(stream) as archive:
-            names = [key for key in ARRAYS if f"{key}.npy" in archive.namelist()]
-            headers = {key: _header(archive, key) for key in names}
+    scans, values = {}, 0
+    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream, ZipFile(stream) as archive:
+        for key in (key for key in ARRAYS if f"{key}.npy" in archive.namelist()):
+            with archive.open(f"{key}.npy") as member:
+                old = np.lib.format.read_magic(member) == (1, 0)
+                header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+                shape, _, kind = header(member)
+            values += abs(math.prod(shape))
             with naming(file):
-                _check_headers(headers)
-            scans = {key: _unpacked(archive, key) for key in names}
+                if kind.kind not in "fiub" or kind.itemsize > 8:
+                    raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
+                check_amount(values)
+            with archive.open(f"{key}.npy") as member:
+                scans[key] = np.lib.format.read_array(member, allow_pickle=False)
     with naming(file):
         return check_scans(scans)
-
-
-def _header(archive, key):
-    """Shape and type of an array in an archive, before it is unpacked."""
-    with archive.open(f"{key}.npy") as member:
-        old = np.lib.format.read_magic(member) == (1, 0)
-        shape, _, kind = (np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0)(member)
-    return shape, kind
-
-
-def _unpacked(archive, key):
-    with archive.open(f"{key}.npy") as member:
-        return np.lib.format.read_array(member, allow_pickle=False)
-
-
-def _check_headers(headers):
-    """Refuse arrays of anything but numbers (pickles are never read), and more values than a session holds."""
-    for key, (shape, kind) in headers.items():
-        if kind.kind not in "fiub" or kind.itemsize > 8:
-            raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
-        if min(shape, default=0) < 0:
-            raise ValueError(f"{key} cannot be read: its shape is {shape}; truncated?")
-    check_amount(sum(math.prod(shape) for shape, _ in headers.values()))
-
-
-def _without_log(file, within):
-    return read_npz(file, within), None
-
-
-def _from_telegrams(file, within):
-    scans, log = read_telegrams(file, within)
-    with naming(file):
-        return check_scans(scans), log
-
-
-_READERS = {"lrf/scans.npz": _without_log, "lrf/telegrams.bin": _from_telegrams}
 
 
 def check_scans(scans):
@@ -187,48 +163,36 @@ def check_scans(scans):
         if scans[key].shape != shape:
             raise ValueError(f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}")
     scans = {key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes}
-    _check_ranges(ranges)
-    _check_angles(scans["bearings"], scans["pitch"])
-    ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
-    return {**scans, "ranges": ranges}
-
-
-def _check_ranges(ranges):
     seen = ranges[np.isfinite(ranges)]
     if seen.size == 0:
-        raise ValueError(f"no range in {ranges.shape[0]} scan lines (all NaN): nothing was recorded")
+        raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
     if np.median(seen) > LONGEST_MEDIAN_RANGE:
         raise ValueError(f"the median range is {np.median(seen):g} m: millimetres? Divide by 1000")
     if seen.min() < 0:
         raise ValueError(f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN")
-
-
-def _check_angles(bearings, pitch):
-    for name, angles, limit in (("bearing", bearings, 2 * np.pi), ("pitch", pitch, np.pi)):
+    for name, angles, limit in (("bearing", scans["bearings"], 2 * np.pi), ("pitch", scans["pitch"], np.pi)):
         if not np.isfinite(angles).all():
             raise ValueError(f"{np.sum(~np.isfinite(angles))} values of {name} are not finite")
         if np.abs(angles).max(initial=0) > limit + 1e-6:
             raise ValueError(f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians")
-    if np.any(np.diff(bearings) <= 0):
+    if np.any(np.diff(scans["bearings"]) <= 0):
         raise ValueError("bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round")
-
-
-def unfinished_of(data):
-    """Placements that session.json says are being recorded; None for a session that is not being recorded."""
-    return None if data.get("unfinished") is None else tuple(whole(p, "a placement") for p in data["unfinished"])
+    ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
+    return {**scans, "ranges": ranges}
 
 
 def missing_parts(placements, scans, records, cameras, unfinished=None):
     """What a session states and does not hold, as sentences; the rest can be used."""
-    seen = np.unique(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)])
-    out = [f"placement {p}: no scan line with a range" for p in placements if p not in seen]
+    seen = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
+    shot, unfinished = {(r.camera, r.placement) for r in records}, unfinished or ()
     again = "its recording was not finished, ignored; 'record --resume' records it again"
-    out += [f"placement {p}: {again}" for p in unfinished or ()]
-    extra = sorted(set(seen.tolist()) - set(placements) - set(unfinished or ()))
-    out += [f"placement {p}: in the scan lines but not in session.json, ignored" for p in extra]
-    shot = {(r.camera, r.placement) for r in records}
-    out += [f"placement {p}: no image of camera '{c}'" for p in placements for c in cameras if (c, p) not in shot]
-    return tuple(out)
+    extra = sorted(seen - {*placements, *unfinished})
+    return (
+        *(f"placement {p}: no scan line with a range" for p in placements if p not in seen),
+        *(f"placement {p}: {again}" for p in unfinished),
+        *(f"placement {p}: in the scan lines but not in session.json, ignored" for p in extra),
+        *(f"placement {p}: no image of camera '{c}'" for p in placements for c in cameras if (c, p) not in shot),
+    )
 
 
 def inside(path, name, where):
@@ -244,8 +208,8 @@ def read_images(path, stated, unfinished=None):
 
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
     """
-    file = path / "images.csv"
-    if not stated["cameras"] and not os.path.lexists(file):
+    file, cameras = path / "images.csv", stated["cameras"]
+    if not cameras and not os.path.lexists(file):
         return ()
     out, skipped = [], {str(p) for p in unfinished or ()}
     rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
@@ -253,39 +217,35 @@ def read_images(path, stated, unfinished=None):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
         with naming(f"{file} line {number}"):
-            out.append(_image_record(path, row, stated))
-            check_image_size(out[-1].file, image_size(out[-1].file, path), stated["cameras"][row["camera"]])
+            if row["camera"] not in cameras:
+                raise ValueError(f"no camera '{row['camera']}' in session.json, which has {short(cameras)}")
+            if row["purpose"] not in PURPOSES:
+                raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
+            placement = int(row["placement"] or -1)
+            if placement not in (*stated["placements"], -1):
+                raise ValueError(f"placement {placement} is not in session.json")
+            pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
+            target = inside(path, row["file"], "images.csv: file")
+            out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
+            check_image_size(target, image_size(target, path), cameras[row["camera"]])
     return tuple(out)
-
-
-def _image_record(path, row, stated):
-    if row["camera"] not in stated["cameras"]:
-        raise ValueError(f"no camera '{row['camera']}' in session.json, which has {short(stated['cameras'])}")
-    if row["purpose"] not in PURPOSES:
-        raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
-    placement = int(row["placement"]) if row["placement"] else -1
-    if placement not in stated["placements"] + (-1,):
-        raise ValueError(f"placement {placement} is not in session.json")
-    pitch, time = (float(row[k]) if row[k] else math.nan for k in ("pitch_deg", "t_s"))
-    target = inside(path, row["file"], "images.csv: file")
-    return ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"])
 
 
 def read_edges(path, stated, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
-    file = path / "edges.csv"
-    if not os.path.lexists(file):
-        return ()
-    known = {(r.camera, r.file): r for r in records}
-    out = []
-    for number, row in enumerate(read_table(file, EDGE_COLUMNS, path)[0], start=2):
+    file, out = path / "edges.csv", []
+    known, edges = {(r.camera, r.file) for r in records}, stated["board"].edges
+    rows = read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
+    for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
             if (row["camera"], target) not in known:
                 raise ValueError(f"images.csv has no '{row['file']}' of camera '{row['camera']}'")
-            if row["edge"] not in stated["board"].edges:
-                raise ValueError(f"edge is one of {short(stated['board'].edges)}, got '{row['edge']}'")
-            ends = numbers([float(row[k]) for k in EDGE_COLUMNS[3:]], (4,), "u1, v1, u2, v2").reshape(2, 2)
+            if row["edge"] not in edges:
+                raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
+            ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
+            if not np.isfinite(ends).all():
+                raise ValueError(f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}")
             if np.linalg.norm(ends[1] - ends[0]) < 5:
                 raise ValueError(f"the two pixels {ends.tolist()} are too close for a direction: pick them far apart")
             out.append(EdgePick(row["camera"], target, row["edge"], ends))
@@ -316,27 +276,23 @@ def image_size(file, within=None):
 def size_in_header(file, data):
     """Width and height of an image of which the bytes are known, see :func:`image_size`."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
-        size, complete = (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), b"IEND" in data[-16:]
+        header, complete = data[16:24], b"IEND" in data[-16:]
+        size = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")
     elif data[:2] == b"\xff\xd8":
-        size, complete = _jpeg_size(data), b"\xff\xd9" in data[-64:]
+        at, size, complete = 2, None, b"\xff\xd9" in data[-64:]
+        # what is no segment ends the walk: a decoder would go on looking, and find another header than we do
+        while size is None and at + 9 <= len(data) and data[at] == 0xFF and 0xC0 <= data[at + 1] < 0xFF:
+            marker = data[at + 1]
+            if 0xD0 <= marker <= 0xD9:
+                break
+            if marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # the frame header
+                size = int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     else:
         raise SessionError(f"{file}: neither PNG nor JPEG; convert the image")
     if size is None or not complete:
         raise SessionError(f"{file}: the image is truncated after {len(data)} bytes; restore it or remove its row")
     return size
-
-
-def _jpeg_size(data):
-    """Walk the segments of a JPEG file to the frame header, which holds the size; None where it is missing."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker < 0xC0 or 0xD0 <= marker <= 0xD9 or marker == 0xFF:
-            return None  # no segment: a decoder would go on looking, and find another header than we do
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-        at += 2 + length
-    return None
 
 
 def check_image_size(file, size, camera):
@@ -563,7 +519,7 @@ def open_session(path):
         raise SessionError(f"{path / 'session.json'}: schema is {data.get('schema')!r}, this version reads '{SCHEMA}'")
     with naming(path / "session.json"):
         stated = parse_session(data)
-        unfinished = unfinished_of(data)
+        unfinished = stated.pop("unfinished")
         scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
     records = read_images(path, stated, unfinished)
     picks = read_edges(path, stated, records)

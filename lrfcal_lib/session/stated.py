@@ -14,9 +14,13 @@ import stat
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import pydantic
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, PlainSerializer
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
@@ -134,7 +138,16 @@ def _refuse_other(file, status, kind, wanted):
 @contextmanager
 def alone(path):
     """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
-    with _locked(Path(path)) as stream:
+    with opened(Path(path) / LOCK, path, os.O_RDWR | os.O_CREAT) as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = stream.read(200).decode(errors="replace") or "another process"
+            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+        if not os.fstat(stream.fileno()).st_nlink:  # who held it has removed it meanwhile
+            with alone(path):
+                yield
+            return
         stream.truncate()
         stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
         stream.flush()
@@ -143,24 +156,6 @@ def alone(path):
         finally:
             with suppress(OSError), folder(Path(path) / LOCK, path) as handle:  # gone with its session?
                 os.unlink(LOCK, dir_fd=handle)
-
-
-def _locked(path):
-    """The lock file, locked; who removes one holds its lock, so one that was removed meanwhile is opened anew."""
-    while True:
-        stream = opened(path / LOCK, path, os.O_RDWR | os.O_CREAT)
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            with stream:
-                holder = stream.read(200).decode(errors="replace") or "another process"
-            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
-        except BaseException:
-            stream.close()
-            raise
-        if os.fstat(stream.fileno()).st_nlink:
-            return stream
-        stream.close()
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
@@ -253,12 +248,11 @@ def short(values):
 
 
 SCHEMA = "lrfcal-session/1"
-MOUNTS = ("head", "platform")
-LARGEST_WHOLE = 1_000_000  # placements and the like
 LARGEST_IMAGE = 30_000_000  # pixels
 MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
-LONGEST_LEVER = 10.0  # metres between the parts of a rig
+MOST_CAMERAS = 100
+MILLIMETRES = "millimetres? Divide by 1000"
 # metres, by part of the model's name: systematic error of a range up to 10 m according to SICK (technical description
 # of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors LMSxxx"; data sheet of TiM55x and TiM56x)
 SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS5": 0.025, "TiM5": 0.060}
@@ -266,6 +260,183 @@ SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0
 # deviations or steps of a range; the sheets above admit 2 to 4.2, and 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
+
+
+def in_words(error):
+    """The first mistake that pydantic found: where, value, what is needed."""
+    first = error.errors(include_url=False)[0]
+    where, kind, value = ".".join(map(str, first["loc"])), first["type"], ascii(first["input"])
+    if kind == "missing":
+        return f"{where} is missing"
+    found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
+    if kind == "value_error":
+        return f"{found}: {first['ctx']['error']}"
+    needed = "an object" if kind in ("model_type", "dataclass_type") else first["msg"].removeprefix("Input should be ")
+    large = kind.startswith("less_than") and re.search(r"_m\b", where)  # the key tells the unit
+    return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
+
+
+adapter = lru_cache(pydantic.TypeAdapter)
+
+
+def from_json(kind, data):
+    """What is stated in JSON as one of the types below; ValueError in words for anything else."""
+    try:
+        return adapter(kind).validate_python(data)
+    except pydantic.ValidationError as error:
+        raise ValueError(in_words(error)) from None
+
+
+def refused(wrong, words):
+    """A check that raises ValueError with these words where a value is wrong."""
+
+    def check(value):
+        if wrong(value):
+            raise ValueError(words)
+        return value
+
+    return AfterValidator(check)
+
+
+NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
+TWICE = "placements are different numbers"
+NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
+Name = Annotated[str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)]
+EdgeName = Annotated[str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)]
+Whole = Annotated[int, Field(ge=0, le=1_000_000)]
+Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
+Positive, Length = Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0, le=1)]
+Angle = Annotated[FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))]
+Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
+Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
+
+
+class TransformStated(BaseModel):
+    """A transform as it stands in a file."""
+
+    rotation_vector_rad: Triple
+    translation_m: tuple[(Annotated[FiniteFloat, Field(ge=-10, le=10)],) * 3]
+
+    def made(self):
+        """As a RigidTransform."""
+        return RigidTransform.from_components(self.translation_m, Rotation.from_rotvec(self.rotation_vector_rad))
+
+
+def transform_to_json(transform):
+    """A RigidTransform (or None) as rotation vector and translation."""
+    if transform is None:
+        return None
+    turn, shift = transform.rotation.as_rotvec().tolist(), transform.translation.tolist()
+    return {"rotation_vector_rad": turn, "translation_m": shift}
+
+
+def transform_from_json(data):
+    """Inverse of :func:`transform_to_json`; ValueError for a wrong one."""
+    return None if data is None else from_json(TransformStated, data).made()
+
+
+Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
+
+
+class LensStated(BaseModel):
+    """Intrinsics as they stand in a file."""
+
+    fx: Positive
+    fy: Positive
+    cx: FiniteFloat
+    cy: FiniteFloat
+    distortion: Lens
+    covariance: tuple[(Row,) * 9] | None = None
+    rms_px: FiniteFloat | None = None
+
+    def made(self, width, height):
+        """As a CameraModel."""
+        covariance = None if self.covariance is None else np.array(self.covariance)
+        pinhole = self.fx, self.fy, self.cx, self.cy
+        return CameraModel(width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px)
+
+
+def model_to_json(model):
+    """Intrinsics (or None) as they stand in session.json."""
+    if model is None:
+        return None
+    out = {k: float(getattr(model, k)) for k in ("fx", "fy", "cx", "cy")}
+    out["distortion"] = np.asarray(model.distortion, float).tolist()
+    out["covariance"] = None if model.covariance is None else np.asarray(model.covariance).tolist()
+    return {**out, "rms_px": model.rms_px}
+
+
+class PatternStated(BaseModel):
+    """A chessboard as it stands in a file."""
+
+    kind: Literal["chessboard"]
+    columns: Inner
+    rows: Inner
+    square_m: Length
+    origin_m: Pair = (0.0, 0.0)
+
+    def made(self):
+        """As a Chessboard."""
+        if self.columns * self.rows > MOST_CORNERS:
+            raise ValueError(f"a chessboard has up to {MOST_CORNERS} inner corners in all")
+        return Chessboard(self.columns, self.rows, self.square_m, self.origin_m)
+
+
+class BoardStated(BaseModel):
+    """A board as it stands in a file."""
+
+    name: str
+    edges: Annotated[tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)]
+    features: tuple[str, str]
+    corners_m: Annotated[tuple[Pair, ...], Field(fail_fast=True)] | None
+    pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
+
+    def made(self):
+        """As a Board."""
+        corners = None if self.corners_m is None else np.array(self.corners_m)
+        if len(set(self.edges)) < len(self.edges):
+            raise ValueError("the edges need different names")
+        if not set(self.features) <= set(self.edges):
+            raise ValueError(f"features are two of the edges {short(self.edges)}, got {short(self.features)}")
+        if corners is not None and len(corners) != len(self.edges):
+            raise ValueError(f"corners_m must be one corner for each of {len(self.edges)} edges, got {len(corners)}")
+        if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:
+            raise ValueError(f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}")
+        return Board(self.name, self.edges, corners, self.pattern, self.features)
+
+
+def board_to_json(board):
+    """A board as it stands in session.json."""
+    p, pattern = board.pattern, None
+    if p is not None:
+        pattern = {"kind": "chessboard", "columns": p.columns, "rows": p.rows, "square_m": p.square}
+        pattern["origin_m"] = list(p.origin)
+    corners = None if board.corners is None else np.asarray(board.corners).tolist()
+    named = {"name": board.name, "edges": list(board.edges), "features": list(board.features)}
+    return {**named, "corners_m": corners, "pattern": pattern}
+
+
+def board_from_json(data):
+    """Inverse of :func:`board_to_json`; ValueError for a wrong one."""
+    return from_json(BoardStated, data).made()
+
+
+StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
+
+
+VIEW = "two ascending bearings within a turn are needed"
+
+
+def _turned(view):
+    return not view[0] < view[1] <= view[0] + 2 * math.pi + 1e-9
+
+
+Endless = Annotated[
+    float,  # null in the file where there is no limit
+    BeforeValidator(lambda metres: math.inf if metres is None else metres),
+    Field(gt=0),
+    PlainSerializer(lambda metres: metres if math.isfinite(metres) else None),
+]
 
 
 @dataclass(frozen=True)
@@ -279,31 +450,28 @@ class LrfInfo:
         First and last bearing it can measure, radians (0 right, pi/2 ahead).
     bearing_step : float
         Radians between neighbouring beams.
-    sigma_range : float
-        Standard deviation of a range, metres.
-    sigma_bearing : float
-        Standard deviation of a bearing, radians; 0 where unknown.
+    sigma_range, sigma_bearing : float
+        Standard deviations of a range, metres, and of a bearing, radians (0 where unknown).
     range_resolution : float
         Step of the recorded ranges, metres.
     max_range : float
         Metres.
-    spot : tuple of float, or None
-        Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet;
-        None where unknown.
+    spot_exit, spot_divergence : float or None
+        Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet.
     systematic_error : float or None
-        Largest offset of all ranges that the maker admits, metres; None where not stated: then the one of the model, or
-        five standard deviations of a range.
+        Largest offset of all ranges that the maker admits, metres.
     """
 
     model: str
-    field_of_view: tuple[float, float]
-    bearing_step: float
-    sigma_range: float
-    sigma_bearing: float = 0.0
-    range_resolution: float = 0.001
-    max_range: float = math.inf
-    spot: tuple[float, float] | None = None
-    systematic_error: float | None = None
+    field_of_view: Annotated[tuple[Angle, Angle], refused(_turned, VIEW), Field(alias="field_of_view_deg")]
+    bearing_step: Annotated[Step, Field(alias="bearing_step_deg")]
+    sigma_range: Annotated[Length, Field(alias="sigma_range_m")]
+    sigma_bearing: Annotated[Angle, Field(alias="sigma_bearing_deg")] = 0.0
+    range_resolution: Annotated[FiniteFloat, Field(alias="range_resolution_m")] = 0.001
+    max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
+    systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
+    spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = None
+    spot_divergence: Annotated[FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)] = None
 
     @property
     def admitted_offset(self):
@@ -315,8 +483,24 @@ class LrfInfo:
 
     def spot_radius(self, distance):
         """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not stated."""
-        exit_diameter, divergence = self.spot or (2 * ASSUMED_SPOT_RADIUS, 0.0)
-        return (exit_diameter + divergence * np.asarray(distance, float)) / 2
+        if self.spot_exit is None:
+            return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
+        return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
+
+
+def lrf_to_json(lrf):
+    """An LrfInfo as it stands in session.json (degrees there)."""
+    return adapter(LrfInfo).dump_python(lrf, by_alias=True, exclude_none=True)
+
+
+def _few_pixels(height, info):
+    if height * info.data.get("width", 0) > LARGEST_IMAGE:
+        raise ValueError(f"at most {LARGEST_IMAGE} pixels are needed in all")
+    return height
+
+
+def _lens(lens, info):
+    return lens and lens.made(info.data.get("width"), info.data.get("height"))
 
 
 @dataclass(frozen=True)
@@ -336,234 +520,62 @@ class CameraInfo:
         Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
     """
 
-    name: str
-    mount: str
-    width: int
-    height: int
-    model: CameraModel | None = None
-    guess: RigidTransform | None = None
-
-
-def parse_session(data):
-    """The statements of session.json as fields of a Session; KeyError, TypeError or ValueError for a wrong one."""
-    rig = data["rig"]
-    placements = tuple(whole(p, "a placement") for p in data["placements"])
-    if len(set(placements)) != len(placements) or min(placements, default=0) < 0:
-        raise ValueError(f"placements are different numbers from 0 on, got {short(placements)}")
-    return {
-        "name": plain_name(data["name"], "name of the session"),
-        "licence": str(data["licence"]),
-        "source": str(data["source"]),
-        "simulated": bool(data["simulated"]),
-        "board": board_from_json(data["board"]),
-        "lrf": lrf_from_json(rig["lrf"]),
-        "T_head_lrf": transform_from_json(rig["platform"]["T_head_lrf"]),
-        "platform_sigma": platform_sigma_from_json(rig["platform"]),
-        "cameras": {name: camera_from_json(name, c) for name, c in rig["cameras"].items()},
-        "placements": placements,
-        "reference": dict(data.get("reference", {})),
-    }
-
-
-def platform_sigma_from_json(data):
-    """How well the stated platform is known: standard deviations of direction (radians) and offset (metres)."""
-    direction = math.radians(_positive(data.get("sigma_direction_deg", 0.5), "sigma_direction_deg"))
-    offset = _positive(data.get("sigma_offset_m", 0.010), "sigma_offset_m")
-    if offset > 1:
-        raise ValueError(f"sigma_offset_m is {offset:g}: millimetres? Divide by 1000")
-    return direction, offset
-
-
-def platform_to_json(T_head_lrf, sigma=None):
-    """The stated platform as it stands in session.json; `sigma` as in :func:`platform_sigma_from_json`."""
-    stated = {"T_head_lrf": transform_to_json(T_head_lrf)}
-    if sigma is None:
-        return stated
-    return stated | {"sigma_direction_deg": round(math.degrees(sigma[0]), 9), "sigma_offset_m": sigma[1]}
-
-
-def plain_name(name, what):
-    """A name that is safe as a file name."""
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise ValueError(f"the {what} becomes a file name: letters, digits, '_', '-' and '.' only, got {name!r}")
-    return name
-
-
-def numbers(values, shape, what):
-    """Finite numbers of a given shape."""
-    out = np.asarray(values, float)
-    if out.shape != shape or not np.isfinite(out).all():
-        raise ValueError(f"{what} must be {' x '.join(map(str, shape)) or 'one'} finite numbers, got {values!r}")
-    return out
-
-
-def whole(value, what):
-    """A whole number, as an int."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST_WHOLE or value % 1:
-        raise ValueError(f"{what} is a whole number up to {LARGEST_WHOLE}, got {value!r}")
-    return int(value)
-
-
-def _positive(value, what):
-    value = float(numbers(value, (), what))
-    if value <= 0:
-        raise ValueError(f"{what} must be positive, got {value}")
-    return value
-
-
-def transform_to_json(transform):
-    """A RigidTransform (or None) as rotation vector and translation."""
-    if transform is None:
-        return None
-    return {
-        "rotation_vector_rad": transform.rotation.as_rotvec().tolist(),
-        "translation_m": transform.translation.tolist(),
-    }
-
-
-def transform_from_json(data):
-    """Inverse of :func:`transform_to_json`."""
-    if data is None:
-        return None
-    shift = numbers(data["translation_m"], (3,), "translation_m")
-    if np.abs(shift).max() > LONGEST_LEVER:
-        raise ValueError(f"translation_m is {shift.tolist()}: millimetres? Divide by 1000")
-    rotation = Rotation.from_rotvec(numbers(data["rotation_vector_rad"], (3,), "rotation_vector_rad"))
-    return RigidTransform.from_components(shift, rotation)
-
-
-def board_to_json(board):
-    """A board as it stands in session.json."""
-    pattern = None
-    if board.pattern is not None:
-        p = board.pattern
-        pattern = {"kind": "chessboard", "columns": p.columns, "rows": p.rows, "square_m": p.square}
-        pattern["origin_m"] = list(p.origin)
-    corners = None if board.corners is None else np.asarray(board.corners).tolist()
-    named = {"name": board.name, "edges": list(board.edges), "features": list(board.features)}
-    return {**named, "corners_m": corners, "pattern": pattern}
-
-
-def board_from_json(data):
-    """Inverse of :func:`board_to_json`; refuses a board larger than 20 m."""
-    edges = tuple(str(e) for e in data["edges"])
-    features = tuple(str(f) for f in data["features"])
-    if not 3 <= len(edges) <= MOST_CORNERS or len(set(edges)) != len(edges):
-        raise ValueError(f"a board needs three or more edges with different names, got {short(edges)}")
-    odd = [repr(e) for e in edges if "$" in e or not e.isprintable()]
-    if odd:
-        raise ValueError(f"names of edges stand in figures: no line ends, no '$' (a formula), got {short(odd)}")
-    if len(features) != 2 or not set(features) <= set(edges):
-        raise ValueError(f"features are two of the edges {short(edges)}, got {short(features)}")
-    corners = data["corners_m"]
-    if corners is not None:
-        corners = numbers(corners, (len(edges), 2), "corners_m")
-        if np.ptp(corners, axis=0).max() > LONGEST_BOARD:
-            raise ValueError(f"the board is {np.ptp(corners, axis=0).max():g} m large: millimetres? Divide by 1000")
-    return Board(str(data["name"]), edges, corners, _pattern_from_json(data["pattern"]), features)
-
-
-def _pattern_from_json(data):
-    if data is None:
-        return None
-    if data["kind"] != "chessboard":
-        raise ValueError(f"pattern kind is 'chessboard', got {data['kind']!r}")
-    square = _positive(data["square_m"], "square_m")
-    if square > 1:
-        raise ValueError(f"square_m is {square:g}: millimetres? Divide by 1000")
-    columns, rows = whole(data["columns"], "columns"), whole(data["rows"], "rows")
-    if min(columns, rows) < 3 or columns * rows > MOST_CORNERS:
-        corners = f"three or more inner corners each way, up to {MOST_CORNERS} in all"
-        raise ValueError(f"a chessboard needs {corners}, got {columns} x {rows}")
-    return Chessboard(columns, rows, square, tuple(numbers(data.get("origin_m", (0, 0)), (2,), "origin_m").tolist()))
-
-
-def lrf_to_json(lrf):
-    """An LrfInfo as it stands in session.json (degrees there)."""
-    return {
-        "model": lrf.model,
-        "field_of_view_deg": np.round(np.degrees(lrf.field_of_view), 9).tolist(),
-        "bearing_step_deg": round(math.degrees(lrf.bearing_step), 9),
-        "sigma_range_m": lrf.sigma_range,
-        "sigma_bearing_deg": round(math.degrees(lrf.sigma_bearing), 9),
-        "range_resolution_m": lrf.range_resolution,
-        "max_range_m": lrf.max_range if math.isfinite(lrf.max_range) else None,
-        **({} if lrf.systematic_error is None else {"systematic_error_m": lrf.systematic_error}),
-        **({} if lrf.spot is None else {"spot_exit_m": lrf.spot[0], "spot_divergence_rad": lrf.spot[1]}),
-    }
-
-
-def lrf_from_json(data):
-    """Inverse of :func:`lrf_to_json`."""
-    first, last = np.radians(numbers(data["field_of_view_deg"], (2,), "field_of_view_deg"))
-    if not first < last <= first + 2 * np.pi + 1e-9:
-        raise ValueError(f"field_of_view_deg is two ascending bearings, got {data['field_of_view_deg']}")
-    sigma = _positive(data["sigma_range_m"], "sigma_range_m")
-    if sigma > 1:
-        raise ValueError(f"sigma_range_m is {sigma:g}: millimetres? Divide by 1000")
-    longest, admitted = data.get("max_range_m"), data.get("systematic_error_m")
-    return LrfInfo(
-        model=str(data["model"]),
-        field_of_view=(float(first), float(last)),
-        bearing_step=math.radians(_positive(data["bearing_step_deg"], "bearing_step_deg")),
-        sigma_range=sigma,
-        sigma_bearing=math.radians(float(numbers(data.get("sigma_bearing_deg", 0.0), (), "sigma_bearing_deg"))),
-        range_resolution=float(numbers(data.get("range_resolution_m", 0.001), (), "range_resolution_m")),
-        max_range=math.inf if longest is None else _positive(longest, "max_range_m"),
-        spot=_spot(data),
-        systematic_error=None if admitted is None else _positive(admitted, "systematic_error_m"),
-    )
-
-
-def _spot(data):
-    """Stated size of the spot, None where it is left out."""
-    if "spot_exit_m" not in data:
-        return None
-    exit_diameter = _positive(data["spot_exit_m"], "spot_exit_m")
-    divergence = float(numbers(data.get("spot_divergence_rad", 0.0), (), "spot_divergence_rad"))
-    if exit_diameter > 0.2 or not 0 <= divergence < 0.2:
-        raise ValueError(f"a spot of {exit_diameter:g} m growing by {divergence:g} rad: millimetres? Divide by 1000")
-    return exit_diameter, divergence
-
-
-def model_to_json(model):
-    """Intrinsics (or None) as they stand in session.json."""
-    if model is None:
-        return None
-    out = {k: float(getattr(model, k)) for k in ("fx", "fy", "cx", "cy")}
-    out["distortion"] = np.asarray(model.distortion, float).tolist()
-    out["covariance"] = None if model.covariance is None else np.asarray(model.covariance).tolist()
-    return {**out, "rms_px": model.rms_px}
-
-
-def model_from_json(data, width, height):
-    """Inverse of :func:`model_to_json`."""
-    if data is None:
-        return None
-    focal = [_positive(data[k], k) for k in ("fx", "fy")]
-    centre = [float(numbers(data[k], (), k)) for k in ("cx", "cy")]
-    covariance = data.get("covariance")
-    if covariance is not None:
-        covariance = numbers(covariance, (9, 9), "covariance")
-    rms = data.get("rms_px")
-    distortion = numbers(data["distortion"], (5,), "distortion")
-    return CameraModel(width, height, *focal, *centre, distortion, covariance, None if rms is None else float(rms))
+    name: Annotated[Name, Field(exclude=True)]  # the key of the object in the file
+    mount: Literal["head", "platform"]
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
+    model: Annotated[
+        LensStated | None, AfterValidator(_lens), PlainSerializer(model_to_json), Field(alias="intrinsics")
+    ] = None
+    guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
 def camera_to_json(camera):
     """A CameraInfo as it stands in session.json."""
-    out = {"mount": camera.mount, "width": camera.width, "height": camera.height}
-    return {**out, "intrinsics": model_to_json(camera.model), "guess": transform_to_json(camera.guess)}
+    return adapter(CameraInfo).dump_python(camera, by_alias=True)
 
 
-def camera_from_json(name, data):
-    """Inverse of :func:`camera_to_json`."""
-    plain_name(name, "name of a camera")
-    if data["mount"] not in MOUNTS:
-        raise ValueError(f"camera '{name}': mount is one of {short(MOUNTS)}, got {data['mount']!r}")
-    width, height = whole(data["width"], "width"), whole(data["height"], "height")
-    if min(width, height) < 1 or width * height > LARGEST_IMAGE:
-        limit = f"at most {LARGEST_IMAGE} pixels in all"
-        raise ValueError(f"camera '{name}': width and height must be positive, {limit}, got {width} x {height}")
-    model = model_from_json(data["intrinsics"], width, height)
-    return CameraInfo(name, data["mount"], width, height, model, transform_from_json(data.get("guess")))
+def _with_names(cameras):
+    if not isinstance(cameras, dict) or len(cameras) > MOST_CAMERAS:
+        raise ValueError(f"an object of at most {MOST_CAMERAS} cameras is needed")
+    return {name: camera | {"name": name} if isinstance(camera, dict) else camera for name, camera in cameras.items()}
+
+
+class PlatformStated(BaseModel):
+    """The platform and how well it is known as they stand in a file."""
+
+    T_head_lrf: Transform
+    sigma_direction: Annotated[Step, Field(alias="sigma_direction_deg")] = math.radians(0.5)
+    sigma_offset: Annotated[Length, Field(alias="sigma_offset_m")] = 0.010
+
+
+class RigStated(BaseModel):
+    """The devices as they stand in a file."""
+
+    lrf: LrfInfo
+    platform: PlatformStated
+    cameras: Annotated[dict[str, CameraInfo], BeforeValidator(_with_names)]
+
+
+class SessionStated(BaseModel):
+    """All of session.json."""
+
+    name: Name
+    licence: str
+    source: str
+    simulated: bool
+    board: StatedBoard
+    rig: RigStated
+    placements: Annotated[tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)]
+    reference: dict = {}
+    unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
+
+
+def parse_session(data):
+    """The statements of session.json as fields of a Session; ValueError for a wrong one."""
+    found = from_json(SessionStated, data)
+    rig, platform = found.rig, found.rig.platform
+    names = ("name", "licence", "source", "simulated", "board", "placements", "reference", "unfinished")
+    plain = {name: getattr(found, name) for name in names}
+    devices = {"lrf": rig.lrf, "T_head_lrf": platform.T_head_lrf, "cameras": rig.cameras}
+    return plain | devices | {"platform_sigma": (platform.sigma_direction, platform.sigma_offset)}

@@ -11,37 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lrfcal_lib.session.read import (
-    DROPPED,
-    IMAGE_COLUMNS,
-    PART,
-    PLATFORM_COLUMNS,
-    PURPOSES,
-    check_image_size,
-    check_scans,
-    image_size,
-    read_npz,
-    unfinished_of,
-)
-from lrfcal_lib.session.stated import (
-    LOCK,
-    SCHEMA,
-    SessionError,
-    alone,
-    board_to_json,
-    camera_to_json,
-    folder,
-    listed,
-    lrf_to_json,
-    naming,
-    opened,
-    parse_session,
-    platform_to_json,
-    read_bytes,
-    read_json,
-    read_table,
-    short,
-)
+from lrfcal_lib.session import read, stated
+from lrfcal_lib.session.stated import SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 
@@ -60,15 +31,14 @@ class SessionWriter:
     lrf : LrfInfo
     cameras : iterable of CameraInfo
     T_head_lrf : RigidTransform, optional
-    platform_sigma : tuple of float, optional
-        How well it is known: direction (radians) and offset (metres).
     name : str, optional
         The folder's name by default.
-    licence, source : str
-    simulated : bool
-    reference : dict, optional
+    platform_sigma : tuple of float, optional
+        How well `T_head_lrf` is known: direction (radians) and offset (metres).
     placements : iterable of int
         Placements known beforehand; those of added sweeps and images are added.
+    licence, source, simulated, reference
+        See :class:`lrfcal_lib.session.read.Session`.
 
     Raises
     ------
@@ -88,33 +58,39 @@ class SessionWriter:
         self.cameras = {camera.name: camera for camera in cameras}
         self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
-        data = {"schema": SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source}
-        rig = {"lrf": lrf_to_json(lrf), "platform": platform_to_json(T_head_lrf, platform_sigma)}
-        rig["cameras"] = {c.name: camera_to_json(c) for c in self.cameras.values()}
-        data |= {"simulated": simulated, "board": board_to_json(board), "rig": rig}
-        self.data = {**data, "placements": [int(p) for p in placements], "reference": reference or {}}
+        platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
+        if platform_sigma is not None:
+            platform["sigma_direction_deg"] = round(math.degrees(platform_sigma[0]), 9)
+            platform["sigma_offset_m"] = platform_sigma[1]
+        self.data = {
+            "schema": stated.SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source,
+            "simulated": simulated, "board": stated.board_to_json(board),
+            "rig": {"lrf": stated.lrf_to_json(lrf), "platform": platform,
+                    "cameras": {c.name: stated.camera_to_json(c) for c in self.cameras.values()}},
+            "placements": [int(p) for p in placements], "reference": reference or {},
+        }  # fmt: skip
         with naming(self.path):
-            parse_session(json.loads(json.dumps(self.data)))
+            stated.parse_session(json.loads(json.dumps(self.data)))
         if self.path.exists() and not self.path.is_dir():
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self.path.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            stack.enter_context(alone(self.path))
+            stack.enter_context(stated.alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
     def _create(self):
-        if set(os.listdir(self.path)) - {LOCK}:
+        if set(os.listdir(self.path)) - {stated.LOCK}:
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self._make_folders()
         self._write_index()
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            with folder(self.path / name / "any", self.path, make=True):
+            with stated.folder(self.path / name / "any", self.path, make=True):
                 pass
-        if self.cameras and not os.path.lexists(self.path / "images.csv"):
-            self._write("images.csv", ",".join(IMAGE_COLUMNS) + "\n")
+        if self.cameras:
+            self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
     def __enter__(self):
         return self
@@ -133,6 +109,13 @@ class SessionWriter:
 
     def _write_index(self):
         self._write("session.json", json.dumps(self.data, indent=1) + "\n")
+
+    def _begin_table(self, name, columns):
+        if not os.path.lexists(self.path / name):
+            self._write(name, ",".join(columns) + "\n")
+
+    def _append_rows(self, name, rows):
+        append_file(self.path / name, "".join(",".join(map(str, row)) + "\n" for row in rows), self.path)
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
@@ -162,12 +145,11 @@ class SessionWriter:
         if self.telegrams.exists():
             raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
         ranges, bearings = np.array(ranges, float, ndmin=2), np.asarray(bearings, float)
-        time_s = np.full(len(ranges), np.nan) if time_s is None else np.asarray(time_s, float)
-        scans = {"ranges": ranges, "bearings": bearings, "pitch": np.asarray(pitch, float), "time_s": time_s}
-        scans |= {"placement": np.full(len(ranges), placement)}
-        scans |= {} if intensities is None else {"intensities": np.asarray(intensities, float)}
+        time_s = np.full(len(ranges), np.nan) if time_s is None else time_s
+        scans = {"ranges": ranges, "bearings": bearings, "pitch": pitch, "time_s": time_s, "intensities": intensities}
+        scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
         with naming(f"{self.path}: placement {placement}"):
-            scans = check_scans(scans)
+            scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
         self.bearings, self.parts = bearings, self.parts + 1
@@ -180,10 +162,9 @@ class SessionWriter:
         Parameters
         ----------
         placement : int
-            -1 for telegrams of no placement, such as the configuration (0xF4) or status (0xB1) reply with which a
-            recording should begin: it states the measuring mode, which a scan does not tell.
+            -1 for none: replies that are no scans, scans between the sweeps.
         telegrams : sequence of bytes
-            One telegram each, from its start byte to its CRC, also damaged ones.
+            Whole telegrams in the order they came, also damaged ones.
         pitch : float or array_like, shape (len(telegrams),)
             Radians.
         time_s : float or array_like, shape (len(telegrams),)
@@ -195,22 +176,25 @@ class SessionWriter:
             that has scan lines already.
         """
         with naming(f"{self.path}: placement {placement}"):
-            telegrams = _checked_telegrams(telegrams)
+            if isinstance(telegrams, bytes | bytearray):
+                raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
+            telegrams = [bytes(raw) for raw in telegrams]
+            lengths = [len(raw) for raw in telegrams]
+            if min(lengths, default=0) < 7:
+                got = short(sorted(set(lengths)))
+                raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {got}")
             pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
             if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
-        index = self.telegrams.with_name("index.csv")
-        if not os.path.lexists(index):
-            self._write("lrf/index.csv", ",".join(INDEX_COLUMNS) + "\n")
+        self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
-        rows = []
-        for raw, angle, time in zip(telegrams, np.degrees(pitch), time_s, strict=True):
-            rows.append([cell(time), offset, len(raw), "" if placement < 0 else placement, cell(angle)])
-            offset += len(raw)
-        append_file(index, "".join(",".join(map(str, row)) + "\n" for row in rows), self.path)
+        offsets, number = offset + np.cumsum([0, *lengths[:-1]]), "" if placement < 0 else placement
+        columns = map(cell, time_s), offsets, lengths, map(cell, np.degrees(pitch))
+        rows = [(time, at, length, number, angle) for time, at, length, angle in zip(*columns, strict=True)]
+        self._append_rows("lrf/index.csv", rows)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
         """Append an image.
@@ -232,19 +216,18 @@ class SessionWriter:
         SessionError
             For an unknown camera or purpose, or an image of another size than the camera's.
         """
-        if camera not in self.cameras or purpose not in PURPOSES:
-            known = f"cameras are {short(self.cameras)}, purposes {short(PURPOSES)}"
+        if camera not in self.cameras or purpose not in read.PURPOSES:
+            known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
         pixels = isinstance(image, np.ndarray)
-        size = image.shape[1::-1] if pixels else image_size(image)
-        check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
+        size = image.shape[1::-1] if pixels else read.image_size(image)
+        read.check_image_size(f"camera '{camera}'" if pixels else image, size, self.cameras[camera])
         self.shots[camera] += 1
-        suffix = ".png" if pixels else Path(image).suffix.lower()
-        name = f"images/{camera}/{self.shots[camera]:04d}{suffix}"
-        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else read_bytes(image))
+        name = f"images/{camera}/{self.shots[camera]:04d}{'.png' if pixels else Path(image).suffix.lower()}"
+        self._write(name, cv2.imencode(".png", image)[1].tobytes() if pixels else stated.read_bytes(image))
         self._note_placement(placement)
-        cells = [cell(time_s), camera, name, "" if placement < 0 else placement, cell(math.degrees(pitch)), purpose]
-        append_file(self.path / "images.csv", ",".join(map(str, cells)) + "\n", self.path)
+        number = "" if placement < 0 else placement
+        self._append_rows("images.csv", [[cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]])
 
 
 def finish(path):
@@ -262,7 +245,7 @@ def finish(path):
         If there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
-        with alone(path):
+        with stated.alone(path):
             complete(Path(path))
     except FileNotFoundError as error:
         raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
@@ -273,13 +256,13 @@ def complete(path):
     mend_tables(path)
     if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    parts = [path / "lrf" / name for name in listed(path / "lrf", path) if PART.fullmatch(name)]
+    parts = [path / "lrf" / name for name in stated.listed(path / "lrf", path) if read.PART.fullmatch(name)]
     if not parts:
         raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
-    sweeps = [read_npz(part, path) for part in parts]
+    sweeps = [read.read_npz(part, path) for part in parts]
     shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
     scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
-    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, compress=True)
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, np.savez_compressed)
     for part in parts:
         part.unlink()
 
@@ -287,18 +270,8 @@ def complete(path):
 def mend_tables(path):
     """Remove rows that a crash cut off at the end of a session's tables."""
     for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
-        if os.path.lexists(table) and not (data := read_bytes(table, path)).endswith(b"\n"):
+        if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
             write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
-
-
-def _checked_telegrams(telegrams):
-    if isinstance(telegrams, bytes | bytearray):
-        raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
-    telegrams = [bytes(raw) for raw in telegrams]
-    if not telegrams or min(map(len, telegrams)) < 7:
-        lengths = short(sorted({len(raw) for raw in telegrams}))
-        raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {lengths}")
-    return telegrams
 
 
 def cell(value):
@@ -306,15 +279,15 @@ def cell(value):
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
-def write_file(file, content, within, compress=False):
-    """Write a file of a session so that it is complete or not there: under another name, fsync, rename."""
+def write_file(file, content, within, save=np.savez):
+    """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
     draft = file.with_name(file.name + ".draft")
-    with folder(file, within) as inside:
+    with stated.folder(file, within) as inside:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(draft.name, dir_fd=inside)
-        with opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+        with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
             if isinstance(content, dict):
-                (np.savez_compressed if compress else np.savez)(stream, **content)
+                save(stream, **content)
             else:
                 stream.write(content.encode() if isinstance(content, str) else content)
             stream.flush()
@@ -326,7 +299,7 @@ def write_file(file, content, within, compress=False):
 def append_file(file, content, within):
     """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
     left = memoryview(content.encode() if isinstance(content, str) else content)
-    with opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
+    with stated.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
         handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
         try:
             while left:
@@ -353,7 +326,7 @@ class SessionRecorder(SessionWriter):
         Must not exist or be an empty folder, unless the recording goes on.
     resume : bool
         Go on with the recording in `path`, if there is one.
-    board, lrf, cameras, T_head_lrf, name, licence, source, simulated, reference
+    **about
         As of :class:`SessionWriter`.
 
     Raises
@@ -372,99 +345,73 @@ class SessionRecorder(SessionWriter):
         return tuple(self.data["placements"])
 
     def _create(self):
-        stated = self.path / "session.json"
-        if self._resume and os.path.lexists(stated):
-            self._go_on(read_json(stated, self.path))
-        else:
-            self._begin(stated)
-        self._make_folders()
-        if not os.path.lexists(self.path / "platform.csv"):
-            self._write("platform.csv", ",".join(PLATFORM_COLUMNS) + "\n")
-
-    def _begin(self, stated):
-        """session.json comes first, so that a recording killed at once can go on."""
-        if set(os.listdir(self.path)) - {_draft(stated), LOCK}:
+        if self._resume and os.path.lexists(self.path / "session.json"):
+            self._go_on()
+        elif set(os.listdir(self.path)) - {"session.json.draft", stated.LOCK}:
             hint = "choose another name" if self._resume else "record with --resume to go on with it, or choose another"
             raise SessionError(f"{self.path}: exists already; {hint}")
-        self.data["unfinished"] = []
-        self._write_index()
-
-    def _go_on(self, data):
-        """Take over what an earlier recording wrote, without the placement that it did not finish."""
-        mine = json.loads(json.dumps(self.data))
-        with naming(self.path / "session.json"):
-            placements = list(parse_session(data)["placements"])
-            left = unfinished_of(data)
-            for key in ("board", "rig"):
-                if data[key] != mine[key]:
-                    where = _first_difference(data[key], mine[key], key)
-                    raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
-        self.data = {**data, "placements": placements, "unfinished": list(left or ())}
+        else:  # session.json comes first, so that a recording killed at once can go on
+            self._state(unfinished=[])
         self._make_folders()
-        mend_tables(self.path)
-        for placement in left or ():
-            self._mark_dropped(placement)
-        self.data["unfinished"] = []
-        self._write_index()
-        for camera in self.cameras:
-            there = listed(self.path / "images" / camera, self.path)
-            names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
-            self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
+        self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
-    def begin_placement(self, placement):
-        """State that a placement is being recorded from now on.
-
-        Raises
-        ------
-        SessionError
-            If another one is, or the number was recorded already.
-        """
-        for other in self.data["unfinished"]:
-            raise SessionError(f"{self.path}: placement {other} is being recorded: finish it first")
-        if placement in self.finished or placement < 0:
-            raise SessionError(f"{self.path}: placement {placement} cannot be begun; recorded: {short(self.finished)}")
-        self.data["unfinished"] = [int(placement)]
-        self._write_index()
-
-    def finish_placement(self):
-        """State that the placement begun last is complete; from now on it is part of the session."""
-        if not self.data["unfinished"]:
-            raise SessionError(f"{self.path}: no placement is being recorded: begin one first")
-        before = dict(self.data)
-        self.data |= {"placements": sorted([*self.finished, *self.data["unfinished"]]), "unfinished": []}
+    def _state(self, **changes):
+        """Change session.json; where that cannot be written, nothing is changed."""
+        before, self.data = self.data, self.data | changes
         try:
             self._write_index()
         except OSError:
             self.data = before
             raise
 
+    def _go_on(self):
+        """Take over what an earlier recording wrote, without the placement that it did not finish."""
+        mine, data = json.loads(json.dumps(self.data)), stated.read_json(self.path / "session.json", self.path)
+        with naming(self.path / "session.json"):
+            known = stated.parse_session(data)
+            for key in ("board", "rig"):
+                if data[key] != mine[key]:
+                    where = _first_difference(data[key], mine[key], key)
+                    raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
+        self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
+        self._make_folders()
+        mend_tables(self.path)
+        for placement in self.data["unfinished"]:
+            self._mark_dropped(placement)
+        self._state(unfinished=[])
+        for camera in self.cameras:
+            there = stated.listed(self.path / "images" / camera, self.path)
+            names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
+            self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
+
+    def begin_placement(self, placement):
+        """State that a placement is being recorded from now on; SessionError if one is, or that one was already."""
+        for other in self.data["unfinished"]:
+            raise SessionError(f"{self.path}: placement {other} is being recorded: finish it first")
+        if placement in self.finished or placement < 0:
+            raise SessionError(f"{self.path}: placement {placement} cannot be begun; recorded: {short(self.finished)}")
+        self._state(unfinished=[int(placement)])
+
+    def finish_placement(self):
+        """State that the placement begun last is complete; from now on it is part of the session."""
+        if not self.data["unfinished"]:
+            raise SessionError(f"{self.path}: no placement is being recorded: begin one first")
+        self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
+
     def drop_placement(self, placement):
         """Take a placement, finished or not, out of the session; its number can be recorded again.
 
-        Raises
-        ------
-        SessionError
-            If there is no such placement.
+        SessionError if there is no such placement.
         """
         if placement not in {*self.finished, *self.data["unfinished"]}:
             raise SessionError(f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}")
-        self.data["placements"] = [p for p in self.finished if p != placement]
-        self.data["unfinished"] = [placement]
-        self._write_index()
+        self._state(placements=[p for p in self.finished if p != placement], unfinished=[placement])
         self._mark_dropped(placement)
-        self.data["unfinished"] = []
-        self._write_index()
+        self._state(unfinished=[])
 
     def add_platform(self, rows):
-        """Append to the log of the platform.
-
-        Parameters
-        ----------
-        rows : sequence of (float, float, float)
-            Host time (s), commanded and measured pitch (rad); NaN where a head was not told, or does not tell.
-        """
-        lines = [[cell(t), *(cell(math.degrees(a)) for a in angles)] for t, *angles in rows]
-        append_file(self.path / "platform.csv", "".join(",".join(line) + "\n" for line in lines), self.path)
+        """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN where unknown."""
+        self._append_rows("platform.csv", [[cell(t), *(cell(math.degrees(a)) for a in both)] for t, *both in rows])
 
     def finish(self):
         """Close the recording: nothing can be half done in it any more."""
@@ -481,7 +428,7 @@ class SessionRecorder(SessionWriter):
 
     def shots_of(self, purpose):
         """Numbers of images of a purpose, a dict by camera."""
-        rows = read_table(self.path / "images.csv", IMAGE_COLUMNS, self.path)[0] if self.cameras else []
+        rows = stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0] if self.cameras else []
         return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
 
     def _note_placement(self, placement):
@@ -489,23 +436,15 @@ class SessionRecorder(SessionWriter):
             raise SessionError(f"{self.path}: placement {placement} was not begun")
 
     def _mark_dropped(self, placement):
-        number = str(placement)
-        for file, columns, key, to in (
-            ("lrf/index.csv", INDEX_COLUMNS, "placement", ""),
-            ("images.csv", IMAGE_COLUMNS, "purpose", DROPPED),
-        ):
-            there = os.path.lexists(self.path / file)
-            rows = read_table(self.path / file, columns, self.path)[0] if there else []
-            mine = [row for row in rows if row["placement"] == number]
-            for row in mine:
-                row[key] = to
-            if mine:
-                lines = [",".join(columns), *(",".join(row.values()) for row in rows)]
-                self._write(file, "\n".join(lines) + "\n")
-
-
-def _draft(file):
-    return file.name + ".draft"
+        marks = (
+            ("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}),
+            ("images.csv", read.IMAGE_COLUMNS, {"purpose": read.DROPPED}),
+        )
+        for name, columns, mark in marks:
+            if os.path.lexists(self.path / name):
+                rows = stated.read_table(self.path / name, columns, self.path)[0]
+                rows = [row | mark if row["placement"] == str(placement) else row for row in rows]
+                self._write(name, "\n".join([",".join(columns), *(",".join(row.values()) for row in rows)]) + "\n")
 
 
 def _first_difference(old, new, where):

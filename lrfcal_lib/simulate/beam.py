@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.simulate.scene import need
 
 MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
 NOT_VALID, DAZZLED, WEAK, TOO_FAR = 8191, 8190, 8187, 8183  # 13-bit words that are no ranges (listing, 10.8)
@@ -47,17 +48,15 @@ class Beam:
             known = ", ".join(f"{a}/{step / 100:g}" for a, step in sorted(WHOLE_SCANS) if a in self.angles)
             raise ValueError(f"{self.name} has no whole scans of {variant}; it can be set to {known}")
         for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{self.name}: {name} is {getattr(self, name)}, it must be zero or positive")
+            value = getattr(self, name)
+            need(0 <= value < math.inf, f"{self.name}: {name} is {value}, it must be zero or positive")
         bound = dict(self.systematic_bound).get(self.unit)
-        if bound is None:
-            raise ValueError(f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
-        if not abs(self.systematic) <= bound:
-            raise ValueError(f"{self.name}: a systematic error of {self.systematic} m is beyond the maker's {bound} m")
-        if not 0 <= self.least_share <= 1:
-            raise ValueError(f"{self.name}: least_share is {self.least_share}, a share lies between 0 and 1")
-        if self.rings < 0:
-            raise ValueError(f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
+        need(bound, f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
+        offset = f"{self.name}: a systematic error of {self.systematic} m"
+        need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
+        share = f"{self.name}: least_share is {self.least_share}, a share lies between 0 and 1"
+        need(0 <= self.least_share <= 1, share)
+        need(self.rings >= 0, f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
 
     @property
     def rays(self):

@@ -52,6 +52,7 @@ class Bench(Devices):
     pitch_step: float = np.radians(0.5)  # between scan lines, radians
     range_offset: float = 0.0  # metres
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
+    floor: float = 0.0  # least softness, in beam steps; real edges have none, the model of the joint estimate has
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +158,7 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise, reach):
     distances, r = _beside(bench.board, origin, rays)
     radius, sensible = bench.radius(r), (r > 0.2) & (r < 30)
     u, edge = distances.max(axis=-1), distances.argmax(axis=-1)
-    jitter = noise * bench.softness * radius * rng.standard_normal(r.shape)
+    jitter = noise * np.hypot(bench.softness * radius, bench.floor * bench.step * r) * rng.standard_normal(r.shape)
     hit = (u + jitter < bench.bias * radius) & sensible
     near = np.zeros((2, *hit.shape), bool)  # to an edge across the scan lines, and along them
     for axis in (0, 1):

@@ -187,7 +187,7 @@ def _writer(folder, name, setup):
     info = LrfInfo(
         model=f"{beam.name} (simulated)", field_of_view=tuple(beam.bearings()[[0, -1]].tolist()),
         bearing_step=math.radians(beam.resolution / 100), sigma_range=beam.sigma_range, range_resolution=beam.unit,
-        max_range=lrf.LARGEST_WORD * beam.unit, spot=(beam.spot_exit, beam.divergence),
+        max_range=lrf.LARGEST_WORD * beam.unit, spot_exit=beam.spot_exit, spot_divergence=beam.divergence,
     )  # fmt: skip
     cameras = [CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in rig.cameras]
     reference = {

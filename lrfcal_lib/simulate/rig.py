@@ -15,7 +15,7 @@ from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.simulate.beam import LMS221, Beam
-from lrfcal_lib.simulate.scene import Exposure
+from lrfcal_lib.simulate.scene import Exposure, need
 
 MOUNTS = ("head", "platform")
 AHEAD = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # axes ahead to those of a camera or an upright board
@@ -43,12 +43,11 @@ class Platform:
 
     def __post_init__(self):
         for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"platform: {name} is {getattr(self, name)}, it must be zero or positive")
-        if not 0 < self.speed < math.inf:
-            raise ValueError(f"platform: speed is {self.speed} rad/s, it must be positive")
-        if not abs(self.stretch) < 0.5:
-            raise ValueError(f"platform: stretch is {self.stretch}, a share of the angle (0.01 is one per cent)")
+            value = getattr(self, name)
+            need(0 <= value < math.inf, f"platform: {name} is {value}, it must be zero or positive")
+        need(0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive")
+        share = f"platform: stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
+        need(abs(self.stretch) < 0.5, share)
 
     def stop(self, commanded, direction, rng):
         """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or from above (-1).
@@ -68,11 +67,10 @@ class Platform:
 
     def check(self, pitch):
         """Refuse angles beyond the limits."""
-        low, high = self.limits
-        if pitch.size and (pitch.min() < low or pitch.max() > high):
-            asked, has = (np.round(np.degrees([a, b]), 2) for a, b in ((pitch.min(), pitch.max()), self.limits))
-            wanted = f"pitch {asked[0]} to {asked[1]} deg is asked for"
-            raise ValueError(f"platform: {wanted}, it turns {has[0]} to {has[1]} deg")
+        low, high = min(pitch, default=0.0), max(pitch, default=0.0)
+        (first, last), has = (np.round(np.degrees(ends), 2) for ends in ((low, high), self.limits))
+        words = f"platform: pitch {first} to {last} deg is asked for, it turns {has[0]} to {has[1]} deg"
+        need(self.limits[0] <= low and high <= self.limits[1], words)
 
     def _told(self, motor, direction):
         """Where the head is and what the encoder says where the motor is."""
@@ -92,8 +90,8 @@ class RigCamera:
     exposure: Exposure = Exposure()
 
     def __post_init__(self):
-        if self.mount not in MOUNTS:
-            raise ValueError(f"camera '{self.name}': mount is one of {', '.join(MOUNTS)}, got '{self.mount}'")
+        known = f"camera '{self.name}': mount is one of {', '.join(MOUNTS)}"
+        need(self.mount in MOUNTS, f"{known}, got '{self.mount}'")
 
 
 @dataclass(frozen=True)
@@ -165,14 +163,11 @@ class Setup:
     quality: int = 95  # of JPEG, 1 to 100
 
     def __post_init__(self):
-        if not self.step > 0:
-            raise ValueError(f"setup '{self.name}': the pitch step is {self.step} rad, it must be positive")
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"setup '{self.name}': JPEG quality is 1 to 100, got {self.quality}")
-        if self.intrinsics_views < 0:
-            raise ValueError(f"setup '{self.name}': {self.intrinsics_views} intrinsics views; 0 or more are possible")
-        if len(self.room_sweep) not in (0, 3):
-            raise ValueError(f"setup '{self.name}': room_sweep is (first, last, step) or empty, got {self.room_sweep}")
+        name, views, sweep = f"setup '{self.name}'", self.intrinsics_views, self.room_sweep
+        need(self.step > 0, f"{name}: the pitch step is {self.step} rad, it must be positive")
+        need(1 <= self.quality <= 100, f"{name}: JPEG quality is 1 to 100, got {self.quality}")
+        need(views >= 0, f"{name}: {views} intrinsics views; 0 or more are possible")
+        need(len(sweep) in (0, 3), f"{name}: room_sweep is (first, last, step) or empty, got {sweep}")
 
 
 def printed_triangle():
@@ -256,11 +251,9 @@ def check_size(rig, nearest):
     for m, name in ((camera.model, camera.name) for camera in rig.cameras):
         views[f"camera '{name}'"] = float(np.degrees(2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2)))
     for name, view in views.items():
-        if angle > 0.9 * view:
-            raise ValueError(
-                f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m, but {name} sees "
-                f"{view:.0f} deg; take a smaller board or a greater distance"
-            )
+        large = f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m"
+        seen = f"{name} sees {view:.0f} deg; take a smaller board or a greater distance"
+        need(angle <= 0.9 * view, f"{large}, but {seen}")
 
 
 def pairs(rig, count, distances, rng, margin=OUTSIDE):
@@ -288,8 +281,8 @@ def pairs(rig, count, distances, rng, margin=OUTSIDE):
     ValueError
         If the board does not fit into a view, or no place is found that everything sees.
     """
-    if count < 1 or not 0.3 <= distances[0] <= distances[1]:
-        raise ValueError(f"{count} pairs at {distances} m: at least one pair, at 0.3 m or more, is needed")
+    asked = f"{count} pairs at {distances} m"
+    need(count >= 1 and 0.3 <= distances[0] <= distances[1], f"{asked}: at least one pair, at 0.3 m or more, is needed")
     check_size(rig, distances[0])
     out = []
     for i, distance in enumerate(rng.permutation(np.linspace(*distances, count))):
@@ -338,8 +331,7 @@ def held_close(rig, camera, count, rng):
     The whole pattern is inside the image, spread over all of it by the poses together; ValueError if it does not fit.
     """
     m, pattern, out = camera.model, rig.board.pattern, []
-    if pattern is None and count:
-        raise ValueError(f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics")
+    need(pattern or not count, f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics")
     size, columns = np.array([m.width, m.height]), int(np.ceil(np.sqrt(count * 4 / 3)))
     for i in range(count):
         points, rows = pattern.points(), np.ceil(count / columns)

@@ -29,6 +29,12 @@ LATTICE = np.random.default_rng(20091001).random((64,) * 3)  # random values tha
 TEXTURES = {}  # by name, for room.json
 
 
+def need(good, words):
+    """A ValueError in these words, unless a setting is good."""
+    if not good:
+        raise ValueError(words)
+
+
 def polygon(corners):
     """A flat convex sheet of no thickness in the plane z = 0."""
     corners = np.asarray(corners, float)
@@ -256,8 +262,7 @@ class World:
     """
 
     def __init__(self, things, lights=None):
-        if not things:
-            raise ValueError("a world needs at least one thing to see, got none")
+        need(things, "a world needs at least one thing to see, got none")
         self.things, self.lights = tuple(things), lights
         vertices = [thing.pose.apply(thing.mesh[0]) for thing in self.things]
         starts = np.cumsum([0] + [len(v) for v in vertices[:-1]])
@@ -387,13 +392,10 @@ class Exposure:
     samples: int = 3  # rays across a pixel and down a pixel, where the pixel is not plain
 
     def __post_init__(self):
-        if not 0 < self.gain[0] <= self.gain[1]:
-            raise ValueError(f"gain is {self.gain}: two positive levels are needed, the smaller first")
+        need(0 < self.gain[0] <= self.gain[1], f"gain is {self.gain}: two positive levels, the smaller first")
         for name in ("bright", "blur_px", "read_noise", "shot_noise", "vignetting"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it cannot be negative")
-        if self.samples < 1:
-            raise ValueError(f"samples is {self.samples}: at least one ray a pixel is needed")
+            need(getattr(self, name) >= 0, f"{name} is {getattr(self, name)}: it cannot be negative")
+        need(self.samples >= 1, f"samples is {self.samples}: at least one ray a pixel is needed")
 
 
 class Imager:
@@ -403,16 +405,15 @@ class Imager:
     """
 
     def __init__(self, model: CameraModel, exposure: Exposure | None = None):
-        if model.width % BLOCK or model.height % BLOCK:
-            raise ValueError(f"the image is {model.width} x {model.height} pixels, both must be multiples of {BLOCK}")
+        size = f"the image is {model.width} x {model.height} pixels"
+        need(not (model.width % BLOCK or model.height % BLOCK), f"{size}, both must be multiples of {BLOCK}")
         self.model, self.exposure = model, exposure or Exposure()
         v, u = np.mgrid[: model.height + 1, : model.width + 1] - 0.5
         corners = np.stack([u, v], axis=-1)
         self.grid = (undistort(corners, model) - [model.cx, model.cy]) / [model.fx, model.fy]
         again = distort(self.grid, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
         miss = np.abs(again - corners).max()
-        if not miss < 1e-3:
-            raise ValueError(f"lens {model.distortion} folds the image (off by {miss:.3g} px): weaken the distortion")
+        need(miss < 1e-3, f"lens {model.distortion} folds the image (off by {miss:.3g} px): weaken the distortion")
 
     def render(self, world, T_camera_platform, rng):
         """Take a picture.
