@@ -69,7 +69,6 @@ def test_ports_that_cannot_be_opened_say_what_to_do(wire, tmp_path, monkeypatch)
     with pytest.raises(PortError, match=rf"busy, held by .*process {os.getpid()}\): close that program"):
         open_port(wire[1], 9600, timeout=0)
     held.close()
-    monkeypatch.setattr(port, "_holder", lambda path: "another program")
 
     def forbidden(*_, **__):
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")

@@ -13,7 +13,7 @@ from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.emulators.line import FAULTS
 from lrfcal_lib.session.lms2xx_codec import crc16, decode_scan, encode_scan
 
-DEVICES = 4
+DEVICES, BOOT_S = 4, 0.5
 RECOVERY_S, CALL_S = 3.0, 12.0  # longest: until all works again, and of any call
 KINDS = [name for name, fault in FAULTS.items() if "lrf" in fault.devices]
 LONG = {"unplug", "reboot", "rate", "deaf", "echo"}  # they last for a while, so there are fewer of them
@@ -27,7 +27,7 @@ class Campaign:
 
     def __init__(self, number):
         self.rng = np.random.default_rng([20091001, number])
-        self.device = lms(baudrate=38400, boot_s=0.5, seed=number, configuration=INDEXED)
+        self.device = lms(baudrate=38400, boot_s=BOOT_S, seed=number, configuration=INDEXED)
         self.host, self.faults = self.device.clock.machine, self.device.faults
         self.recoveries, self.calls, self.readings = [], [], []
 
@@ -52,7 +52,8 @@ class Campaign:
     def over(self, kind):
         """Wait until a fault has ended; a fault that found no opportunity is disarmed."""
         self.faults.clear(kind)
-        self.host.wait(lambda: self.device.port.there and not self.device._booting)
+        self.host.wait(lambda: self.device.port.there)
+        self.host.sleep(BOOT_S if kind == "reboot" else 0)
 
     def fresh(self):
         """A scan that was begun after this call."""
