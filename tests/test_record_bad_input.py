@@ -69,7 +69,7 @@ class Program:
 SPOILT = {  # what is changed, by the path of its key
     "error: lrf: there is no port /dev/no_such_port: check cable and power": {"lrf.port": "/dev/no_such_port"},
     "error: head: ": {"lrf.port": "{head}", "head.port": "{lrf}"},
-    "devices.lrf.port and devices.head.port are both": {"lrf.port": "{head}"},
+    "lrf.port and head.port are both": {"lrf.port": "{head}"},
     "pitch_limits_deg are -1 to 1: ask for less": {"head.pitch_limits_deg": [-1.0, 1.0]},
     "error: camera 'left': http://127.0.0.1:9/left.mjpg gives no video: open http":
         {"cameras.left.source": "http://127.0.0.1:9/left.mjpg"},
