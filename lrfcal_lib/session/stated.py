@@ -256,6 +256,7 @@ def in_words(error):
     if kind == "missing":
         return f"{where} is missing"
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
+    found = where if isinstance(first["input"], dict) else found
     if kind == "value_error":
         return f"{found}: {first['ctx']['error']}"
     needed = "an object" if kind in ("model_type", "dataclass_type") else first["msg"].removeprefix("Input should be ")
