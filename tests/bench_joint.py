@@ -19,6 +19,7 @@ from lrfcal_lib.evaluate.monte_carlo import consistency, monte_carlo
 from lrfcal_lib.fit.least_squares import Block, minimise, whiten
 from lrfcal_lib.fit.residuals import (
     AXIS_COLUMNS,
+    LEAST_STEP,
     Unknowns,
     assemble,
     beam_terms,
@@ -239,9 +240,10 @@ def far_starts(count=100):
 
 def trials(count=100, placements=20, step_deg=0.5):
     """Errors against bound, coverage and normalised squared error at the paper's set-up, both mounts."""
+    step = np.radians(step_deg)
     for mount in ("head", "platform"):
         result = monte_carlo(
-            lambda rng, mount=mount: draw(rng, placements, mount=mount, pitch_step=np.radians(step_deg))[:2],
+            lambda rng, mount=mount: draw(rng, placements, mount=mount, pitch_step=step, floor=LEAST_STEP)[:2],
             lambda obs: solve_joint(obs, required=False),
             range(1000, 1000 + count),
         )
