@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib
 import nbformat
 import pandas as pd
 import pytest
@@ -60,7 +61,7 @@ def run_nbval(path, session=None, report=None):
 def run_plainly(path, session, folder, report=None):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed."""
     told, names = io.StringIO(), {"display": lambda shown: None}
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told):
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         patch.setenv("LRFCAL_SESSION", str(session))
         patch.setenv(cache.VARIABLE, str(folder))
         if report is not None:
