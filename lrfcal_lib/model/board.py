@@ -65,6 +65,7 @@ class Board:
         return dict(zip(self.edges, np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), strict=True))
 
     def known_corners(self):
+        """Corners of the outline, metres, shape (n, 2); ValueError where nobody has measured them."""
         if self.corners is None:
             raise ValueError(f"the outline of board '{self.name}' is not known: measure it from images first")
         return np.asarray(self.corners, float)

@@ -102,6 +102,7 @@ class JointSolution:
 
     @property
     def converged(self):
+        """Whether the last step was small."""
         return bool(self.solution.converged)
 
     @property
@@ -111,6 +112,7 @@ class JointSolution:
 
     @property
     def axis(self):
+        """The tilt axis in the LRF frame."""
         return geometry.axis_of(self.T_head_lrf)
 
     @property

@@ -89,10 +89,12 @@ class PlatformSolution:
 
     @property
     def axis(self):
+        """The tilt axis in the LRF frame."""
         return axis_of(self.solution.transform)
 
     @property
     def converged(self):
+        """Whether the last step was small."""
         return self.solution.converged
 
     def __repr__(self):
