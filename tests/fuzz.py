@@ -411,6 +411,19 @@ def _batch(numbers, seed, sound, progress, out):
     shutil.rmtree(folder, ignore_errors=True)
 
 
+def _child(numbers, seed, sound, progress, log):
+    """A batch in a forked process, which ends here."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say about damaged images
+    with log.open("a") as out:
+        try:
+            _batch(numbers, seed, sound, progress, out)
+        except BaseException:
+            failed = [numbers[0], "fuzzer", "it failed itself", traceback.format_exc()]
+            out.write(json.dumps(failed) + "\n")
+            out.flush()
+    os._exit(0)
+
+
 def run(cases, *, first=0, seed=SEED, workers=1, tell=lambda done: None):
     """Run cases; the findings as lists [number, kind, text, traceback]."""
     base = Path(tempfile.mkdtemp(prefix="lrfcal-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
@@ -428,15 +441,7 @@ def run(cases, *, first=0, seed=SEED, workers=1, tell=lambda done: None):
                 progress[:16] = struct.pack("<qd", numbers[0], time.monotonic())
                 child = os.fork()
                 if not child:
-                    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say about damaged images
-                    with log.open("a") as out:
-                        try:
-                            _batch(numbers, seed, sound, progress, out)
-                        except BaseException:
-                            failed = [numbers[0], "fuzzer", "it failed itself", traceback.format_exc()]
-                            out.write(json.dumps(failed) + "\n")
-                            out.flush()
-                    os._exit(0)
+                    _child(numbers, seed, sound, progress, log)
                 running[child] = numbers, progress
             time.sleep(0.02)
             for child, (numbers, progress) in list(running.items()):

@@ -149,6 +149,7 @@ def top_view(field_of_view, reach):
     step = 1.0 if reach <= 6 else 2.0 if reach <= 12 else 5.0 if reach <= 30 else 20.0
 
     def draw(ax):
+        """The field of view and its circles."""
         ax.set(xlim=(-half * shape, half * shape), ylim=(middle - half, middle + half), aspect="equal")
         ax.set_axis_off()
         ax.fill(*np.vstack([[0, 0], edge]).T, color="#f4f6f8", zorder=0)

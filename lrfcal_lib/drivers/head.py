@@ -339,6 +339,7 @@ class Motion:
         deadline = self._now() + 3 * abs(goal - first) / self.speed(way, step) + 10
 
         def look():
+            """Note where the head is; what goes wrong in a sweep ends it."""
             self.note(brief=True)
             if self.line.counts["reconnects"] != reconnects:
                 raise LineLost("the line was lost in the sweep, and the head stopped when it came back: sweep again")
@@ -633,6 +634,7 @@ class PanTilt(port.Closed):
         self._begin(stop_at)
 
         def run():
+            """The sweep, in its own thread."""
             try:
                 self.motion.sweep(stop_at, step)
             except Stopped:

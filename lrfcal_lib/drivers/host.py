@@ -178,6 +178,7 @@ class _Thread(threading.Thread):
         super().start()
 
     def run(self):
+        """Wait for its turn, then do it."""
         self._begin.turn.acquire()
         try:
             super().run()

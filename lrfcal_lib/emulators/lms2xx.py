@@ -304,6 +304,7 @@ class EmulatedLms(SerialDevice):
         end = self._zero + (turn + turns) * TURN_S
 
         def ahead(_):
+            """Cast the scan, and send it at its end."""
             quarters = codec.scan_quarters(181 - (partial > 0) if partial >= 0 else angle * 100 // step + 1, partial)
             times = self._zero + (turn + np.arange(len(quarters)) % turns + quarters / 1440) * TURN_S
             ranges, reasons, pitch = self.source.scan(turn, quarters, times)

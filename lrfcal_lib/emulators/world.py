@@ -257,6 +257,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Sends images as a stream, NAME.mjpg, or one of them, NAME.jpg."""
 
     def do_GET(self):
+        """Answer a request, see :mod:`http.server`."""
         name, _, kind = self.path.strip("/").rpartition(".")
         cameras, single = self.cameras, kind == "jpg"
         if name not in cameras.names or kind not in ("mjpg", "jpg"):

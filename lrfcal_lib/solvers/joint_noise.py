@@ -154,6 +154,7 @@ def view_levels(data, block, state):
     free = max(free, LEAST_FREEDOM)
 
     def level(sigma):
+        """Negative log likelihood at an error of the pitch of images, and the data with the scale that fits it."""
         trial = replace(data, sigma_pitch=float(sigma))
         for _ in range(SCALE_ROUNDS):
             z = (residuals.view_whitener(trial, by_pitch) @ r)[..., 0][used]

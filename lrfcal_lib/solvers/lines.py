@@ -74,6 +74,7 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=
         return residual(pose, obs)
 
     def equal_weights(pose, _):
+        """The residuals with one weight for all, at a pose."""
         weight = np.mean(evaluate(pose).whitener ** -2.0) ** -0.5
 
         def plain(pose):

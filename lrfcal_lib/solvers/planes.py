@@ -291,6 +291,7 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
         check_normals(sets, obs.camera)
 
     def freeze(pose, number):
+        """The residuals with weights and compressed points as they are at a pose."""
         if not (weighted and number):
             triangles = compress(sets, equal_weights(sets, pose))
             return lambda p: residual(p, triangles, sets.boards, None, sets.count)

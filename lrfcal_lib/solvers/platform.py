@@ -318,6 +318,7 @@ def solve_projected(obs, T0=None, *, required=True):
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
 
     def solved(head, scatter, **earlier):
+        """The fits with a given scatter about the lines."""
         return solve(
             lambda head: projected_block(head, obs, groups.values(), scatter), pose_array(head), move_head,
             names=AXIS_NAMES, method="platform_projected", words=_words, groups=np.repeat(list(groups), rows),
