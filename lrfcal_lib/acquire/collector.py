@@ -14,7 +14,7 @@ from lrfcal_lib.acquire.record import Recording, RecordingError
 from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, prepare
 from lrfcal_lib.drivers.port import DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
-from lrfcal_lib.drivers.rig_file import RigFileError, checked, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.evaluate.tables import handed_over
 from lrfcal_lib.evaluate.verdict import YES, judge, sight_of, verdict
@@ -151,9 +151,9 @@ class Collector:
     """
 
     connected = property(lambda self: self.rig is not None, doc="Whether a rig is open.")
-    emulated = property(lambda self: self.connected and self.rig.stated.control is not None,
+    emulated = property(lambda self: self.connected and self.rig.stated.devices.control is not None,
                         doc="Whether the board moves by itself.")  # fmt: skip
-    limits_deg = property(lambda self: self._needed().stated.head_settings.pitch_limits_deg,
+    limits_deg = property(lambda self: self._needed().stated.devices.head.pitch_limits_deg,
                           doc="Lowest and highest pitch of the head.")  # fmt: skip
     finished = property(lambda self: () if self.recording is None else self.recording.finished,
                         doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
@@ -195,7 +195,7 @@ class Collector:
 
                 made, data, clock = emulated(str(rig))
                 stack.enter_context(made)
-                stated = checked(rig_of(data(), Path(f"emulated {made.setup.name}")))
+                stated = rig_of(data(), Path(f"emulated {made.setup.name}"))
             elif not Path(rig).suffix and not Path(rig).exists():
                 known = ", ".join(PRACTICE_RIGS)
                 raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
