@@ -12,7 +12,7 @@ import numpy as np
 
 from lrfcal_lib.acquire.record import Recording, RecordingError
 from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, prepare
-from lrfcal_lib.drivers.port import DeviceError, LineLost
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
@@ -136,7 +136,7 @@ class View:
     trouble: str = ""  # what cannot be seen, and why
 
 
-class Collector:
+class Collector(Closed):
     """Connects a rig, records placements with it and calibrates what was recorded; a context manager.
 
     All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
@@ -162,12 +162,6 @@ class Collector:
         self.rig, self.recording = None, None
         self.view, self.lights, self._told = View(), {}, ""
         self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def connect(self, rig, session):
         """Open a rig and a session; a session that was recorded with the same rig goes on.

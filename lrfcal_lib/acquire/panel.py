@@ -16,7 +16,7 @@ import numpy as np
 
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
-from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.recording import COLORS
 from lrfcal_lib.session.stated import escape
@@ -346,7 +346,7 @@ class Notes(logging.Handler):
         self.part.value = notes(self.lines)
 
 
-class Panel:
+class Panel(Closed):
     """Records a session with a rig, by buttons or by methods; a context manager that closes the rig.
 
     Methods raise what goes wrong, and the panel says it in words; buttons only say it.
@@ -372,12 +372,6 @@ class Panel:
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         self._refresh()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def show(self):
         """Display the panel."""
