@@ -12,7 +12,7 @@ from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, o
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 
 YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
@@ -151,7 +151,8 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
 
 def _expected(chains, models, pitch, noise, reasons, doubt):
     """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
-    unsure = np.diag([doubt**2 * (name == "range_offset") for name in COLUMNS])
+    # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have taken it up
+    unsure = np.diag([doubt**2 * (name in ("range_offset", *POSE_NAMES[3:])) for name in COLUMNS])
     more = {c: tuple(C + unsure for C in chain.covariances) for c, chain in chains.items()}
     chains = {c: replace(chain, covariances=more[c]) for c, chain in chains.items()}
     low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
