@@ -205,3 +205,12 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
 def opened(rig):
     """Stands in for the class Rig where a program opens one."""
     return SimpleNamespace(open=lambda stated, **options: rig)
+
+
+def raising(error):
+    """A call that fails."""
+
+    def call(*_, **__):
+        raise error
+
+    return call

@@ -13,7 +13,7 @@ from functools import partial, reduce
 
 import numpy as np
 import pytest
-from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
+from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, raising, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.head import HeadSettings
@@ -274,15 +274,6 @@ def test_interlaced_scans_are_streamed():
     rig = make_rig(changed("devices.lrf.interlaced", True, scans_per_stop=2))
     assert [len(e.readings) for e in events_of(rig, kind=Scanned)] == [2] * 9
     assert not rig.lrf.streaming
-
-
-def raising(error):
-    """A call that fails."""
-
-    def call(*_, **__):
-        raise error
-
-    return call
 
 
 def test_nothing_is_held_back():
