@@ -9,7 +9,7 @@ import numpy as np
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
 from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded, platform_of
-from lrfcal_lib.fit.residuals import chart_parameters, edge_residuals_px, plane_residuals_m
+from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
@@ -376,16 +376,6 @@ def leave_out(joint, groups=8):
             continue
         found |= {int(placement): solution for placement in out}
     return replace(joint, without=found)
-
-
-def left_out_residuals(joint, camera):
-    """Residuals of every placement under the estimate from all the others: crossings (pixels), face points (metres)."""
-    edges, planes = [np.zeros(0)], [np.zeros(0)]
-    for placement, solution in joint.without.items():
-        held = joint.seen_by(camera, solution).along().select([placement])
-        edges.append(edge_residuals_px(held, solution.transforms[camera]))
-        planes.append(plane_residuals_m(held, solution.transforms[camera]))
-    return np.concatenate(edges), np.concatenate(planes)
 
 
 def stereo_reference(prepared):
