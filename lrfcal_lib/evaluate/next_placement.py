@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -108,44 +109,15 @@ def camera_poses(solution, name, pitch):
     return np.broadcast_to(geometry.pose_array(solution.camera_at(name, pitch)), (len(pitch), 3, 4))
 
 
-@dataclass(frozen=True)
-class Yield:
-    """What a placement of this recording brings: steps of the scans and how many of the beams get used.
-
-    Attributes
-    ----------
-    bearing_step, pitch_step : float
-        Radians.
-    spot : ndarray, shape (2,)
-        Growth with distance and constant of the spot's radius.
-    background : float
-        See :mod:`lrfcal_lib.fit.residuals`.
-    faces, cells : int
-        Most ranges a placement, and most beams an edge.
-    features : ndarray, shape (k, 3)
-        What the cameras see of the board.
-    face_share, edge_share : float
-        Of the beams that hit a board, and of the information about its edges, that really arrive.
-    pixels : ndarray, shape (6,)
-        Standard deviations of the board's pose in an image, relative to that from features at 1 px each.
-    """
-
-    bearing_step: float
-    pitch_step: float
-    spot: np.ndarray
-    background: float
-    faces: int
-    cells: int
-    features: np.ndarray
-    face_share: float = 1.0
-    edge_share: float = 1.0
-    pixels: np.ndarray | None = None
-
-
 def measure_yield(solution, models, features=None):
-    """Compare the placements of a solution with what is predicted for the same poses: a :class:`Yield`.
+    """What a placement of this recording brings, by comparing its placements with what is predicted for the same poses.
 
     `features`, shape (k, 3), is what the cameras see of the board (its pattern), metres; all over it when left out.
+    Returned are, by name, `bearing_step` and `pitch_step` of the scans (radians), `spot` (how the radius of a spot
+    grows with distance, and its constant), `background` (see :mod:`lrfcal_lib.fit.residuals`), `faces` and `cells`
+    (most ranges of a placement, and most beams about an edge), `features`, `face_share` and `edge_share` (of the beams
+    that hit a board, and of the information about its edges, that really arrive), and `pixels` (6,): standard
+    deviations of the board's pose in an image, relative to that from features at 1 px each.
     """
     obs, boards = solution.observations, solution.state.boards
     radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
@@ -157,17 +129,21 @@ def measure_yield(solution, models, features=None):
     features = _inner(solution, 8) if features is None else np.asarray(features, float)
     background = np.median(obs.beam_background) if len(radius) else 0.0
     faces, ratios = np.bincount(obs.face_placement, minlength=len(boards)), []
-    first = Yield(_step(obs, "bearing"), _step(obs, "pitch"), spot, background, faces.max(), cells, features)
+    rate = SimpleNamespace(
+        bearing_step=_step(obs, "bearing"), pitch_step=_step(obs, "pitch"), spot=spot, background=background,
+        faces=faces.max(), cells=cells, features=features, face_share=1.0, edge_share=1.0,
+    )  # fmt: skip
     bare = replace(solution.state, sweeps=0 * solution.state.sweeps, sides=0 * solution.state.sides)
-    expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, first)), solution.unknowns)
+    expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, rate)), solution.unknowns)
     found = _edge_information(solution.state, solution.data, solution.unknowns)
-    face_share = _share(faces, np.sum(_faces(boards, solution, first)["used"] ** 2, axis=1))
+    hits = np.sum(_faces(boards, solution, rate)["used"] ** 2, axis=1)
     for number, name in enumerate(solution.transforms):
         mine = obs.view_camera == number
         both = obs.view_covariance[mine], _view_covariance(obs.view_pose[mine], features, models[name])
         ratios.append(np.sqrt(np.divide(*(np.diagonal(C, axis1=1, axis2=2) for C in both))))
-    pixels = np.median(np.concatenate(ratios), axis=0) if len(obs.view_camera) else np.ones(6)
-    return replace(first, face_share=face_share, edge_share=_share(found, expected), pixels=pixels)
+    rate.pixels = np.median(np.concatenate(ratios), axis=0) if len(obs.view_camera) else np.ones(6)
+    rate.face_share, rate.edge_share = _share(faces, hits), _share(found, expected)
+    return rate
 
 
 def _step(obs, name):
@@ -284,8 +260,8 @@ def _edge_information(state, data, unknowns):
 def candidate_information(boards, pitches, solution, models, rate):
     """Information that each candidate would add about the shared unknowns, shape (n, c, c).
 
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images; `rate` is a :class:`Yield`.
-    The candidate's own pose and sweep are eliminated; at the noise levels of the solution.
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images; `rate` is that of
+    :func:`measure_yield`. The candidate's own pose and sweep are eliminated; at the noise levels of the solution.
     """
     c, found = solution.unknowns.shared, []
     for first in range(0, len(boards), CHUNK):

@@ -164,8 +164,8 @@ def residuals_by_range(ax, distance, residual):
     limits = np.unique(np.quantile(distance, np.linspace(0, 1, BINS + 1)))
     which = np.clip(np.searchsorted(limits, distance, side="right") - 1, 0, max(len(limits) - 2, 0))
     bins = [which == i for i in np.unique(which)]
-    bins = [(distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins]
-    x, y, error = zip(*bins, strict=True)
+    means = [(distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins]
+    x, y, error = np.transpose(means)
     ax.errorbar(x, y, yerr=error, fmt="o-", color=COLORS["lrf"], capsize=2.5, label="mean and its standard error")
     ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
     limit, title = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9), f"{np.sqrt(np.mean(residual**2)):.2g} mm rms"
