@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_covariance, polar_to_points, tilt
@@ -58,9 +58,8 @@ def surfaces(ranges, bearings, pitch):
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
     close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], np.diff(pitch)[:, None])
-    pairs = np.unique(np.stack([pieces[:-1][close], pieces[1:][close]]), axis=1)
     n = pieces.max(initial=-1) + 1
-    graph = coo_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(n, n))
+    graph = coo_array((np.ones(close.sum()), (pieces[:-1][close], pieces[1:][close])), shape=(n, n))
     joined = connected_components(graph, directed=False)[1] if n else np.zeros(0, int)
     return np.where(pieces >= 0, np.append(joined, -1)[pieces], -1)
 
@@ -121,7 +120,7 @@ def best_plane(points, upright, rng, trials=200, sample=1500):
     """Random sample consensus over neighbouring points, then total least squares over all that agree; None if none."""
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
-    near = np.linalg.norm(seeds[:, None] - few, axis=2)
+    near = cdist(seeds, few)
     near = np.where((near < 0.3) & (near > 1e-6), rng.random(near.shape), -1.0)
     others = few[np.argpartition(-near, 1, axis=1)[:, :2]]
     normals = np.cross(others[:, 0] - seeds, others[:, 1] - seeds if upright is None else upright)

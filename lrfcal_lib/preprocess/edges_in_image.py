@@ -77,19 +77,18 @@ def sample(image, model, uv):
     normalised = (uv - [model.cx, model.cy]) / [model.fx, model.fy]
     seen = distort(normalised, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
     height, width, channels = image.shape
+    (x, y), (u, v) = np.moveaxis(normalised, -1, 0), np.moveaxis(seen, -1, 0)
     # far outside, where the radial distortion no longer grows, it folds points back into the image
     k1, k2, _, _, k5 = model.distortion
-    r2 = np.sum(normalised**2, axis=-1)
+    r2 = x * x + y * y
     inside = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
-    inside &= np.all((seen >= 0) & (seen < [width - 1, height - 1]), axis=-1)
-    seen = np.where(inside[..., None], seen, 0)
-    corner = np.floor(seen).astype(np.intp)
-    f = (seen - corner).astype(np.float32)
-    flat = image.reshape(-1, channels)
-    at = corner[..., 1] * width + corner[..., 0]
-    u, v = f[..., :1], f[..., 1:]
-    top = flat[at] * (1 - u) + flat[at + 1] * u
-    out = top * (1 - v) + (flat[at + width] * (1 - u) + flat[at + width + 1] * u) * v
+    inside &= (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    column, row = u.astype(np.intp), v.astype(np.intp)
+    u, v = ((s - whole).astype(np.float32)[..., None] for s, whole in ((u, column), (v, row)))
+    flat, at = image.reshape(-1, channels), row * width + column
+    top, bottom = (flat.take(i, axis=0) * (1 - u) + flat.take(i + 1, axis=0) * u for i in (at, at + width))
+    out = top * (1 - v) + bottom * v
     out[~inside] = np.nan
     return out
 
