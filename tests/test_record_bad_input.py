@@ -62,7 +62,7 @@ class Program:
         finally:
             self.run.kill()
         time.sleep(0.2)
-        assert not self.rig.world.head.tilt.moving(self.rig.clock.now()) and "Traceback" not in err
+        assert not self.rig.world.head.moving(self.rig.clock.now()) and "Traceback" not in err
         return self.run.returncode, out, err.strip()
 
 
@@ -101,7 +101,7 @@ def test_a_camera_without_exposure_control_is_used_as_it_is(tmp_path, rig, state
 
 def test_a_head_at_its_end_stop_ends_the_recording(tmp_path, rig, stated, monkeypatch):
     first, last, _ = stated["plan"]["placements"][0]["pitch_deg"]
-    monkeypatch.setattr(rig.world.head.tilt, "limits", (-1.0, np.radians((first + last) / 2)))
+    monkeypatch.setattr(rig.world.head, "limits", (-1.0, np.radians((first + last) / 2)))
     code, _, err = Program(tmp_path, stated, rig).end()
     assert code == 2 and "no placement was finished; --resume goes on from there" in err
     assert "end stop" in err or "limit" in err
