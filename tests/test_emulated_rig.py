@@ -37,7 +37,7 @@ def setup():
 
 @pytest.fixture(scope="module")
 def placements(setup):
-    return placements_of(setup)
+    return placements_of(setup)[:4]
 
 
 @pytest.fixture

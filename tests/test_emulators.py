@@ -7,12 +7,12 @@ import time
 import numpy as np
 import pytest
 import serial
-from virtual import INDEXED, Bench, head, lms, telegrams
+from virtual import INDEXED, Bench, Source, head, lms, telegrams
 
 from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.emulators.head import REACT_S, EmulatedHead, Head
 from lrfcal_lib.emulators.line import FAULTS, RATES, Clock, Faults, SerialDevice, resample
-from lrfcal_lib.emulators.lms2xx import AHEAD_S, BAUD_COMMAND, VARIANTS, EmulatedLms, Memory, SyntheticSource
+from lrfcal_lib.emulators.lms2xx import AHEAD_S, BAUD_COMMAND, VARIANTS, EmulatedLms, Memory
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
     decode_scan,
@@ -142,7 +142,7 @@ def test_a_pause_within_a_request_drops_it():
 @pytest.mark.parametrize("settings", [{"model": "short"}, {"variant": (180, 25)}, {"baudrate": 1200}])
 def test_settings_that_no_device_has(settings):
     with pytest.raises(ValueError, match="characters|no variant|no LMS2xx"):
-        EmulatedLms(path="lrf", **settings)
+        lms(**settings)
     memory = Memory(model="LMS211;302063;X01.27 ", variant=(100, 50))
     assert memory.takes_variant((100, 25)) and not memory.takes_variant((180, 50))
 
@@ -248,7 +248,7 @@ def test_a_stream_that_this_machine_is_too_slow_for_leaves_scans_out(caplog):
     """Casting a scan takes the processor a time that passes meanwhile."""
     slow, host = [], VirtualHost()
 
-    class Slow(SyntheticSource):
+    class Slow(Source):
         def scan(self, *args):
             host._now += slow.pop() if slow else 0
             return super().scan(*args)
@@ -327,7 +327,7 @@ def test_a_host_that_does_not_read_loses_bytes_and_nothing_else():
     one.port.write(bytes.fromhex(STREAM))
     one.machine.sleep(1.0)
     assert one.device.counts["lost"] > 0 and one.port.in_waiting == 4095
-    assert one.ask(STOP, 0xA0)
+    assert one.reply(STOP, 0xA0)
     one.port.write(bytes.fromhex(STREAM))
     one.port.close()
     one.machine.sleep(1.0)
@@ -340,13 +340,13 @@ def test_a_host_that_does_not_read_loses_bytes_and_nothing_else():
 
 def test_unplugged_and_back_at_the_same_path():
     one = bench(baudrate=38400)
-    assert one.ask(TYPE, 0xBA)
+    assert one.reply(TYPE, 0xBA)
     one.device.faults.inject("unplug", seconds=0.3)
     assert not one.device.port.there
     with pytest.raises(OSError, match="unplugged"):
         one.send(TYPE)
     one.machine.sleep(0.31)
-    assert one.device.port.there and Bench(one.device).ask(TYPE, 0xBA) and one.device.faults.counts["unplug"] == 1
+    assert one.device.port.there and Bench(one.device).reply(TYPE, 0xBA) and one.device.faults.counts["unplug"] == 1
 
 
 # --------------------------------------------------------------------------------------------- on a pseudo-terminal
@@ -354,7 +354,7 @@ def test_unplugged_and_back_at_the_same_path():
 
 def test_a_laser_range_finder_on_a_pseudo_terminal(tmp_path):
     """In real time; the limits only guard against hanging."""
-    with EmulatedLms(path=tmp_path / "lrf", baudrate=38400, configuration=INDEXED) as device:
+    with EmulatedLms(Source(), path=tmp_path / "lrf", baudrate=38400, configuration=INDEXED) as device:
         port = serial.Serial(device.path, 38400, timeout=DEADLINE)
         port.write(bytes.fromhex(STREAM))
         assert port.read(10) == b"\x06" + bytes.fromhex(OK)
@@ -425,7 +425,7 @@ def test_clients_of_other_people(client):
         else:
             one.device.scans.clear()
             code = parse_telegram(bytes.fromhex(step) if isinstance(step, str) else step).code | 0x80
-            answer = one.ask(step, code, wait=wait, tries=tries)
+            answer = one.reply(step, code, wait=wait, tries=tries)
             assert code not in (0xA0, 0xF7, 0xBB) or answer[5] == (code != 0xA0)
 
 
@@ -451,7 +451,7 @@ def test_carmen_connects_in_its_own_order_of_commands(found, wanted):
             one.send(RATE[wanted], wait=0.0)
             assert any(answered(STATUS) for _ in range(5))
     assert find() == wanted == one.device.baudrate
-    assert parse_status(one.ask(STATUS, 0xB1)).baud == wanted
+    assert parse_status(one.reply(STATUS, 0xB1)).baud == wanted
 
 
 # ------------------------------------------------------------------------------------------------ the head
@@ -547,13 +547,12 @@ def test_an_upside_down_head():
     assert one.send(TO_30, wait=9.0) == b"" and np.degrees(one.device.pitch()) == pytest.approx(-30, abs=0.02)
 
 
-def test_play_of_the_gear_and_stretch_as_the_simulator_has_them():
-    platform = Platform(backlash=0.01, stretch=0.02, settle=0.0, speed=0.1)
-    head = Head(platform)
+def test_play_of_the_gear_and_stretch():
+    head = Head(Platform(backlash=0.01, stretch=0.02, settle=0.0))
     head.move(1.0, 0.5, 0.1)
     t = np.linspace(1.0, 4.0, 200)
-    true, _ = platform.sweep(0.0, 0.5, t - 1.0 - REACT_S)
-    assert np.allclose(head.pitch(t), np.maximum(true, 0.0), atol=1e-12)
+    motor = np.clip(0.1 * (t - 1.0 - REACT_S), 0.0, 0.5)
+    assert np.allclose(head.pitch(t), np.maximum(1.02 * motor - 0.005, 0.0), atol=1e-12)
     head.move(4.0, 0.0, 0.1)
     turning = head.pitch(np.linspace(4.0 + REACT_S, 5.0, 300))
     assert np.count_nonzero(np.abs(np.diff(turning)) < 1e-12) > 20  # the play, then down

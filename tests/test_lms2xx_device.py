@@ -9,7 +9,7 @@ import tty
 import numpy as np
 import pytest
 import serial
-from virtual import INDEXED, Bench
+from virtual import INDEXED, Bench, Source
 from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import port
@@ -18,7 +18,7 @@ from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, interval_s, transfer_s
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate
 from lrfcal_lib.emulators.line import Clock, SerialDevice
-from lrfcal_lib.emulators.lms2xx import EmulatedLms, SyntheticSource
+from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_scan, encode_telegram
 
 
@@ -678,12 +678,12 @@ def test_on_a_pseudo_terminal(tmp_path):
     The limits guard against hanging only.
     """
 
-    class Slow(SyntheticSource):
+    class Slow(Source):
         def scan(self, *args):
             time.sleep(0.02)
             return super().scan(*args)
 
-    with EmulatedLms(Slow(), path=tmp_path / "lrf", time_scale=4.0, configuration=INDEXED) as device:
+    with EmulatedLms(Slow(), path=tmp_path / "lrf", clock=Clock(4.0), configuration=INDEXED) as device:
         with LMS2xx(device.path, baudrate=500000, find_s=60) as lms:
             assert len(lms.request(timeout=60).ranges) == 361
             lms.start()
