@@ -1,7 +1,5 @@
 """A Pelco-D pan-tilt head, as good or as bad as heads are; how it moves is known at every instant."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

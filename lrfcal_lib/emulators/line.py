@@ -4,8 +4,6 @@ The port is a pseudo-terminal served by a thread, whose rate is read at the mast
 on a real line; or, on a VirtualHost, a buffer in memory, and the device goes on while the driver waits.
 """
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import itertools

@@ -1,7 +1,5 @@
 """A SICK LMS2xx: the commands that our driver, sicktoolbox and CARMEN send, their times, its mirror and its streams."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections import deque
@@ -271,11 +269,6 @@ class EmulatedLms(SerialDevice):
 
     # ------------------------------------------------------------------------------------------- scans
 
-    @property
-    def _turns(self):
-        """Turns of the mirror for a scan of the stream."""
-        return 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1]
-
     def _turn_of(self, instant, turns, rounded):
         """First turn of the scan that is being measured (math.floor), or of the next one (math.ceil)."""
         return rounded((instant - self._zero) / MIRROR_TURN / turns) * turns
@@ -306,6 +299,9 @@ class EmulatedLms(SerialDevice):
         self.scans.append(replace(scan, number=self._number, telegram_index=self.telegrams % 256, telegram=raw))
         self.telegrams, self._number = self.telegrams + 1, self._number + 1
         self.reply(codec.SCAN, raw, at, then, BURST if self.memory.baudrate == 500000 else None, MIRROR_TURN)
+
+    _turns = property(lambda self: 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1],
+                      doc="Turns of the mirror for a scan of the stream.")  # fmt: skip
 
     def _plan(self):
         """Measure the next scan of the stream; of one that lags, some are left out: the indices show the gap."""

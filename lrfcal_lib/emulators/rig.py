@@ -4,8 +4,6 @@ A line to the socket is a command with its arguments, ``place 3``; in JSON ``{"c
 Every line is answered by one line of JSON, ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -4,8 +4,6 @@ A process of its own draws the images, so that the serial devices keep their tim
 while it does none is sent, and one that was begun before a move is not sent after it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging
@@ -14,7 +12,7 @@ import os
 import signal
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -186,6 +184,8 @@ class CameraServer:
         What ended the drawing process; there are no more images.
     """
 
+    serving = property(lambda self: not self.quit.is_set() and self.error is None, doc="Whether images are to come.")
+
     def __init__(self, world, setup, *, seed=0, rest_s=0.5):
         self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
         self.names = [camera.name for camera in setup.rig.cameras]
@@ -208,25 +208,30 @@ class CameraServer:
         self._serving.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    @property
-    def serving(self):
-        """Whether there are images to come."""
-        return not self.quit.is_set() and self.error is None
-
     def image(self, name, timeout=1.0):
         """What a camera's image shows (a key), and the image of the rig as it stands now, a JPEG file.
 
         (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
         """
         end = time.monotonic() + timeout
-        while self.serving:
-            key = self._key(name)
-            data = self._drawn(key)
-            if data is not None and self._key(name) == key:
-                return key, data
-            if time.monotonic() > end:
-                break
-            self.quit.wait(LOOK_S)
+        try:
+            while self.serving and time.monotonic() < end:
+                key = self._key(name)
+                if key is None:
+                    self.quit.wait(LOOK_S)
+                    continue
+                with contextlib.suppress(TimeoutError, CancelledError):
+                    data = self._drawn(key).result(LOOK_S)
+                    if self._key(name) == key:
+                        return key, data
+        except BrokenProcessPool as error:
+            if self.serving:
+                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
+                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
+            self.error = error
+        except RuntimeError:  # a pool that was shut down is no news
+            if self.serving:
+                raise
         return None, None
 
     def _key(self, name):
@@ -237,27 +242,16 @@ class CameraServer:
         return name, self.world.place, round(float(head.pitch(now)), 7)
 
     def _drawn(self, key):
-        """JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
-        if key is None:
-            return None
-        try:
-            with self._lock:
-                before, image = self._images.get(key[0], (None, None))
-                if before != key:
-                    if image is not None:
-                        image.cancel()
-                    index = self.names.index(key[0])
-                    image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
-                    self._images[key[0]] = key, image
-            return image.result() if image.done() else None
-        except BrokenProcessPool as error:
-            if self.serving:
-                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
-                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
-            self.error = error
-        except RuntimeError:  # a pool that was shut down is no news
-            if self.serving:
-                raise
+        """Future JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
+        with self._lock:
+            before, image = self._images.get(key[0], (None, None))
+            if before != key:
+                if image is not None:
+                    image.cancel()
+                index = self.names.index(key[0])
+                image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
+                self._images[key[0]] = key, image
+        return image
 
 
 class _Handler(BaseHTTPRequestHandler):

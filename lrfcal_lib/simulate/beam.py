@@ -1,7 +1,5 @@
 """A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and beams one after another."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -160,7 +158,7 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / distance**2 / beam.rays
     shape = len(bearings), beam.rays
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    return reading, total, world.dazzling(hits.thing).reshape(shape).any(axis=1)
+    return reading, total, world.dazzling[hits.thing].reshape(shape).any(axis=1)
 
 
 def measured(beam, reading, total, dazzled, rng):

@@ -1,7 +1,5 @@
 """Record a session with a simulated rig: telegrams, platform log, images and the truth."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math

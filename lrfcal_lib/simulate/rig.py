@@ -1,7 +1,5 @@
 """The simulated rig, the set-ups by name (``setups.json``), and the places that the board is put."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, replace
@@ -115,8 +113,9 @@ class Rig:
         return {"T_head_lrf": head, "cameras": cameras, "board": board}
 
     def outline(self, T_platform_board):
-        """Corners of the board in the platform frame, shape (n, 3)."""
-        return T_platform_board.apply(_flat(self.board.known_corners()))
+        """Corners of the board in the platform frame (or a camera's, by its pose there), shape (n, 3)."""
+        corners = self.board.known_corners()
+        return T_platform_board.apply(np.column_stack([corners, np.zeros(len(corners))]))
 
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
@@ -137,7 +136,7 @@ class Rig:
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
         """Whether a camera sees points of the board, its corners by default, inside the image by a margin in pixels."""
-        p = T_camera_board.apply(_flat(self.board.known_corners()) if points is None else points)
+        p = self.outline(T_camera_board) if points is None else T_camera_board.apply(points)
         if p[:, 2].min() < 0.1 or np.abs(p[:, :2] / p[:, 2:]).max() > 1.0:
             return False
         uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
@@ -325,8 +324,3 @@ def held_close(rig, camera, count, rng):
             raise ValueError(f"the pattern of board '{rig.board.name}' does not fit into {where}")
         out.append(pose)
     return out
-
-
-def _flat(corners):
-    """Corners (n, 2) of a board as points of its frame, shape (n, 3)."""
-    return np.column_stack([corners, np.zeros(len(corners))])

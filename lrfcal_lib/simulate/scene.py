@@ -5,8 +5,6 @@ A row of ``room.json`` is a shape and a texture with their settings (functions o
 Its numbers are kept to the last bit: the shipped sessions are rebuilt from them to the byte.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -246,6 +244,7 @@ class World:
     def __init__(self, things, lights=None):
         need(things, "a world needs at least one thing to see, got none")
         self.things, self.lights = tuple(things), lights
+        self.dazzling = np.array([t.dazzles for t in things] + [False])  # by the number of a thing, the last: nothing
         vertices = [thing.pose.apply(thing.mesh[0]) for thing in self.things]
         starts = np.cumsum([0] + [len(v) for v in vertices[:-1]])
         faces = np.concatenate([t.mesh[1] + s for t, s in zip(self.things, starts, strict=True)])
@@ -289,10 +288,6 @@ class World:
         ask = np.isnan(out)
         out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
         return out
-
-    def dazzling(self, thing):
-        """Whether things dazzle the LRF, shape (n,)."""
-        return np.array([t.dazzles for t in self.things] + [False])[thing]
 
     def radiance(self, origins, directions, hits):
         """Light that comes back along rays, linear, shape (n, 3).
