@@ -497,13 +497,6 @@ def test_partial_feedback_and_none():
         EmulatedHead(path="head", feedback="some")
 
 
-def test_an_upside_down_head():
-    one = at_head(invert=True)
-    one.send(UP, wait=0.5)
-    assert moved(one, 0.5) < -1
-    assert one.send(TO_30, wait=9.0) == b"" and np.degrees(one.device.pitch()) == pytest.approx(-30, abs=0.02)
-
-
 def test_play_of_the_gear_and_stretch():
     head = Head(Platform(backlash=0.01, stretch=0.02, settle=0.0))
     head.move(1.0, 0.5, 0.1)

@@ -149,7 +149,7 @@ def test_simulate_writes_a_session(tmp_path, tiny):
 
 def test_an_existing_folder_is_left_alone(tmp_path, tiny, capsys):
     (tmp_path / "s").mkdir()
-    with pytest.raises(record.SimulationError, match="exists already"):
+    with pytest.raises(ValueError, match="exists already"):
         record.simulate(tmp_path / "s", tiny)
     assert main(["simulate", "sim_quick", str(tmp_path / "s")]) == 1 and "exists already" in capsys.readouterr().err
     assert list((tmp_path / "s").iterdir()) == []
@@ -166,7 +166,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, after):
         real(handle)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(record.SimulationError, match="No space left on device.*free some space; nothing was kept"):
+    with pytest.raises(ValueError, match="No space left on device.*free some space; nothing was kept"):
         record.simulate(tmp_path / "s", tiny)
     assert list(tmp_path.iterdir()) == []
 

@@ -29,10 +29,6 @@ SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACE
 REPLY_TIME = 0.0016 + 0.016  # s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
 
 
-class SimulationError(ValueError):
-    """A session that cannot be simulated or written; nothing is left behind."""
-
-
 class Stops(NamedTuple):
     """The head at rest, one after the other: pitch, radians, shape (n,)."""
 
@@ -123,22 +119,22 @@ def simulate(path, setup, workers=1):
 
     Raises
     ------
-    SimulationError
+    ValueError
         If the folder exists, the board does not fit into the views, or the session cannot be written (a full disk).
         The session is made beside its place and moved there when it is complete; nothing is left of a failed one.
     """
     path = Path(path)
     if path.exists():
-        raise SimulationError(f"{path}: exists already; choose another name or remove it first")
+        raise ValueError(f"{path}: exists already; choose another name or remove it first")
     draft = path.with_name(f".{path.name}.draft{os.getpid()}")
     try:
         _record(draft, path.name, setup, workers)
         draft.rename(path)
     except OSError as error:
         full = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
-        raise SimulationError(f"{path}: cannot be written ({error.strerror}){full}; nothing was kept") from error
+        raise ValueError(f"{path}: cannot be written ({error.strerror}){full}; nothing was kept") from error
     except ValueError as error:
-        raise SimulationError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {error}") from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 
