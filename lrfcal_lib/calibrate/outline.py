@@ -367,16 +367,14 @@ def fused_outline_of(joint, placement):
     solution, prepared = joint.without.get(placement, joint.solution), joint.prepared
     points, pitch = solution.correct(placement, *face_points(prepared.scans[placement])[:2])
     face = lrf_to_platform(points, pitch, solution.T_head_lrf)
-    centre = face.mean(axis=0)
-    normal = np.linalg.svd(face - centre, full_matrices=False)[2][2]
-    sides = {}
+    pose, sides = plane_frame(face), {}
     for camera, views in prepared.views.items():
         view = views.get(placement)
         if view is None or camera not in solution.transforms:
             continue
         T_platform_camera = solution.camera_at(camera, solution.correct(placement, np.zeros(3), view.pitch)[1]).inv()
         for edge in view.edges:
-            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, centre, normal)
+            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, pose[:3, 3], pose[:3, 2])
             sides.setdefault(edge.name, []).append(points)
     if not sides:
         raise DegenerateGeometry(f"placement {placement}: no image shows an edge of the board")

@@ -54,11 +54,6 @@ class PlatformCalibration:
     stated_sigma: tuple
 
     @property
-    def T_head_lrf(self):
-        """The platform to use."""
-        return self.axes["combined"][0]
-
-    @property
     def covariance(self):
         """Of its axis, shape (4, 4)."""
         return self.axes["combined"][1]
@@ -167,7 +162,7 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     """
     prepared = prepare(session)
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
-    observations = observe_all(prepared, platform.T_head_lrf)
+    observations = observe_all(prepared, platform.transform("combined"))
     found = Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
     return with_joint(found) if joint and prepared.views else found
 

@@ -14,11 +14,11 @@ from scipy.stats import norm
 from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import edge_shift, flip_sigma, named_blocks
-from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.solvers.joint import UNSEEN
+from lrfcal_lib.solvers.joint import UNSEEN, WORDS
 
 FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # upright ahead of the LRF, print towards it
 LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
@@ -38,10 +38,6 @@ ALONG = (np.arange(5) + 0.5) / 5  # an edge
 CHUNK = 400  # placements at a time: memory
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 LARGE, MOST = 0.5, 3  # of a direction, components above this share of the largest are named, and so many of them
-OTHERS = {
-    "range_offset": "the range offset", "edge_log_odds": "the edge bias", "pitch_scale": "the scale of the pitch",
-    "pitch_by_direction": "the pitch offset by sweep direction",
-}  # fmt: skip
 
 
 def outline(solution):
@@ -312,15 +308,14 @@ def observability(solution):
     values, vectors = np.linalg.eigh(H)
     least, cameras = max(1e-13 * values[-1], UNSEEN**-2), tuple(solution.transforms)
     sigmas = np.where(values > least, np.maximum(values, least) ** -0.5, np.inf)
-    words = [direction_words(x, names[index], cameras) for x in vectors.T]
-    return [Direction(*pair) for pair in zip(words, sigmas.tolist(), strict=True)]
+    found = zip(vectors.T, sigmas.tolist(), strict=True)
+    return [Direction(direction_words(x, names[index], cameras), sigma) for x, sigma in found]
 
 
 def direction_words(direction, names, cameras):
     """A direction (k,) of unknowns, scaled to metres at 2 m, in words; what cameras have in common is said once."""
     value = dict(zip(names, np.asarray(direction) / np.max(np.abs(direction)), strict=True))
-    single = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | OTHERS
-    words = [(abs(value[n]), w) for n, w in single.items() if n in value]
+    words = [(abs(value[name]), what) for name, what in WORDS.items() if name in value]
     for kind, part in (("rotation about", geometry.POSE_NAMES[:3]), ("shift along", geometry.POSE_NAMES[3:])):
         found = {f"camera '{c}'": np.array([value[f"{c}_{p}"] for p in part]) for c in cameras}
         mean = np.mean([*found.values()], axis=0) if found else 0.0

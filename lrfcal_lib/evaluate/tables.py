@@ -11,7 +11,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
 from lrfcal_lib.evaluate.next_placement import outline
@@ -169,8 +169,7 @@ def poses_under(obs, model):
             start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
             seen = obs.pattern_points[good], pixels[good], model.matrix, model.distortion
             _, rotvec, shift = cv2.solvePnP(*seen, *start, useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE)
-            turn = Rotation.from_rotvec(rotvec[:, 0])
-            pose[:] = RigidTransform.from_components(shift[:, 0], turn).as_matrix()
+            pose[:3, :3], pose[:3, 3:] = cv2.Rodrigues(rotvec)[0], shift
     return moved
 
 
