@@ -7,7 +7,7 @@ import pytest
 from joint_draws import draw, none
 from test_joint import random_problem
 
-from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, groups_of, monte_carlo, spread, state_errors
+from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, spread, state_errors
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, move_state, named_blocks
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -61,13 +61,10 @@ def test_units():
     assert wide.unit.tolist() == ["deg", "deg", "mm", "mm", ""]
     turn = np.degrees(np.sqrt(np.mean(np.sum(trials.errors[:, :2] ** 2, axis=1))))
     assert wide.rmse[0] == pytest.approx(turn)
-    assert groups_of(("size_ab", "edge_log_odds"))["board size"][1] == "mm"
-
-
-def test_spread_is_the_root_of_the_trace_in_its_unit():
-    found = spread(np.diag(np.square([0.003, 0.004, 0.02, 0.005, 0.001])), NAMES)
+    found = spread(np.diag(np.square([0.003, 0.004, 0.02, 0.005, 0.001])), NAMES)  # the root of the trace
     expected = {"axis direction": np.degrees(0.005), "left rotation": np.degrees(0.02)}
     assert found == pytest.approx(expected | {"left translation": 5.0, "range offset": 1.0})
+    assert list(spread(np.eye(1), ("size_ab",)).values()) == [1000.0]
 
 
 def test_bad_trials_are_refused():

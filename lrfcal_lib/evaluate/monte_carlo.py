@@ -228,20 +228,10 @@ def _freedom(C):
 
 
 def observations(shots, setup, last_beam=False):
-    """Drawn shots as the preprocessing makes observations of a scan line, with a leading trial axis.
+    """Drawn shots as the preprocessing makes CameraObservations of a scan line, with a leading trial axis.
 
-    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24 face points.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-    last_beam : bool
-
-    Returns
-    -------
-    CameraObservations
+    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24 face points. `shots`
+    and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
     """
     ranges, bearings, (t, p, _) = shots["ranges"], setup.bearings(), shots["ranges"].shape
     flat, half = ranges.reshape(t * p, -1), np.array([-0.5, 0.5]) * setup.step

@@ -50,14 +50,10 @@ def outline(solution):
 def board_grid(solution, distances, bearings, elevations, turns, leans):
     """All combinations of a grid of poses, visible or not; every lean above zero in four directions.
 
-    Returns
-    -------
-    places : DataFrame
-        distance of the board's middle from the LRF (metres), bearing to the left, elevation, turn in the board's plane
-        (anticlockwise as the rig sees it; 0 with the board's x to the right), lean out of the upright plane that faces
-        the LRF (radians), towards ('back' with the top farther away, 'forward', 'left', 'right'; '' upright).
-    boards : ndarray, shape (n, 3, 4)
-        ``T_platform_board``.
+    A DataFrame with distance of the board's middle from the LRF (metres), bearing to the left, elevation, turn in the
+    board's plane (anticlockwise as the rig sees it; 0 with the board's x to the right), lean out of the upright plane
+    that faces the LRF (radians), towards ('back' with the top farther away, 'forward', 'left', 'right'; '' upright);
+    and ``T_platform_board``, shape (n, 3, 4).
     """
     leant = [(lean, way) for lean in leans for way in LEANS if bool(lean) == bool(way)]
     places = [(*place, *lean) for *place, lean in product(distances, bearings, elevations, turns, leant)]
@@ -165,14 +161,11 @@ def _view_covariance(pose, features, model):
 
 def _inner(solution, number):
     """Points spread over the board, shape (n, 3)."""
-    corners = outline(solution)[:, :2]
+    corners, middle = outline(solution), (np.arange(number) + 0.5) / number
     low, high = corners.min(axis=0), corners.max(axis=0)
-    middle = (np.arange(number) + 0.5) / number
-    x = np.stack(np.meshgrid(*(low[i] + middle * (high - low)[i] for i in (0, 1))), -1).reshape(-1, 2)
-    along, away = np.roll(corners, -1, axis=0) - corners, x[:, None] - corners
-    side = along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0]
-    x = x[np.all(side > 0, axis=1) | np.all(side < 0, axis=1)]
-    return np.column_stack([x, np.zeros(len(x))])
+    x = low + np.stack(np.meshgrid(middle, middle, [0.0]), axis=-1).reshape(-1, 3) * (high - low)
+    side = np.cross(np.roll(corners, -1, axis=0) - corners, x[:, None] - corners)[..., 2]
+    return x[np.all(side > 0, axis=1) | np.all(side < 0, axis=1)]
 
 
 def _sampled(boards, local, solution, rate):

@@ -30,7 +30,6 @@ from lrfcal_lib.solvers.joint_noise import on_board
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
-USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
 ALL = 10**9  # crossings
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
@@ -62,16 +61,8 @@ def rms(values):
 class Truth:
     """What a simulated session was made with.
 
-    Attributes
-    ----------
-    T_head_lrf : RigidTransform
-    cameras : dict of str to RigidTransform
-        ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base.
-    board : Board
-    boards : dict of int to RigidTransform
-        ``T_platform_board`` by placement.
-    pitch : dict of int to ndarray, shape (n_scan_lines,)
-        Of every scan line, radians.
+    `cameras` are ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base; `boards`
+    ``T_platform_board`` by placement, `pitch` that of every scan line by placement, radians.
     """
 
     T_head_lrf: RigidTransform
@@ -239,7 +230,8 @@ def method_comparison(observations, solutions, truth=None, joint=None):
             held = () if joint is None else jointly_left_out(joint, camera)
         else:
             own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
-            used, held = getattr(own, USED[METHODS[name].uses]), left_out(own, judge, name, solution)
+            used = own.placements if METHODS[name].uses == "plane" else getattr(own, f"{METHODS[name].uses}_placement")
+            held = left_out(own, judge, name, solution)
         edge, held = edge_residuals_px(judge, solution.transform, solution.model), left_out_residuals(held)
         row = {
             "camera": camera, "method": name, "n_placements": len(np.unique(used)),
@@ -580,7 +572,8 @@ def size_error(joint):
     bias. The error is the mean relative one of the lengths whose ends beams decide; NaN with fewer than three
     placements, or where nobody knows the outline.
     """
-    prepared, model = joint.prepared, replace(joint.edge_model(), range_offset=0.0)
+    prepared, model = joint.prepared, joint.edge_model()
+    model = replace(model, sensor=model.sensor | {"range_offset": 0.0})
     if prepared.board.corners is None:
         return np.nan, np.nan
     true, edges, found = prepared.board.lengths(), prepared.board.edges, []
@@ -591,8 +584,8 @@ def size_error(joint):
             found += [np.mean(own)] if own else []
     if len(found) < 3:
         return np.nan, np.nan
-    slope = edge_shift(model.log_odds, np.median(joint.observations.beam_radius))[1]
-    bias = 2 * slope * model.log_odds_sigma / np.mean(list(true.values()))
+    slope = edge_shift(model.sensor["edge_log_odds"], np.median(joint.observations.beam_radius))[1]
+    bias = 2 * slope * model.sigma.get("edge_log_odds", 0.0) / np.mean(list(true.values()))
     offset = prepared.session.lrf.admitted_offset / np.median(joint.observations.face_range)
     return float(np.mean(found)), float(np.linalg.norm([np.std(found, ddof=1) / np.sqrt(len(found)), offset, bias]))
 

@@ -159,8 +159,8 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
     cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
     looks = {"image_pitch": sum(field) / 2, "pitches": field}
     maps = {"cloud_mm": 1000 * cloud.rms()} | {
-        f"{camera}_px": projection_sigma(chains[camera], camera, model, DISTANCES, (12, 9), **looks).rms()
-        for camera, model in models.items() if camera in chains
+        f"{camera}_px": projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks).rms()
+        for camera, chain in chains.items() if camera is not None
     }  # fmt: skip
     errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
