@@ -601,11 +601,10 @@ def random_halves(joint, pairs=8):
     rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
     for pair in range(pairs):
         parts = np.array_split(rng.permutation(numbers), 2)
-        try:
+        halves = []
+        with suppress(DegenerateGeometry):
             halves = [solve_again(joint.observations.select(np.sort(part)), joint.solution) for part in parts]
-        except DegenerateGeometry:
-            continue
-        for camera in joint.observations.cameras:
+        for camera in joint.observations.cameras if halves else ():
             turn, shift = geometry.transform_difference(*(half.transforms[camera] for half in halves))
             lens = np.diag(joint.solution.lens)[joint.solution.columns(f"{camera}_")]
             sigma = 2 * np.sqrt(np.maximum(joint.solution.camera(camera).trusted_sigma ** 2 - lens, 0.0))

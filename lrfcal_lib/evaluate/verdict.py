@@ -136,16 +136,13 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
-    suggestion, problem = None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
     found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
-    if suggest:
-        try:
-            suggestion = suggest_placement(solution, models, **options)
-        except DegenerateGeometry as error:
-            problem = f"No placement can be suggested: {error}."
-    return replace(found, suggestion=suggestion, no_suggestion=problem)
+    try:
+        return replace(found, suggestion=suggest_placement(solution, models, **options) if suggest else None)
+    except DegenerateGeometry as error:
+        return replace(found, no_suggestion=f"No placement can be suggested: {error}.")
 
 
 def _expected(chains, models, pitch, noise, reasons, doubt):
