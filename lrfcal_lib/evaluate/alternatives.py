@@ -9,12 +9,15 @@ import numpy as np
 
 from lrfcal_lib.fit.least_squares import eliminate, whiten
 from lrfcal_lib.fit.residuals import named_blocks
+from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
 from lrfcal_lib.solvers.joint import gathered
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
+FAR = 4.0  # standard deviations of the stated axis and its own
+FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
 LARGER = ("larger", "smaller")
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
 
@@ -72,11 +75,6 @@ ALTERNATIVES = {
         }), 0.004, 100.0, ("small", "large"),
         "bearings are {size} +- {sigma} % too {sign}", "check the angular step that session.json states",
     ),
-    "image pitch": Alternative(
-        lambda obs, s: replace(obs, view_pitch=obs.view_pitch + s), np.radians(0.1), np.degrees(1.0),
-        ("above", "below"), "images were taken at a pitch {size} +- {sigma} deg {sign} the recorded one",
-        "check that the head rests when images are taken, and their times",
-    ),
 }  # fmt: skip
 
 
@@ -91,7 +89,7 @@ class Doubt:
     words: str
 
 
-def tested(solution, admitted_offset):
+def weigh(solution, admitted_offset):
     """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest first.
 
     A score test at the solution: no estimate is repeated. The standard deviation is the larger one of noise and scatter
@@ -135,6 +133,43 @@ def tested(solution, admitted_offset):
 
 def doubtful(solution, admitted_offset):
     """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well."""
-    found = tested(solution, admitted_offset)
+    found = weigh(solution, admitted_offset)
     asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
     return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
+
+
+def far_from_stated(joint):
+    """What lies far from where session.json puts it (JointCalibration): list of words and by what angle (radians).
+
+    A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of the other sense turns
+    the axis about: only the statement of the platform, or a camera's guess, can tell.
+    """
+    session, solution, far = joint.prepared.session, joint.solution, []
+    why = "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras look like this"
+    if session.T_head_lrf is not None and joint.settings["axis"]:
+        found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
+        own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
+        if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
+            far.append((f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}", found[0]))
+    for camera, pose in solution.transforms.items():
+        guess = session.cameras[camera].guess
+        if guess is not None:
+            turn, shift = transform_difference(pose, guess)
+            if turn > FAR_TURN or shift > FAR_SHIFT:
+                far.append((f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn))
+    return far
+
+
+def _apart(angle, distance):
+    return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
+
+
+def places_of_cameras(solution):
+    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it here."""
+    words = []
+    for camera in solution.transforms:
+        x, y, z = 1000 * (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+        sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
+        places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
+        words.append(f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder.")
+    return words
