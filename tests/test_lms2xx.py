@@ -117,7 +117,7 @@ REFUSED = [
     (lms2xx_codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
     (lms2xx_codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
     (lms2xx_codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
-    (lms2xx_codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
+    (lms2xx_codec.parse_type, A0[:-1], "states 9 bytes, got 8"),
     (lambda block: lms2xx_codec.Configuration(block).unit, b"\0\0\0\0\0\0\7", "unit 7 is neither 0"),
     (lambda values: scan_quarters(*values), (100,), "101, 181, 201, 361, 401 values, got 100"),
     (lambda values: scan_quarters(*values), (181, 1), "partial scan 1 has 180 values, got 181"),
@@ -315,12 +315,9 @@ def test_the_factory_configuration_is_that_of_an_outdoor_device():
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
-def test_type_and_errors():
+def test_the_type_is_told():
     by_head = {text[12:17]: bytes.fromhex(text) for text in FROM_DEVICE}
     assert lms2xx_codec.parse_type(by_head["BA 4C"]) == ("LMS221", "302063", "X01.27")
-    assert lms2xx_codec.parse_errors(by_head["B2 10"]) == []
-    old = encode_telegram(0xB2, bytes.fromhex("84 16 01 31 07 02"), status=0x12)
-    assert lms2xx_codec.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
 
 
 # --------------------------------------------------------------------------------------------- real recordings

@@ -94,8 +94,7 @@ def _parse_contents(rng, seeds, count):
 def _parse_single(rng, seeds, count):
     """Damaged contents with sound checksums, and damaged frames, one string after the other."""
     outcomes = {True: 0, False: 0}
-    parsers = {0xB0: decode_scan, 0xB1: lms2xx_codec.parse_status, 0xB2: lms2xx_codec.parse_errors,
-               0xBA: lms2xx_codec.parse_type,
+    parsers = {0xB0: decode_scan, 0xB1: lms2xx_codec.parse_status, 0xBA: lms2xx_codec.parse_type,
                0xF4: lms2xx_codec.parse_configuration, 0xF7: lms2xx_codec.parse_configuration}  # fmt: skip
     for seed in seeds:
         parse = parsers.get(int(seed[4]), parse_telegram)
