@@ -16,12 +16,10 @@ import nbformat
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.spatial.transform import RigidTransform
+from test_session import wall, write
 
-from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.report import notebook, report
-from lrfcal_lib.session.stated import LrfInfo, SessionError
-from lrfcal_lib.session.write import SessionWriter
+from lrfcal_lib.session.stated import SessionError
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 GOOD = """
@@ -42,14 +40,7 @@ notebook.table(pd.DataFrame({"edge": ["ab", "ca"], "error_mm": [-2.0, float("nan
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A recording of one flat wall."""
-    path = tmp_path_factory.mktemp("sessions") / "wall"
-    bearings = np.radians(np.arange(60.0, 121.0))
-    lrf = LrfInfo("made up", (bearings[0], bearings[-1]), np.radians(1.0), 0.005, 0.0, 0.001, 8.0)
-    writer = SessionWriter(path, triangle_board(), lrf, (), RigidTransform.identity(), source="a wall", simulated=True)
-    with writer:
-        ranges = np.full((4, 1), 2.0) / np.sin(bearings)
-        writer.add_sweep(1, ranges, bearings, np.radians([-1.0, 0.0, 1.0, 2.0]))
-    return path
+    return write(tmp_path_factory.mktemp("sessions") / "wall", wall(), simulated=True)
 
 
 def write_notebook(path, *cells):
@@ -228,7 +219,7 @@ def test_the_shipped_session_comes_first_and_without_any_it_says_how_to_get_one(
         report.default_session()
 
 
-def test_storing_keeps_outputs_of_simulations_only(session, tmp_path):
+def test_storing_keeps_outputs_of_simulations_only_and_nothing_of_what_fails(session, tmp_path):
     path = write_notebook(tmp_path / "00_x.ipynb", GOOD, "print(session.name)")
     assert report.store(path, session) == ""
     assert nbformat.read(path, 4).cells[2].outputs[0].text == "wall\n"
@@ -240,11 +231,7 @@ def test_storing_keeps_outputs_of_simulations_only(session, tmp_path):
     assert report.store(path, recording) == ""
     cells = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in cells] == [1, 2] and not any(cell.outputs for cell in cells)
-
-
-def test_a_notebook_that_fails_is_not_stored(tmp_path):
-    path = write_notebook(tmp_path / "00_x.ipynb", "1 / 0")
-    before = path.read_bytes()
+    before = write_notebook(path, "1 / 0").read_bytes()
     assert "ZeroDivisionError" in report.store(path, None) and path.read_bytes() == before
 
 
