@@ -191,7 +191,7 @@ class SessionWriter:
             content = cv2.imencode(".png", image)[1].tobytes()
         elif not isinstance(image, bytes):
             what, content = image, stated.read_bytes(image)
-        read.check_image_size(what, read.size_in_header(what, content), self.cameras[camera])
+        read.check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
         kind = "jpg" if content[:2] == b"\xff\xd8" else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
