@@ -1,9 +1,9 @@
 """Damaged and hostile sessions and rig files, one after the other: ``python tests/fuzz.py`` (or ``make fuzz``).
 
 A case is a number: it seeds what is damaged and what is done with it, so ``--case N`` repeats it. Cases run in
-processes that may take 500 MB and, for each case, 20 s of a processor. Whatever comes out has to be an error of ours; nothing outside
-of the session's folder is to be opened, which the kernel (inotify, for a folder that links and names lead to) and
-Python's audit events (for all absolute paths) tell.
+processes that may take 500 MB and, for each case, 20 s of a processor. Whatever comes out has to be an error of ours;
+nothing outside of the session's folder is to be opened, which the kernel (inotify, for a folder that links and names
+lead to) and Python's audit events (for all absolute paths) tell.
 """
 
 import argparse

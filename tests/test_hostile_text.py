@@ -3,11 +3,11 @@
 import csv
 import json
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+from shared import QUICK, ROOT
 from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_report import write_notebook
 
@@ -17,8 +17,6 @@ from lrfcal_lib.report import notebook, report
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.read import validate
 
-ROOT = Path(__file__).resolve().parents[1]
-QUICK = ROOT / "data" / "sim_quick"
 IMAGE = '"><img src=x onerror="window.pwned=1">'
 HOSTILE = f"{IMAGE}</title></script></pre></textarea><script>window.pwned=1</script>&lt;b&gt;"
 # every text of session.json by its place; whether it is refused, or else what a report shows

@@ -116,7 +116,7 @@ def line(tmp_path):
 
 def waiting(path, tmp_path):
     cell = f"open({str(tmp_path / 'here')!r}, 'w').write('.'); open({str(tmp_path / 'go')!r}).read(1)"
-    return write_notebook(path, GOOD, cell, 'notebook.finding("late", 2, "Found late")')
+    return write_notebook(path, cell, GOOD, 'notebook.finding("late", 2, "Found late")')
 
 
 def wait_until_there(line):
@@ -149,7 +149,11 @@ def test_two_reports_at_once_lose_nothing(session, tmp_path, line):
     assert parts(tmp_path) == []
 
 
-RUN = "import sys, pathlib; from lrfcal_lib.report import report; report.NOTEBOOKS = pathlib.Path(sys.argv[1])\n"
+RUN = """import sys, pathlib
+sys.modules["rfc3987_syntax"] = None  # see conftest.py
+from lrfcal_lib.report import report
+report.NOTEBOOKS = pathlib.Path(sys.argv[1])
+sys.exit(report.main(sys.argv[2:]))"""
 ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129, signal.SIGKILL: -9}
 
 
@@ -159,8 +163,7 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
     report.make_report(session, out, notebooks=[])
     before = {file.name: file.read_bytes() for file in out.glob("*.*")}
     waiting(tmp_path / "00_late.ipynb", tmp_path)
-    command = [sys.executable, "-c", RUN + "sys.exit(report.main(sys.argv[2:]))"]
-    command += [str(tmp_path), str(session), "--out", str(out)]
+    command = [sys.executable, "-c", RUN, str(tmp_path), str(session), "--out", str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         wait_until_there(line)
         report.make_report(session, out.with_name("other"), notebooks=[])

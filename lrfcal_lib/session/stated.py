@@ -394,9 +394,9 @@ class BoardStated(BaseModel):
 def board_to_json(board):
     """A board as it stands in session.json."""
     p = board.pattern
-    shape = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows, "square_m": p.square, "origin_m": p.origin}
-    named = {"name": board.name, "edges": board.edges, "features": board.features}
-    return plain({**named, "corners_m": board.corners, "pattern": shape})
+    grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
+    named = {"name": board.name, "edges": board.edges, "features": board.features, "corners_m": board.corners}
+    return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
 
 
 def board_from_json(data):
