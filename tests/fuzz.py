@@ -7,7 +7,6 @@ lead to) and Python's audit events (for all absolute paths) tell.
 """
 
 import argparse
-import collections
 import ctypes
 import io
 import json
@@ -311,19 +310,22 @@ def use(rng, path):
     """Everything that reads a session, and some that writes; the errors that came out."""
     if (path / "rig.json").exists():
         return [_caught(read_rig_file, path / "rig.json")]  # what it names belongs to who wrote it
-    out = [_caught(_read, path, [None, rng.random() < SURVEYED][rng.integers(2)])]
-    if rng.random() < 0.3:
-        out.append(_caught(_go_on if rng.random() < 0.7 else finish, path))
-    return out
+    surveyed = rng.random() < SURVEYED
+    read = [validate, _survey if surveyed else read_all][rng.integers(2)]
+    writing = [_go_on if rng.random() < 0.7 else finish] * (rng.random() < 0.3)
+    return [_caught(work, path) for work in (read, *writing)]
 
 
-def _read(path, images):
-    if images is None:
-        return validate(path)
+def _survey(path):
+    views_of(read_all(path))
+
+
+def read_all(path):
+    """What `calibrate` reads of a session besides its images."""
     session = open_session(path)
     read_truth(session)
     file_hashes(session)
-    return views_of(session) if images else None
+    return session
 
 
 def _go_on(path):
@@ -340,7 +342,7 @@ def _caught(work, *arguments):
         if "MemoryError" in trace or "nsufficient memory" in trace:
             return "memory", repr(error)[:300], trace
         ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
-        if work is _read and frames[-1].filename.startswith(LIBRARY):
+        if work in (read_all, _survey) and frames[-1].filename.startswith(LIBRARY):
             ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
         if not isinstance(error, tuple(ours)):
             place = next(f for f in reversed(frames) if f.filename.startswith(LIBRARY) or f is frames[0])
@@ -452,9 +454,8 @@ def run(cases, first, seed, workers, tell):
 def main():
     """From the command line."""
     options = argparse.ArgumentParser(description=__doc__)
-    for name, value in (("cases", 200_000), ("first", 0), ("seed", SEED), ("workers", os.cpu_count())):
+    for name, value in (("cases", 200_000), ("first", 0), ("seed", SEED), ("workers", os.cpu_count()), ("case", None)):
         options.add_argument(f"--{name}", type=int, default=value)
-    options.add_argument("--case", type=int, help="repeat one case, with its traceback")
     options.add_argument("--out", default="reports/fuzz/findings.jsonl", help="file for the findings, one a line")
     asked = options.parse_args()
     if asked.case is not None:
@@ -464,13 +465,8 @@ def main():
     found = run(asked.cases, asked.first, asked.seed, asked.workers, tell)
     Path(asked.out).parent.mkdir(parents=True, exist_ok=True)
     Path(asked.out).write_text("".join(json.dumps({"seed": asked.seed, "finding": f}) + "\n" for f in found))
-    groups = collections.defaultdict(list)
     for number, kind, text, trace in found:
-        groups[kind, ":".join(text.split(":")[:2])[:100]].append(number)
-        if asked.case is not None:
-            print(trace)
-    for (kind, what), numbers in groups.items():
-        print(f"{len(numbers):6} {kind} {what}, for instance --seed {asked.seed} --case {numbers[0]}")
+        print(f"{kind} {text}: --seed {asked.seed} --case {number}", trace * (asked.case is not None), sep="\n")
     print(f"{asked.cases} cases in {time.monotonic() - began:.0f} s, {len(found)} findings (in {asked.out})")
     return bool(found)
 

@@ -11,8 +11,6 @@ import fuzz
 import numpy as np
 import pytest
 
-from lrfcal_lib.evaluate.export import file_hashes
-from lrfcal_lib.evaluate.tables import read_truth
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
@@ -34,12 +32,6 @@ def folder(sound, tmp_path):
     return shutil.copytree(sound, tmp_path, dirs_exist_ok=True)
 
 
-def read_all(path):
-    session = open_session(path)
-    read_truth(session)
-    file_hashes(session)
-
-
 def large(file):
     for one in (file, file.with_name("unrelated")):
         one.touch()
@@ -58,7 +50,7 @@ def test_only_plain_files_of_a_size_are_read(folder, name, told):
     (folder / name).unlink()
     OTHERS[told](folder / name)
     with pytest.raises(SessionError, match=f"{re.escape(name)}: {told}"):
-        read_all(folder / name.partition("/")[0])
+        fuzz.read_all(folder / name.partition("/")[0])
 
 
 @pytest.mark.parametrize("name", ["lrf", "images", "images/left"])
@@ -137,7 +129,7 @@ DAMAGE = {
 def test_what_a_file_promises_is_checked_before_it_is_unpacked(folder, message):
     DAMAGE[message](folder / "scans")
     with pytest.raises(SessionError, match=message):
-        read_all(folder / ("telegrams" if message.startswith("index") else "scans"))
+        fuzz.read_all(folder / ("telegrams" if message.startswith("index") else "scans"))
 
 
 def test_opencv_s_refusals_are_errors_in_the_values():

@@ -1,6 +1,5 @@
 """Text of a session is text: it is refused, or nothing of it runs in a page and all of it can be read there."""
 
-import csv
 import json
 import shutil
 from types import SimpleNamespace
@@ -57,12 +56,10 @@ def replace(folder, old, new):
 
 
 def rename_image(folder, name):
-    with (folder / "images.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    old, rows[1][2] = rows[1][2], f"images/left/{name}"
-    (folder / old).rename(folder / rows[1][2])
-    with (folder / "images.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+    table = pd.read_csv(folder / "images.csv", dtype=str)
+    old, table.loc[0, "file"] = table.file[0], f"images/left/{name}"
+    (folder / old).rename(folder / table.file[0])
+    table.to_csv(folder / "images.csv", index=False, lineterminator="\n")
 
 
 @pytest.fixture
