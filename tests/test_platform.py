@@ -32,7 +32,7 @@ from lrfcal_lib.model.geometry import (
 )
 from lrfcal_lib.solvers import pitch as pitch_solver
 from lrfcal_lib.solvers import platform
-from lrfcal_lib.solvers.pitch import MODELS, SweepPoints, estimate_pitch_errors, pitch_of
+from lrfcal_lib.solvers.pitch import MODELS, estimate_pitch_errors
 from lrfcal_lib.solvers.platform import PlatformObservations, projected_block, solve_platform, solve_projected
 
 DIRECTION = np.array([0.9993, 0.02, -0.0317])
@@ -258,40 +258,26 @@ def pitched(seed, offset, stretch, *, count=24, noise=0.0, cameras=("left",)):
     rig = random_rig(rng)
     poses = random_board_poses(rng, count, rig, spread=0.7)
     obs = camera_observations(rng, rig, poses, noise=0.0, source="platform", face=80)
-    points, pitch = meet(obs.plane_points, TRUTH)
-    middle = np.array([pitch[obs.plane_placement == p].mean() for p in range(1, count + 1)])
-
-    def recorded(true, placement):
-        m, o, s = (np.broadcast_to(x, count)[placement - 1] for x in (middle, offset, stretch))
-        return m + (true - m - o) / (1 + s)
-
-    def ranged(p):
-        return p + noise * rng.normal(size=(len(p), 1)) * p / np.linalg.norm(p, axis=1, keepdims=True)
-
-    crossings, at = meet(obs.crossing_points, TRUTH)
-    crossings = lrf_to_platform(ranged(crossings), recorded(at, obs.crossing_placement), TRUTH)
+    middle = np.array([meet(obs.plane_points[obs.plane_placement == p], TRUTH)[1].mean() for p in range(1, count + 1)])
+    given = {}
+    for name in ("crossing", "plane"):
+        (p, true), rows = meet(getattr(obs, f"{name}_points"), TRUTH), getattr(obs, f"{name}_placement") - 1
+        m, o, s = (np.broadcast_to(x, count)[rows] for x in (middle, offset, stretch))
+        pitch = m + (true - m - o) / (1 + s)
+        p = p + noise * rng.normal(size=(len(p), 1)) * p / np.linalg.norm(p, axis=1, keepdims=True)
+        given |= {f"{name}_points": lrf_to_platform(p, pitch, TRUTH), f"{name}_pitch": pitch}
     direction = {p: 1 if p % 2 else -1 for p in range(1, count + 1)}
-    middles = dict(enumerate(middle, start=1))
-    pitch = recorded(pitch, obs.plane_placement)
-    sweeps = SweepPoints(ranged(points), pitch, obs.plane_placement, TRUTH, direction, middles)
-    return rig, sweeps, {name: replace(obs, crossing_points=crossings) for name in cameras}
-
-
-def test_pitch_of_platform_points():
-    obs = make(30, count=6)
-    p = lrf_to_platform(obs.points, obs.pitch, TRUTH)
-    np.testing.assert_allclose(pitch_of(p, TRUTH, obs.pitch + 0.2), obs.pitch, atol=1e-12)
-    assert np.isnan(pitch_of(np.array([[0.0, 0.001, 0.0]]), TRUTH, np.zeros(1))).all()
+    sweeps = {name: replace(obs, **given) for name in cameras}, direction, dict(enumerate(middle, start=1))
+    return rig, sweeps
 
 
 @pytest.mark.parametrize("edges", [True, False])
 def test_direction_offset_is_recovered_and_asked_for(edges):
-    _, sweeps, cameras = pitched(20, np.radians(0.3) * ALTERNATING, 0.0, noise=0.003)
+    _, (cameras, *sweeps) = pitched(20, np.radians(0.3) * ALTERNATING, 0.0, noise=0.003)
     if not edges:
         cameras = {name: obs.keep(crossing=np.zeros(len(obs.crossing_points), bool)) for name, obs in cameras.items()}
-    found = estimate_pitch_errors(sweeps, cameras)
+    found = estimate_pitch_errors(cameras, *sweeps)
     assert np.degrees(found.direction_offset) == pytest.approx(0.3, abs=0.03)
-    assert np.isnan(found.models["none"].edge_rms["left"]) != edges
     assert abs(found.direction_offset - np.radians(0.3)) < 4 * found.direction_sigma
     assert found.wanted == "direction" and found.models["direction"].p_value < 1e-6
     assert found.models["direction"].misfit < found.models["none"].misfit
@@ -300,8 +286,8 @@ def test_direction_offset_is_recovered_and_asked_for(edges):
 def test_an_honest_platform_asks_for_nothing():
     wanted, scores = [], []
     for seed in range(100, 120):
-        _, sweeps, cameras = pitched(seed, 0.0, 0.0, noise=0.003)
-        found = estimate_pitch_errors(sweeps, cameras)
+        _, sweeps = pitched(seed, 0.0, 0.0, noise=0.003)
+        found = estimate_pitch_errors(*sweeps)
         wanted.append(found.wanted)
         scores.append(found.direction_offset / found.direction_sigma)
     assert wanted.count("none") >= 18
@@ -310,8 +296,8 @@ def test_an_honest_platform_asks_for_nothing():
 
 def test_a_common_offset_cannot_be_seen():
     """It turns the platform frame; the cameras' poses take it up."""
-    rig, sweeps, cameras = pitched(22, np.radians(1.0), 0.0)
-    found = estimate_pitch_errors(sweeps, cameras)
+    rig, sweeps = pitched(22, np.radians(1.0), 0.0)
+    found = estimate_pitch_errors(*sweeps)
     assert abs(found.direction_offset) < 1e-8
     T = found.models["none"].transforms["left"]
     turned = rig.T_camera_lrf * RigidTransform.from_rotation(Rotation.from_rotvec([np.radians(1.0), 0, 0]))
@@ -321,8 +307,8 @@ def test_a_common_offset_cannot_be_seen():
 def test_offsets_and_stretches_of_single_sweeps_are_recovered():
     rng = np.random.default_rng(23)
     offset, stretch = np.radians(rng.normal(0, 0.3, 24)), rng.normal(0, 0.03, 24)
-    _, sweeps, cameras = pitched(24, offset - offset.mean(), stretch, cameras=("left", "right"))
-    found = estimate_pitch_errors(sweeps, cameras)
+    _, sweeps = pitched(24, offset - offset.mean(), stretch, cameras=("left", "right"))
+    found = estimate_pitch_errors(*sweeps)
     model = found.models["sweep_stretch"]
     assert found.wanted == "sweep_stretch" and model.converged
     assert np.degrees(np.abs(model.offset - offset + offset.mean())).max() < 0.02
@@ -331,8 +317,8 @@ def test_offsets_and_stretches_of_single_sweeps_are_recovered():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_pitch_jacobians_against_numeric_ones(name):
-    _, sweeps, cameras = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))
-    data = pitch_solver.gather(sweeps, cameras, 20)
+    _, sweeps = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))
+    data = pitch_solver.gather(*sweeps)
     pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
     state = (np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03))
     base = pitch_solver.pitch_blocks(state, data, name)
@@ -346,25 +332,27 @@ def test_pitch_jacobians_against_numeric_ones(name):
 
 
 def test_corrected_pitch_makes_the_scans_fit():
-    _, sweeps, cameras = pitched(26, np.radians(0.3) * ALTERNATING, 0.0)
-    model = estimate_pitch_errors(sweeps, cameras).models["direction"]
-    p = tilt(sweeps.T_head_lrf.apply(sweeps.points), sweeps.pitch + model.offset[sweeps.placement - 1])
-    boards = cameras["left"].board_poses[sweeps.placement - 1]
+    _, sweeps = pitched(26, np.radians(0.3) * ALTERNATING, 0.0)
+    model = estimate_pitch_errors(*sweeps).models["direction"]
+    obs = sweeps[0]["left"]
+    p = tilt(obs.plane_points, model.offset[obs.plane_placement - 1])
+    boards = obs.board_poses[obs.plane_placement - 1]
     q = model.transforms["left"].apply(p)
     assert np.abs(np.sum(boards[:, :3, 2] * (q - boards[:, :3, 3]), axis=1)).max() < 1e-9
 
 
 def test_sweeps_all_one_way_have_no_direction_offset():
-    _, sweeps, cameras = pitched(27, 0.0, 0.0)
-    found = estimate_pitch_errors(replace(sweeps, direction=dict.fromkeys(sweeps.direction, 1)), cameras)
+    _, (cameras, direction, middle) = pitched(27, 0.0, 0.0)
+    found = estimate_pitch_errors(cameras, dict.fromkeys(direction, 1), middle)
     assert np.isnan(found.direction_offset) and "direction" not in found.models
 
 
 def test_pitch_errors_need_cameras_on_the_base():
-    _, sweeps, cameras = pitched(28, 0.0, 0.0)
+    _, (cameras, *sweeps) = pitched(28, 0.0, 0.0)
+    obs = cameras["left"]
     with pytest.raises(ValueError, match="source 'lrf'"):
-        estimate_pitch_errors(sweeps, {"left": replace(cameras["left"], source="lrf")})
+        estimate_pitch_errors({"left": replace(obs, source="lrf")}, *sweeps)
     with pytest.raises(DegenerateGeometry, match="3 placements seen by the LRF"):
-        estimate_pitch_errors(sweeps, {"left": cameras["left"].select([1, 2, 3])})
-    with pytest.raises(ValueError, match="pitch of the sweeps holds 1 values that are not finite"):
-        replace(sweeps, pitch=np.where(np.arange(len(sweeps.pitch)) == 3, np.nan, sweeps.pitch))
+        estimate_pitch_errors({"left": obs.select([1, 2, 3])}, *sweeps)
+    with pytest.raises(ValueError, match="plane_pitch of camera 'left' holds 1 values that are not finite"):
+        replace(obs, plane_pitch=np.where(np.arange(len(obs.plane_pitch)) == 3, np.nan, obs.plane_pitch))

@@ -45,7 +45,10 @@ def stack(prefix, parts, nothing=()):
     return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE):
+def observe(
+    prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
+    faces=FACE_POINTS,
+):
     """Pair what the LRF and one camera saw of the board.
 
     Parameters
@@ -59,8 +62,8 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
     correct : callable
         ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
-    crossings : int
-        Kept of each edge of a placement, evenly spread.
+    crossings, faces : int
+        Kept of each edge and of the face of a placement, evenly spread.
 
     Returns
     -------
@@ -80,10 +83,10 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
             continue
         turn = source_of(prepared, camera, placement, T_head_lrf, correct)
         if placement in posed:
-            points, pitch, covariance = face_points(scan, FACE_POINTS)
+            points, pitch, covariance = face_points(scan, faces)
             R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
             points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-            planes.append({"points": points, "covariance": covariance, "placement": number})
+            planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
         crossed += _crossings(prepared, placement, view, variant, turn, crossings)
     return CameraObservations(
         camera=camera,
@@ -135,6 +138,7 @@ def _crossings(prepared, placement, view, variant, turn, count):
         R, error = _rotation(turn, pitch), moved[:, :, None] * moved[:, None, :]  # of the recorded pitch
         yield {
             "points": turn(p_lrf, pitch),
+            "pitch": pitch,
             "covariance": R @ found.covariance[rows] @ R.swapaxes(-1, -2) + error,
             "noise": R @ found.noise[rows] @ R.swapaxes(-1, -2) + error,
             "half_step": (R @ found.half_step[rows][..., None])[..., 0],

@@ -65,6 +65,8 @@ class CameraObservations(_Groups):
         Standard deviation of the image line at the crossing, pixels; 0.5 by default.
     crossing_placement, crossing_edge : ndarray of int and of str, shape (n,)
         Every row has a placement of its own by default, as of the other groups.
+    crossing_pitch, plane_pitch : ndarray, shapes (n,), (m,)
+        Recorded pitch of the points, radians; only its errors (:mod:`lrfcal_lib.solvers.pitch`) need it.
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
         the recorded pitch. The paper uses none of these.
@@ -126,6 +128,7 @@ class CameraObservations(_Groups):
     crossing_line_sigma: np.ndarray | None = None
     crossing_placement: np.ndarray | None = None
     crossing_edge: np.ndarray | None = None
+    crossing_pitch: np.ndarray | None = None
     crossing_across: np.ndarray | None = None
     crossing_half_step: np.ndarray | None = None
     crossing_noise: np.ndarray | None = None
@@ -134,6 +137,7 @@ class CameraObservations(_Groups):
     plane_points: np.ndarray | None = None
     plane_covariance: np.ndarray | None = None
     plane_placement: np.ndarray | None = None
+    plane_pitch: np.ndarray | None = None
     placements: np.ndarray | None = None
     board_poses: np.ndarray | None = None
     board_covariance: np.ndarray | None = None
@@ -152,9 +156,9 @@ class CameraObservations(_Groups):
         p = 0 if self.board_poses is None else self.board_poses.shape[-3]
         zeros = {
             "crossing_lines": (0, 3), "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3),
-            "crossing_background": n, "board_poses": (0, 4, 4), "board_covariance": (p, 6, 6),
-            "pattern_points": (0, 3), "scene_pixels": (0, 2),
-        }  # fmt: skip
+            "crossing_background": n, "crossing_pitch": n, "plane_pitch": m, "board_poses": (0, 4, 4),
+            "board_covariance": (p, 6, 6), "pattern_points": (0, 3), "scene_pixels": (0, 2),
+        }
         defaults = {name: np.zeros(shape) for name, shape in zeros.items()}
         defaults |= {"crossing_edge": np.full(n, ""), "crossing_across": np.zeros(n, bool), "placements": np.arange(p)}
         defaults |= {"crossing_line_sigma": np.full(n, 0.5), "scene_sigma_px": np.full(q, 0.5)}
