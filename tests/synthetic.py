@@ -184,7 +184,7 @@ def edge_sweeps(rng, T_head_lrf, boards, corners, *, edges=(0, 1), noise=0.0):
             on_edge.append((*meet(board.apply(points), T_head_lrf), placement, number))
         inside = flat(rng.dirichlet(np.ones(len(corners)), 60) @ corners)
         on_face.append((*meet(board.apply(inside), T_head_lrf), placement))
-    for prefix, parts in (("", on_edge), ("face_", on_face)):
+    for prefix, parts in (("edge_", on_edge), ("face_", on_face)):
         points, pitch, placement, *number = zip(*parts, strict=True)
         of_point = np.repeat(np.arange(len(parts)), [len(p) for p in points])
         drawn, covariance, _ = measured(rng, np.concatenate(points), noise)
@@ -192,7 +192,7 @@ def edge_sweeps(rng, T_head_lrf, boards, corners, *, edges=(0, 1), noise=0.0):
         own |= {"placement": np.array(placement)[of_point]}
         out |= {prefix + name: values for name, values in own.items()}
         if number:
-            out["edge"] = np.array(number[0])[of_point]
+            out["edge_number"] = np.array(number[0])[of_point]
     return out
 
 

@@ -20,24 +20,17 @@ from synthetic import (
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import move_head, prior_terms
 from lrfcal_lib.fit.result import PlatformPrior
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    TiltAxis,
-    axis_difference,
-    axis_of,
-    head_from_axis,
-    lrf_to_platform,
-    pose_array,
-    tilt,
-)
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, head_from_axis, lrf_to_platform, pose_array
+from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.solvers import pitch as pitch_solver
 from lrfcal_lib.solvers import platform
 from lrfcal_lib.solvers.pitch import MODELS, estimate_pitch_errors
-from lrfcal_lib.solvers.platform import PlatformObservations, projected_block, solve_platform, solve_projected
+from lrfcal_lib.solvers.platform import projected_block, solve_platform, solve_projected
 
 DIRECTION = np.array([0.9993, 0.02, -0.0317])
-TRUTH = head_from_axis(TiltAxis(DIRECTION / np.linalg.norm(DIRECTION), np.array([0.0, -0.05, -0.12])))
-AXIS = axis_of(TRUTH)
+TRUTH = head_from_axis(geometry.TiltAxis(DIRECTION / np.linalg.norm(DIRECTION), np.array([0.0, -0.05, -0.12])))
+AXIS = geometry.axis_of(TRUTH)
 ROUGH = RigidTransform.from_components([0.0, 0.03, 0.10], Rotation.identity())
 STEP = 1e-6
 both_fits = pytest.mark.parametrize("solve", [solve_platform, solve_projected])
@@ -53,7 +46,7 @@ def make(seed=0, count=20, **options):
 
 
 def without_faces(obs):
-    return replace(obs, **{name: getattr(obs, name)[:0] for name in vars(obs) if name.startswith("face_")})
+    return obs.keep(face=obs.face_placement < 0)
 
 
 def miss(found):
@@ -71,10 +64,10 @@ def test_synthetic_sweeps_lie_on_the_boards():
     rng = np.random.default_rng(1)
     boards = sweep_boards(rng, 20)
     obs = swept(rng, boards)
-    p = lrf_to_platform(obs.points, obs.pitch, TRUTH)
+    p = lrf_to_platform(obs.edge_points, obs.edge_pitch, TRUTH)
     for index, board in enumerate(boards, start=1):
-        assert np.abs(board.inv().apply(p[obs.placement == index])[:, 2]).max() < 1e-12
-    assert np.abs(obs.points[:, 2]).max() < 1e-12
+        assert np.abs(board.inv().apply(p[obs.edge_placement == index])[:, 2]).max() < 1e-12
+    assert np.abs(obs.edge_points[:, 2]).max() < 1e-12
 
 
 @pytest.mark.parametrize("faces", [True, False])
@@ -102,7 +95,7 @@ def test_the_gauge_of_the_start_changes_nothing(solve):
 
 
 def pairs(obs, placements):
-    return [[np.flatnonzero((obs.placement == p) & (obs.edge == e)) for e in (1, 2)] for p in placements]
+    return [[np.flatnonzero((obs.edge_placement == p) & (obs.edge_number == e)) for e in (1, 2)] for p in placements]
 
 
 def test_projected_jacobian_against_a_numeric_one():
@@ -125,13 +118,13 @@ def test_level_edges_are_reported_not_divided_by_zero():
 
 
 def test_platform_jacobians_against_numeric_ones():
-    data, boards, _ = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
-    state = (pose_array(ROUGH), boards, np.full((4, 2), 0.02))
-    base = platform.platform_blocks(state, data, 1e-3)
+    *data, boards, _ = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
+    state = (pose_array(ROUGH), np.array(list(boards.values())), np.full((4, 2), 0.02))
+    base = platform.platform_blocks(state, *data, 1e-3)
     for k in range(12):
         step = STEP * np.eye(12)[k]
         high, low = (
-            platform.platform_blocks(platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), data, 1e-3)
+            platform.platform_blocks(platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3)
             for s in (step, -step)
         )
         for b, h, lo in zip(base, high, low, strict=True):
@@ -141,14 +134,14 @@ def test_platform_jacobians_against_numeric_ones():
 
 
 def test_platform_gradient_includes_the_noise():
-    data, boards, _ = platform.prepare_boards(make(9, count=3, noise=1.0), TRUTH)
-    state, still = (pose_array(TRUTH), boards, np.zeros((3, 2))), np.zeros((3, 8))
+    *data, boards, _ = platform.prepare_boards(make(9, count=3, noise=1.0), TRUTH)
+    state, still = (pose_array(TRUTH), np.array(list(boards.values())), np.zeros((3, 2))), np.zeros((3, 8))
 
     def cost(step):
-        blocks = platform.platform_blocks(platform.move_platform(state, (step, still)), data, 0.0)
+        blocks = platform.platform_blocks(platform.move_platform(state, (step, still)), *data, 0.0)
         return 0.5 * sum(np.sum(whiten(b)[0] ** 2) for b in blocks)
 
-    gradient = sum(np.einsum("pn,pnk->k", *whiten(b))[:4] for b in platform.platform_blocks(state, data, 0.0))
+    gradient = sum(np.einsum("pn,pnk->k", *whiten(b))[:4] for b in platform.platform_blocks(state, *data, 0.0))
     numeric = [(cost(s) - cost(-s)) / 2e-6 for s in STEP * np.eye(4)]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3)
 
@@ -200,8 +193,8 @@ def test_weighted_3d_fits_beat_projected_ones():
 
 def test_one_edge_with_a_face_serves_too():
     obs = make(14)
-    keep = (obs.edge == 1) | (obs.placement > 10)
-    lone = replace(obs, **{f: getattr(obs, f)[keep] for f in ("points", "covariance", "pitch", "placement", "edge")})
+    keep = (obs.edge_number == 1) | (obs.edge_placement > 10)
+    lone = obs.keep(edge=keep)
     found = solve_platform(lone, ROUGH)
     assert len(found.placements) == 20 and miss(found)[1] < 1e-9
     without = solve_platform(without_faces(lone), ROUGH)
@@ -216,7 +209,7 @@ def test_parallel_edges_are_skipped_with_the_reason():
 
 def test_pitch_that_never_changes_leaves_the_axis_open():
     obs = make(16)
-    flat = replace(obs, pitch=0 * obs.pitch, face_pitch=0 * obs.face_pitch)
+    flat = replace(obs, edge_pitch=0 * obs.edge_pitch, face_pitch=0 * obs.face_pitch)
     with pytest.raises(DegenerateGeometry, match="do not determine .*the axis"):
         solve_platform(flat, ROUGH)
     found = solve_platform(flat, ROUGH, required=False)
@@ -232,10 +225,10 @@ def test_one_placement_leaves_the_axis_open_or_uncertain():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("points", np.nan, "points holds 3 values that are not finite, the first in row 4"),
-        ("pitch", np.inf, "pitch holds 1 values that are not finite, the first in row 4"),
+        ("edge_points", np.nan, "edge_points holds 3 values that are not finite, the first in row 4"),
+        ("edge_pitch", np.inf, "edge_pitch holds 1 values that are not finite, the first in row 4"),
         ("face_points", np.nan, "face_points holds 3 values that are not finite"),
-        ("edge", 3, r"edge must be 1 or 2 \(the two perpendicular edges\), got \[1 2 3\]"),
+        ("edge_number", 3, r"edge_number must be 1 or 2 \(the two perpendicular edges\), got \[1 2 3\]"),
     ],
 )
 def test_what_cannot_be_is_refused(field, value, message):
@@ -335,7 +328,7 @@ def test_corrected_pitch_makes_the_scans_fit():
     _, sweeps = pitched(26, np.radians(0.3) * ALTERNATING, 0.0)
     model = estimate_pitch_errors(*sweeps).models["direction"]
     obs = sweeps[0]["left"]
-    p = tilt(obs.plane_points, model.offset[obs.plane_placement - 1])
+    p = geometry.tilt(obs.plane_points, model.offset[obs.plane_placement - 1])
     boards = obs.board_poses[obs.plane_placement - 1]
     q = model.transforms["left"].apply(p)
     assert np.abs(np.sum(boards[:, :3, 2] * (q - boards[:, :3, 3]), axis=1)).max() < 1e-9

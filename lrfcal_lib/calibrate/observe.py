@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from lrfcal_lib.calibrate.outline import as_recorded, cells_of, named_sides, outline_of, platform_of
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_source, tilt
-from lrfcal_lib.model.observations import CameraObservations, JointObservations
+from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
 from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
@@ -18,7 +18,6 @@ from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
-from lrfcal_lib.solvers.platform import PlatformObservations
 
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
 FACE_POINTS = 150  # a placement: neighbouring ranges of a real device share their errors
@@ -36,7 +35,7 @@ BEAMS |= {"hit": np.zeros(0, bool), "edge": WHOLE, "placement": WHOLE}
 VIEWS = {"camera": WHOLE, "pitch": NUMBER, "pose": np.zeros((0, 4, 4)), "covariance": np.zeros((0, 6, 6))}
 VIEWS |= {"placement": WHOLE, "lens": np.zeros((0, 6, 9))}
 EDGES = {"points": np.zeros((0, 3)), "covariance": np.zeros((0, 3, 3)), "pitch": NUMBER}
-EDGES |= {"placement": WHOLE, "edge": WHOLE}
+EDGES |= {"placement": WHOLE}
 
 
 def stack(prefix, parts, nothing=()):
@@ -191,11 +190,11 @@ def platform_observations(prepared, variant="half_step"):
         for number, (found, side) in enumerate(_perpendicular(prepared.edges[variant][placement], swept), 1):
             rows = thin(np.flatnonzero(found.side == side), PLATFORM_POINTS)
             points = {key: getattr(found, key)[rows] for key in ("points", "covariance", "pitch")}
-            edges.append(points | {"placement": np.full(len(rows), placement), "edge": np.full(len(rows), number)})
+            edges.append(points | {"placement": np.full(len(rows), placement), "number": np.full(len(rows), number)})
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
-    return PlatformObservations(**stack("", edges, EDGES), **stack("face_", faces))
+    return PlatformObservations(**stack("edge_", edges, EDGES | {"number": WHOLE}), **stack("face_", faces, EDGES))
 
 
 def _perpendicular(along, swept):

@@ -10,24 +10,9 @@ from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import line_distance, line_through, project, undistort
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    axis_of,
-    cross,
-    gradient_by_pose,
-    hat,
-    head_from_axis,
-    log_rotation,
-    move_pose,
-    moved_noise,
-    noise_correction,
-    pose_array,
-    pose_parameters,
-    pose_transform,
-    rotate_points,
-    tilt,
-)
+from lrfcal_lib.model.geometry import cross, gradient_by_pose, hat, move_pose, pose_transform, rotate_points, tilt
 
 
 def line_block(pose, obs):
@@ -44,16 +29,16 @@ def line_block(pose, obs):
     slope = (a * x + b * y) / z
     residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
     gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
-    shift = moved_noise(pose, gradient, obs.crossing_covariance)
+    shift = geometry.moved_noise(pose, gradient, obs.crossing_covariance)
     variance = np.sum(shift * gradient, axis=-1) + obs.crossing_line_sigma**2
     jacobian = gradient_by_pose(rotated, gradient)
-    corrected = jacobian - noise_correction(rotated, q, gradient, shift, residuals / variance)
+    corrected = jacobian - geometry.noise_correction(rotated, q, gradient, shift, residuals / variance)
     return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
 
 
 def read_pose(pose):
     """Transform and parameters of a pose state."""
-    return pose_transform(pose), pose_parameters(pose)
+    return pose_transform(pose), geometry.pose_parameters(pose)
 
 
 def edge_residuals_px(obs, transform, model=None):
@@ -82,7 +67,7 @@ def edge_residuals_px(obs, transform, model=None):
         moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
         moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
         obs = replace(obs, crossing_lines=moved, model=model)
-    return line_block(pose_array(transform), obs).residuals
+    return line_block(geometry.pose_array(transform), obs).residuals
 
 
 def plane_residuals_m(obs, transform, board_poses=None):
@@ -284,7 +269,7 @@ class Unknowns:
 
     def names(self, cameras, edges):
         """Names of the shared unknowns."""
-        poses = [f"{c}_{n}" for c in cameras for n in POSE_NAMES]
+        poses = [f"{c}_{n}" for c in cameras for n in geometry.POSE_NAMES]
         every = [*AXIS_NAMES, *poses, *SENSOR, *(f"size_{e}" for e in edges)]
         return tuple(np.array(every)[self.mask].tolist())
 
@@ -481,7 +466,7 @@ def view_block(state, data, unknowns):
     B = A @ np.swapaxes(tilt(np.eye(3), -pitch[..., None]), -1, -2)
     y = tilt(board[..., 3], -pitch)
     t = (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
-    w = log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
+    w = geometry.log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
     left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
 
@@ -605,7 +590,7 @@ def move_state(state, step, unknowns):
 
 def chart_parameters(head):
     """The axis of ``T_head_lrf`` (3, 4): angles out of and within the scan plane, and minus y, z of its foot, (4,)."""
-    axis = axis_of(pose_transform(head))
+    axis = geometry.axis_of(pose_transform(head))
     x, y, z = axis.direction
     return np.r_[np.arctan2(z, x), np.arctan2(-y, x), -axis.foot[1:]]
 
@@ -615,7 +600,7 @@ def prior_terms(head, prior):
 
     The direction is compared by ``R0 R^T e_x``, the offset by the foot points, both in the prior's head frame.
     """
-    reference = pose_array(head_from_axis(axis_of(prior.T_head_lrf)))
+    reference = geometry.pose_array(geometry.head_from_axis(geometry.axis_of(prior.T_head_lrf)))
     turn = reference[:, :3] @ head[:, :3].T
     along, arm = turn[:, 0], np.array([0.0, head[1, 3], head[2, 3]])
     r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]

@@ -207,6 +207,39 @@ class CameraObservations(_Groups):
         return replace(out, placements=self.placements[known], **{name: getattr(self, name)[known] for name in boards})
 
 
+@dataclass(frozen=True)
+class PlatformObservations(_Groups):
+    """Edge points and face points of boards swept by the pitching LRF.
+
+    Attributes
+    ----------
+    edge_points, face_points : ndarray, shapes (n, 3), (m, 3)
+        LRF frame, metres; those of faces may be missing.
+    edge_covariance, face_covariance : ndarray, shapes (n, 3, 3), (m, 3, 3)
+    edge_pitch, face_pitch : ndarray, shapes (n,), (m,)
+        Recorded pitch of their scan lines, radians.
+    edge_placement, face_placement : ndarray of int, shapes (n,), (m,)
+    edge_number : ndarray of int, shape (n,)
+        1 or 2: the two perpendicular edges of equations (7) to (14).
+    """
+
+    edge_points: np.ndarray
+    edge_covariance: np.ndarray
+    edge_pitch: np.ndarray
+    edge_placement: np.ndarray
+    edge_number: np.ndarray
+    face_points: np.ndarray
+    face_covariance: np.ndarray
+    face_pitch: np.ndarray
+    face_placement: np.ndarray
+
+    def __post_init__(self):
+        check_finite(self)
+        if not np.isin(self.edge_number, (1, 2)).all():
+            found = np.unique(self.edge_number)
+            raise ValueError(f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}")
+
+
 GROUPS = ("face", "beam", "view")
 
 

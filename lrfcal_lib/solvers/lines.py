@@ -8,20 +8,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import edge_shift, interval_terms, line_block, read_pose, sight_block, sight_normals
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import pinhole_jacobian
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    apply_pose,
-    gradient_by_pose,
-    motion_words,
-    move_pose,
-    moved_noise,
-    noise_correction,
-    pose_array,
-    pose_transform,
-    rotate_points,
-)
+from lrfcal_lib.model.geometry import DegenerateGeometry, gradient_by_pose, move_pose, noise_correction, rotate_points
 from lrfcal_lib.solvers.planes import shifted, start_rotations
 
 
@@ -35,7 +24,7 @@ def distance_block(pose, obs):
     plain = sight_block(pose, obs.crossing_points, normals, 1.0)
     rotated = rotate_points(pose, obs.crossing_points)
     q = rotated + pose[..., None, :, 3]
-    shift = moved_noise(pose, normals, obs.crossing_covariance)
+    shift = geometry.moved_noise(pose, normals, obs.crossing_covariance)
     line = (obs.crossing_line_sigma / length) ** 2 * q[..., 2]
     variance = np.sum(shift * normals, axis=-1) + line * q[..., 2]
     factor = plain.residuals / variance
@@ -87,8 +76,10 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
     groups = getattr(obs, f"{uses}_placement")
-    about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, obs.camera)}
-    return solve(problem, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
+    return solve(
+        problem, pose, move_pose, names=geometry.POSE_NAMES, method=method, read=read_pose, groups=groups,
+        words=lambda d: geometry.motion_words(d, obs.camera), required=required, earlier=earlier, **options,
+    )
 
 
 def cost_readings(obs, transform, direction, steps):
@@ -124,7 +115,7 @@ def cost_readings(obs, transform, direction, steps):
             pairs.append([here & (obs.crossing_edge == name) for name in names])
     if not pairs:
         raise ValueError(f"no placement of camera '{obs.camera}' has crossings on two edges: equation (21) needs pairs")
-    poses = move_pose(pose_array(transform), np.multiply.outer(np.asarray(steps, float), np.asarray(direction, float)))
+    poses = move_pose(geometry.pose_array(transform), np.multiply.outer(steps, np.asarray(direction, float)))
     squares = line_block(poses, obs).residuals ** 2
     first, second = (np.stack([squares[:, rows[i]].mean(axis=1) for rows in pairs], axis=1) for i in range(2))
     return {
@@ -177,10 +168,10 @@ def freeze_intervals(state, obs, sight, lengths, softness):
     Of some values of the softness (spot radii) that is taken which makes the intervals most likely.
     """
     pose = state[..., :4]
-    depth = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
+    depth = np.abs(geometry.apply_pose(pose, obs.crossing_points)[..., 2])
     half = np.abs(np.sum(sight * rotate_points(pose, obs.crossing_half_step), axis=-1))
     half = np.maximum(half, 0.02 * np.linalg.norm(obs.crossing_half_step, axis=-1))
-    noise = np.sum(moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
+    noise = np.sum(geometry.moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
     margin = interval_margins(state, obs, sight)[0]
     soft = np.reshape(softness, (-1,) + (1,) * margin.ndim) * obs.crossing_radius
     variance = np.maximum(soft, 2 * LEAST_STEP * half) ** 2 + noise + (obs.crossing_line_sigma * depth / lengths) ** 2
@@ -208,12 +199,12 @@ def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_ite
         return transform, np.concatenate([parameters, state[..., :1, 4]], axis=-1)
 
     def words(direction):
-        return "the sensor's edge bias" if abs(direction[6]) > 0.5 else motion_words(direction[:6], obs.camera)
+        return "the sensor's edge bias" if abs(direction[6]) > 0.5 else geometry.motion_words(direction[:6], obs.camera)
 
     state = np.concatenate([pose, np.zeros(pose.shape[:-1] + (1,))], axis=-1)
     problem, state, earlier = minimise_in_rounds(freeze, state, move_biased, ROUNDS, max_iterations=30)
     return solve(
-        problem, state, move_biased, names=(*POSE_NAMES, "log_odds"), method=method, read=read, words=words,
+        problem, state, move_biased, names=(*geometry.POSE_NAMES, "log_odds"), method=method, read=read, words=words,
         scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, required=required, earlier=earlier,
         max_iterations=max_iterations,
     )  # fmt: skip
@@ -238,7 +229,7 @@ def start_from_lines(obs):
     for loss in (None, "cauchy"):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
         found = minimise(lambda pose: sight_block(pose, points, normals, 0.005), found, move_pose, **options)[0]
-    z = apply_pose(found, points)[..., 2]
+    z = geometry.apply_pose(found, points)[..., 2]
     keep = (z > 0).mean(axis=1) > 0.8
     if not keep.any():
         raise DegenerateGeometry(
@@ -247,7 +238,7 @@ def start_from_lines(obs):
     found, z = found[keep], z[keep]
     distance = np.abs(sight_block(found, points, normals, 1.0).residuals) / np.abs(z)
     count = max(6, int(0.75 * len(points)))
-    return pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])
+    return geometry.pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])
 
 
 def start_from_scene(obs):

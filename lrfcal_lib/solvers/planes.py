@@ -11,19 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, pad, plane_residuals_m, read_pose
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    apply_pose,
-    gradient_by_pose,
-    hat,
-    motion_words,
-    move_pose,
-    pose_array,
-    pose_transform,
-    rotate_points,
-)
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, apply_pose, move_pose, pose_transform
 
 
 @dataclass(frozen=True)
@@ -124,7 +114,7 @@ def plane_terms(pose, triangles, boards, offset=0.0):
     turned = np.swapaxes(pose[..., :3], -1, -2)
     top, last = (turned @ normal[..., None])[..., 0], np.sum(normal * between, axis=-1, keepdims=True)
     residuals = (triangles @ np.concatenate([top, last], axis=-1)[..., None])[..., 0] + offset
-    spin = turned @ hat(normal)
+    spin = turned @ geometry.hat(normal)
     normal = np.broadcast_to(normal, top.shape)[..., None, :]
     moment = np.cross(normal[..., 0, :], between)[..., None, :]
     upper = np.concatenate([spin, np.zeros_like(spin)], axis=-1)
@@ -303,7 +293,7 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
     count = int(sets.count.sum())
     return solve(
         problem, pose, move_pose, names=POSE_NAMES, method=method, read=read_pose,
-        words=lambda d: motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
+        words=lambda d: geometry.motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
         required=required, n_observations=count, earlier=earlier,
         chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0, **options,
     )  # fmt: skip
@@ -334,10 +324,10 @@ def planes_and_pattern(state, planes, obs):
     by_lens = np.zeros(residuals.shape + (9,))
     distances = Block(residuals, np.concatenate([by_pose, by_lens, by_board], axis=-1), whitener[:, None])
     camera, pixels, seen = obs.model.with_parameters(intrinsics), obs.pattern_pixels, np.isfinite(obs.pattern_pixels)
-    q, rotated = apply_pose(boards, obs.pattern_points), rotate_points(boards, obs.pattern_points)
+    q, rotated = apply_pose(boards, obs.pattern_points), geometry.rotate_points(boards, obs.pattern_points)
     by_point, by_lens = project_jacobians(q, camera)
     errors = np.where(seen, project(q, camera) - np.where(seen, pixels, 0.0), 0.0)
-    by_board = np.stack([gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
+    by_board = np.stack([geometry.gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
     jacobian = np.concatenate([np.zeros_like(by_board), by_lens, by_board], axis=-1)
     p = len(boards)
     sigma = seen.reshape(p, -1) / obs.pattern_sigma_px
@@ -358,7 +348,7 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, **op
             "refinement needs a printed pattern"
         )
     first = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
-    sets, pose = plane_sets(obs, 3 if required else 1), pose_array(first.transform)
+    sets, pose = plane_sets(obs, 3 if required else 1), geometry.pose_array(first.transform)
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, first)
     triangles, offset, rest = correct_and_compress(sets, pose)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
