@@ -112,7 +112,7 @@ def _blocks(evaluate, state):
     return [found] if isinstance(found, Block) else list(found)
 
 
-def _linearise(blocks, loss, scale, axes):
+def linearise(blocks, loss, scale, axes):
     """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the robust weights."""
     hessian = gradient = cost = 0.0
     roots = []
@@ -200,7 +200,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
     """
     axes = -1 if shared is None else (-2, -1)
     blocks = _blocks(evaluate, state)
-    hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+    hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
     history, converged = [cost], np.zeros(np.shape(cost), bool)
     damping, iteration = np.full(np.shape(cost), 1e-7), 0
     while iteration < max_iterations and not np.all(converged):
@@ -222,7 +222,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         kept = np.where(gain > 0.8, 0.1, 1.0) * damping
         worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
         damping = np.clip(np.where(accepted & (gain > 0.5), kept, worse), 1e-12, 1e14)
-        hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+        hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
         history.append(cost)
     return state, (bool(converged) if converged.ndim == 0 else converged), iteration, np.array(history)
 

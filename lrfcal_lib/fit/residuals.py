@@ -207,8 +207,6 @@ class JointState:
         ``T_platform_board``.
     sensor : ndarray, shape (5,)
         In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
-    size : ndarray, shape (e,)
-        By how much each edge lies outside the stated one, metres.
     sweeps : ndarray, shape (p, 2)
         Offset (radians) and stretch of the recorded pitch of each sweep.
     sides : ndarray, shape (p, e)
@@ -218,7 +216,6 @@ class JointState:
     head: np.ndarray
     cameras: np.ndarray
     sensor: np.ndarray
-    size: np.ndarray
     boards: np.ndarray
     sweeps: np.ndarray
     sides: np.ndarray
@@ -237,7 +234,6 @@ class Unknowns:
     edges: int
     axis: bool = True
     sensor: tuple = ("range_offset", "edge_log_odds", "edge_log_softness")
-    size: bool = False
     sweep: str = "none"
     poses: bool = True
     sides: bool = False
@@ -245,15 +241,15 @@ class Unknowns:
     @property
     def mask(self):
         """Of the full set of shared columns, those that are unknown."""
-        poses, size = [self.poses] * 6 * self.cameras, [self.size] * self.edges
-        return np.array([self.axis] * 4 + poses + [name in self.sensor for name in SENSOR] + size)
+        sensor = [name in self.sensor for name in SENSOR]
+        return np.array([self.axis] * 4 + [self.poses] * 6 * self.cameras + sensor)
 
     @cached_property
     def columns(self):
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's own."""
         widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
-        widths |= {name: int(name in self.sensor) for name in SENSOR} | {"size": self.edges * self.size, "board": 6}
-        widths |= {"sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
+        widths |= {name: int(name in self.sensor) for name in SENSOR}
+        widths |= {"board": 6, "sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
         ends = np.cumsum(list(widths.values())).tolist()
         return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
 
@@ -267,10 +263,9 @@ class Unknowns:
         """Number of unknowns of one placement."""
         return self.columns["sides"].stop - self.shared
 
-    def names(self, cameras, edges):
+    def names(self, cameras):
         """Names of the shared unknowns."""
-        poses = [f"{c}_{n}" for c in cameras for n in geometry.POSE_NAMES]
-        every = [*AXIS_NAMES, *poses, *SENSOR, *(f"size_{e}" for e in edges)]
+        every = [*AXIS_NAMES, *(f"{c}_{n}" for c in cameras for n in geometry.POSE_NAMES), *SENSOR]
         return tuple(np.array(every)[self.mask].tolist())
 
 
@@ -400,31 +395,28 @@ def edge_distance(state, data, group, ray):
     """Signed distance u (p, n) of rays from their edges, positive outside, and what it hangs on, (p, n, 3).
 
     The gradients by_o, by_d, by_t by origin, direction, and the edge's direction (that by the edge's point is
-    ``-by_o``), then a, t, n: point (relative to the board's origin), direction and outward normal of the edge, platform
-    frame.
+    ``-by_o``), then a, t: point (relative to the board's origin) and direction of the edge, platform frame.
     """
     o, d = ray[:2]
     rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
     line = data.lines[group["edge"]]
-    shift = -(line[..., 2] - state.size[group["edge"]])[..., None]
-    zero = np.zeros(line.shape[:2] + (1,))
-    normal = np.concatenate([line[..., :2], zero], axis=-1)
-    along = np.stack([-line[..., 1], line[..., 0], zero[..., 0]], axis=-1)
-    a, t, n = ((shift * normal) @ rotation, along @ rotation, normal @ rotation)
+    normal = np.concatenate([line[..., :2], 0 * line[..., :1]], axis=-1)
+    along = np.stack([-line[..., 1], line[..., 0], 0 * line[..., 0]], axis=-1)
+    a, t, n = ((-line[..., 2:] * normal) @ rotation, along @ rotation, normal @ rotation)
     away = o - a - state.boards[:, None, :, 3]
     m = cross(d, t)
     length = np.linalg.norm(m, axis=-1, keepdims=True)
     c = m / length * np.where(np.sum(m * n, axis=-1, keepdims=True) < 0, -1.0, 1.0)
     u = np.sum(c * away, axis=-1)
     g = (away * np.sign(np.sum(c * m, axis=-1, keepdims=True)) - u[..., None] * m / length) / length
-    return u, c, cross(t, g), cross(g, d), a, t, n
+    return u, c, cross(t, g), cross(g, d), a, t
 
 
 def beam_block(state, data, unknowns):
     """Negative log likelihoods of beams near the edges."""
     group = data.beam
     ray = rays(state, data, group)
-    u, by_o, by_d, by_t, a, t, n = edge_distance(state, data, group, ray)
+    u, by_o, by_d, by_t, a, t = edge_distance(state, data, group, ray)
     own = np.take_along_axis(state.sides, group["edge"], axis=1)
     shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"] + own)
     radius = np.where(group["used"], group["radius"], 1.0)
@@ -433,11 +425,9 @@ def beam_block(state, data, unknowns):
     cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
-    size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
-    np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
-    np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
+    sides = slope[..., None] * (group["edge"][..., None] == np.arange(unknowns.edges))
     sensor = {"edge_log_odds": slope[..., None], "edge_log_softness": (-margin * share_soft)[..., None]}
-    J = assemble(unknowns, axis=head, parts=parts, board=board, size=size, sides=sides, **sensor)
+    J = assemble(unknowns, axis=head, parts=parts, board=board, sides=sides, **sensor)
     share = data.beam_share * group["used"]
     root = np.sqrt(information)
     alive = root * sigma > 1e-7
@@ -568,9 +558,7 @@ def move_state(state, step, unknowns):
     full = np.zeros(len(unknowns.mask))
     full[unknowns.mask] = step[0]
     c = len(state.cameras)
-    head = np.zeros(6)
-    head[AXIS_COLUMNS] = full[:4]
-    sensor = state.sensor + full[4 + 6 * c : 9 + 6 * c]
+    sensor = state.sensor + full[4 + 6 * c :]
     sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
     sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
     count = SWEEPS[unknowns.sweep]
@@ -578,10 +566,9 @@ def move_state(state, step, unknowns):
     sweeps[:, :count] += step[1][:, 6 : 6 + count]
     return replace(
         state,
-        head=move_pose(state.head, head),
+        head=move_head(state.head, full[:4]),
         cameras=move_pose(state.cameras, full[4 : 4 + 6 * c].reshape(c, 6)) if c else state.cameras,
         sensor=sensor,
-        size=state.size + full[9 + 6 * c :],
         boards=move_pose(state.boards, step[1][:, :6]),
         sweeps=sweeps,
         sides=state.sides + step[1][:, 6 + count :] if unknowns.sides else state.sides,

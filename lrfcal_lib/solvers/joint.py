@@ -64,8 +64,6 @@ class JointSolution:
         Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by direction (rad).
     sweeps : dict of int to ndarray
         Offset (rad) and stretch of the recorded pitch of each sweep.
-    size : dict of str to float
-        By how much each edge lies outside the stated one, metres.
     noise : dict of str to float
         Factors on the stated standard deviations, and shares of independent errors, as estimated.
     misfit : dict of int to float
@@ -88,7 +86,6 @@ class JointSolution:
     boards: dict
     sensor: dict
     sweeps: dict
-    size: dict
     noise: dict
     misfit: dict
     excluded: dict
@@ -170,20 +167,8 @@ class JointSolution:
 
 
 def solve_joint(
-    obs,
-    T0=None,
-    *,
-    prior=None,
-    axis=True,
-    sensor=("range_offset", "edge_log_odds", "edge_log_softness"),
-    size=False,
-    sides=False,
-    sweep="none",
-    sweep_sigma=SWEEP_SIGMA,
-    lapse=0.0,
-    noise="stated",
-    start=None,
-    required=True,
+    obs, T0=None, *, prior=None, axis=True, sensor=SENSOR[:3], sides=False, sweep="none", sweep_sigma=SWEEP_SIGMA,
+    lapse=0.0, noise="stated", start=None, required=True,
 ):
     """Estimate axis, cameras, range offset, edge bias and the pose of every board at once.
 
@@ -198,8 +183,6 @@ def solve_joint(
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
         Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero (softness: 0.2).
-    size : bool
-        Estimate the board's size: one offset an edge.
     sides : bool
         Every side of every placement deviates from the sensor's edge bias, because backgrounds are not alike.
     sweep : {'none', 'offset', 'offset_stretch'}
@@ -229,7 +212,7 @@ def solve_joint(
     """
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
-    unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
+    unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
     if start is None:
         obs, lost = without_lost_placements(obs)
         obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
@@ -472,7 +455,7 @@ def wrong_image(obs, state, data, unknowns, i, limits):
     groups["view"]["used"][each, each] = False
     groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
     data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
-    lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
+    lone = replace(unknowns, axis=False, sensor=(), poses=False)
     state = converged(state, data, lone, steps=START_STEPS)
     found = np.max(contradictions(state, data, lone)[0] / limits, axis=1)
     best = int(np.argmin(found))
@@ -522,11 +505,11 @@ def joint_words(direction, names, cameras):
 
 def finished(obs, state, data, unknowns, excluded, required):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
-    names = unknowns.names(obs.cameras, obs.edges)
+    names = unknowns.names(obs.cameras)
 
     def read(s):
         poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
-        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor, s.size])[unknowns.mask]
+        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[unknowns.mask]
 
     found = solve(
         lambda s: joint_blocks(s, data, unknowns), in_stated_gauge(state, obs),
@@ -547,7 +530,6 @@ def finished(obs, state, data, unknowns, excluded, required):
         boards=dict(zip(numbers, pose_transform(state.boards), strict=True)),
         sensor=dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
         sweeps=dict(zip(numbers, state.sweeps, strict=True)),
-        size=dict(zip(obs.edges, state.size.tolist(), strict=True)),
         noise={name: float(getattr(data, name)) for name in levels}
         | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
         misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),

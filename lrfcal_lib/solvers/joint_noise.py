@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
 from lrfcal_lib.fit.residuals import SIDE_FREEDOM, SWEEPS, Unknowns, rays, view_block
 from lrfcal_lib.model.camera import project_jacobians
 
@@ -53,8 +53,8 @@ def lens_covariance(obs, found, data, unknowns):
     lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
     weighted = np.sqrt(found.weights[..., None]) * found.jacobian
     hessian = np.swapaxes(weighted, -1, -2) @ weighted
-    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
-    reduced = J[..., :c] - J[..., c:] @ inverse @ hessian[:, c:, :c]
+    back = eliminate(hessian, np.zeros(hessian.shape[:2]), c)[2]
+    reduced = J[..., :c] - J[..., c:] @ back[..., :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
     for camera, spread in enumerate(obs.lens_covariance):
         mine = (used & (data.view["camera"] == camera))[..., None, None]
@@ -66,11 +66,9 @@ def lens_covariance(obs, found, data, unknowns):
 
 def estimate_noise(state, data, unknowns):
     """Padded observations with noise levels from the residuals at a solution."""
-    blocks, hessian = residuals.named_blocks(state, data, unknowns), 0.0
-    for block in blocks.values():
-        J = whiten(block)[1][..., unknowns.shared :]
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
-    variance = np.diagonal(np.linalg.pinv(hessian, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
+    blocks = residuals.named_blocks(state, data, unknowns)
+    own = linearise(blocks.values(), None, 1.0, (-2, -1))[0][:, unknowns.shared :, unknowns.shared :]
+    variance = np.diagonal(np.linalg.pinv(own, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
     if "face" in blocks:
         data = replace(data, **face_levels(state, data, blocks["face"]))
     if "beam" in blocks:
@@ -263,15 +261,9 @@ def score_tests(state, data, unknowns, held):
 
     Each one is tested by itself, with all that was estimated free.
     """
-    c, hessian, gradient = unknowns.shared, 0.0, 0.0
-    for block in residuals.named_blocks(state, data, unknowns).values():
-        r, J = whiten(block)
-        transposed = np.swapaxes(J, -1, -2)
-        hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
-    back = hessian[:, :c, c:] @ np.linalg.pinv(hessian[:, c:, c:], rcond=1e-12, hermitian=True)
-    whole = np.sum(hessian[:, :c, :c] - back @ hessian[:, c:, :c], axis=0)
-    score = np.sum(gradient[:, :c] - (back @ gradient[:, c:, None])[..., 0], axis=0)
-    names = unknowns.names(range(unknowns.cameras), range(unknowns.edges))
+    hessian, gradient, *_ = linearise(residuals.joint_blocks(state, data, unknowns), None, 1.0, (-2, -1))
+    whole, score = (np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2])
+    names = unknowns.names(range(unknowns.cameras))
     others, out = [i for i, name in enumerate(names) if name not in held], {}
     for name in held:
         free = [*others, names.index(name)]

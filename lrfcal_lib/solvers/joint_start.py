@@ -127,8 +127,7 @@ def state_of(obs, head, cameras):
         boards[seen] = boards_in_images(obs, pose_array(head), poses, first)
     for placement in np.setdiff1d(np.arange(count), seen):
         boards[placement] = pose_array(board_from_scan(obs, placement, head))
-    own = boards, np.zeros((count, 2)), np.zeros((count, edges))
-    return JointState(pose_array(head), poses, sensor, np.zeros(edges), *own)
+    return JointState(pose_array(head), poses, sensor, boards, np.zeros((count, 2)), np.zeros((count, edges)))
 
 
 def boards_in_images(obs, head, cameras, views):
