@@ -61,7 +61,7 @@ def test_units():
     assert wide.unit.tolist() == ["deg", "deg", "mm", "mm", ""]
     turn = np.degrees(np.sqrt(np.mean(np.sum(trials.errors[:, :2] ** 2, axis=1))))
     assert wide.rmse[0] == pytest.approx(turn)
-    assert groups_of(("size_ab", "edge_log_odds"))["board size"][1] == "mm"
+    assert groups_of(("range_offset", "edge_log_odds"))["range offset"][1] == "mm"
 
 
 def test_spread_is_the_root_of_the_trace_in_its_unit():
@@ -104,7 +104,7 @@ def test_unknowns_may_not_change_between_draws():
 
 def test_errors_are_the_increments_that_were_applied():
     obs, state = random_problem(np.random.default_rng(0))
-    unknowns = Unknowns(2, 3, size=True)
+    unknowns = Unknowns(2, 3)
     step = 1e-3 * np.random.default_rng(1).normal(size=unknowns.shared)
     other = move_state(state, (step, np.zeros((3, unknowns.own))), unknowns)
     assert np.allclose(state_errors(other, state, unknowns), step, atol=1e-9)

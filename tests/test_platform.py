@@ -1,6 +1,7 @@
 """The tilt axis: the paper's projected fits and the weighted 3D estimate; and errors of the recorded pitch."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,7 +34,8 @@ TRUTH = head_from_axis(geometry.TiltAxis(DIRECTION / np.linalg.norm(DIRECTION), 
 AXIS = geometry.axis_of(TRUTH)
 ROUGH = RigidTransform.from_components([0.0, 0.03, 0.10], Rotation.identity())
 STEP = 1e-6
-both_fits = pytest.mark.parametrize("solve", [solve_platform, solve_projected])
+printed = partial(solve_projected, printed=True)
+every_fit = pytest.mark.parametrize("solve", [solve_platform, solve_projected, printed])
 
 
 def swept(rng, boards, corners=TRIANGLE, edges=(0, 2), **options):
@@ -86,7 +88,7 @@ def test_projected_fits_recover_exact_data():
     assert np.abs(found.skew).max() < 1e-9 and np.abs(found.gap).max() < 1e-9
 
 
-@both_fits
+@every_fit
 def test_the_gauge_of_the_start_changes_nothing(solve):
     obs = make(5, noise=0.3)
     turned = RigidTransform.from_components([0.4, 0, 0], Rotation.from_rotvec([0.3, 0, 0])) * ROUGH
@@ -98,12 +100,13 @@ def pairs(obs, placements):
     return [[np.flatnonzero((obs.edge_placement == p) & (obs.edge_number == e)) for e in (1, 2)] for p in placements]
 
 
-def test_projected_jacobian_against_a_numeric_one():
+@pytest.mark.parametrize("printed", [False, True])
+def test_projected_jacobian_against_a_numeric_one(printed):
     obs, head = make(6, noise=1.0), pose_array(ROUGH)
-    groups = pairs(obs, range(1, 21))
-    block = projected_block(head, obs, groups)
+    groups, chart = pairs(obs, range(1, 21)), {"printed": printed}
+    block = projected_block(head, obs, groups, **chart)
     for k, step in enumerate(STEP * np.eye(4)):
-        high, low = (projected_block(move_head(head, s), obs, groups).residuals for s in (step, -step))
+        high, low = (projected_block(move_head(head, s), obs, groups, **chart).residuals for s in (step, -step))
         np.testing.assert_allclose(block.jacobian[:, k], (high - low) / 2e-6, rtol=1e-5, atol=1e-6)
 
 

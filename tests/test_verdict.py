@@ -26,7 +26,8 @@ def lrf(model="SICK LMS400", **options):
 def joint_of(offset_mm, sigma_mm, **options):
     """As much of a joint calibration as tells the range offset."""
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma_mm / 1000]))
-    solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset_mm / 1000})
+    seen = SimpleNamespace(face_range=np.array([2.0]))
+    solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset_mm / 1000}, observations=seen)
     board = SimpleNamespace(lengths=lambda: {"ab": 0.8, "bc": 0.8})
     stated = lrf(**{"systematic_error": 0.004} | options)
     prepared = SimpleNamespace(session=SimpleNamespace(lrf=stated), board=board)
@@ -53,8 +54,9 @@ def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted)
 )
 def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers):
     monkeypatch.setattr(verdict, "size_error", lambda joint: (np.nan, np.nan))
-    found = verdict.contradicts_stated(joint_of(offset, sigma))
+    found, doubt = verdict.contradicts_stated(joint_of(offset, sigma))
     assert [reason.answer for reason in found] == answers
+    assert doubt == (abs(offset) / 1000 if found else 0.0)
     assert all("board" in r.words and "squares" in r.words and f"{offset} mm" in r.words for r in found)
 
 
@@ -64,8 +66,9 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
 )
 def test_edges_that_contradict_the_stated_ones(monkeypatch, error, sigma, answers):
     monkeypatch.setattr(verdict, "size_error", lambda joint: (error, sigma))
-    found = verdict.contradicts_stated(joint_of(0, 1))
+    found, doubt = verdict.contradicts_stated(joint_of(0, 1))
     assert [reason.answer for reason in found] == answers
+    assert doubt == (2.0 * abs(error) if found else 0.0)
     assert all("shorter in the cloud than stated" in reason.words for reason in found)
 
 
@@ -77,18 +80,25 @@ def plate(tmp_path_factory):
     return folder, json.loads((folder / "session.json").read_text())
 
 
-@pytest.mark.parametrize(("size", "wrong"), [(1.0, False), (1.05, True)])
-def test_a_board_stated_too_large_is_no_better_and_named(plate, size, wrong):
+def judged_as(plate, size):
+    """The verdict on the plate with all its stated sizes times a factor."""
     folder, stated = plate
     board = json.loads(json.dumps(stated["board"]))
     board["corners_m"] = [[size * x for x in corner] for corner in board["corners_m"]]
     board["pattern"]["square_m"] *= size
     board["pattern"]["origin_m"] = [size * x for x in board["pattern"]["origin_m"]]
     (folder / "session.json").write_text(json.dumps(stated | {"board": board}))
-    judged = verdict.judge(calibrate(open_session(folder), ["zhang_pless"]), suggest=False)
-    named = [reason.words for reason in judged.reasons if reason.kind in ("range offset", "size")]
-    assert judged.answer != "yes" and bool(named) == wrong
-    assert all("board" in words and "squares" in words for words in named)
+    return verdict.judge(calibrate(open_session(folder), ["zhang_pless"]), suggest=False)
+
+
+def test_a_board_stated_too_large_is_no_better_and_named(plate):
+    honest, wrong = judged_as(plate, 1.0), judged_as(plate, 1.05)
+    named = [reason.words for reason in wrong.reasons if reason.kind in ("range offset", "size")]
+    assert named and all("board" in words and "squares" in words for words in named)
+    assert not [reason for reason in honest.reasons if reason.kind in ("range offset", "size")]
+    assert wrong.answer != "yes" != honest.answer
+    for distance, errors in honest.errors.items():
+        assert all(wrong.errors[distance][name] >= error for name, error in errors.items())
 
 
 @pytest.fixture(scope="module")

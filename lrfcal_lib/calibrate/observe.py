@@ -19,6 +19,7 @@ from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
 
+ONE_SCAN = "one_scan"
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
 FACE_POINTS = 150  # a placement: neighbouring ranges of a real device share their errors
 CELLS_PER_EDGE = 160  # a placement, of each edge
@@ -54,8 +55,9 @@ def observe(
     ----------
     prepared : Prepared
     camera : str
-    variant : {'half_step', 'last_beam'}
-        Rule for the edge point.
+    variant : {'half_step', 'last_beam', 'one_scan'}
+        Rule for the edge point; 'one_scan' is the paper's: last beams of the two edges of `board.features`, on the
+        middle one of the scan lines that cross both.
     T_head_lrf : RigidTransform, optional
         Platform calibration to use instead of the session's own.
     correct : callable
@@ -75,7 +77,8 @@ def observe(
         pattern[:, 2] += prepared.relief  # the waves of the sheet
     n, k = len(posed), len(pattern)
     pixels = [np.full((k, 2), np.nan) if view.pixels is None else view.pixels for view in posed.values()]
-    planes, crossed = [], []
+    planes, crossed, one_scan = [], [], variant == ONE_SCAN
+    variant = "last_beam" if one_scan else variant
     for placement, scan in prepared.scans.items():
         view = prepared.views[camera].get(placement)
         if view is None:
@@ -86,7 +89,7 @@ def observe(
             R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
             points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
             planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
-        crossed += _crossings(prepared, placement, view, variant, turn, crossings)
+        crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
     return CameraObservations(
         camera=camera,
         source="platform" if prepared.session.cameras[camera].mount == "platform" else "lrf",
@@ -104,7 +107,7 @@ def observe(
 
 
 def observe_all(prepared, T_head_lrf=None):
-    """Observations of all cameras in both edge-point variants, keyed by (camera, variant)."""
+    """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
     keys = [(camera, variant) for camera in prepared.views for variant in VARIANTS]
     return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
 
@@ -123,14 +126,21 @@ def _rotation(turn, pitch):
     return np.stack([turn(np.tile(e, (len(pitch), 1)), pitch) - origin for e in np.eye(3)], axis=-1)
 
 
-def _crossings(prepared, placement, view, variant, turn, count):
+def _crossings(prepared, placement, view, variant, turn, count, one_scan):
     """Crossings of named sides with the image line of the same edge, thinned evenly along each edge."""
     middle = np.mean(prepared.scans[placement].sweep.pitch)
-    for name, found, side, across in named_sides(prepared, placement, variant):
+    sides = list(named_sides(prepared, placement, variant))
+    if one_scan:
+        sides = [part for part in sides if part[0] in prepared.board.features and not part[3]]
+        lines = [found.line[found.side == side] for _, found, side, _ in sides]
+        both = np.intersect1d(*lines) if len(lines) == 2 else np.zeros(0, int)
+    for name, found, side, across in sides:
         edge = view.edge(name)
         if edge is None:
             continue
         rows = thin(np.flatnonzero(found.side == side), count)
+        if one_scan:
+            rows = np.flatnonzero((found.side == side) & np.isin(found.line, both[len(both) // 2 :][:1]))
         p_lrf, pitch, n, step = found.points[rows], found.pitch[rows], len(rows), 1e-6
         by_pitch = (turn(p_lrf, pitch + step) - turn(p_lrf, pitch - step)) / (2 * step)
         moved = by_pitch * prepared.pitch_noise.sigma(pitch, middle)[:, None]

@@ -12,7 +12,7 @@ from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, o
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 
 YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
@@ -29,7 +29,10 @@ STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a wo
 DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
 LOST = 0.1  # share of the placements that may be left out without a warning
-SIZES = "check the stated size of the board and of the squares of its chessboard, which expected errors presume"
+SIZES = (
+    "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
+    "of every range)"
+)
 POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
@@ -119,7 +122,7 @@ def _error_words(errors):
     return ", ".join(words)
 
 
-def verdict(solution, models, *, suggest=True, **options):
+def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     """Judge a joint estimate: a :class:`Verdict`.
 
     Parameters
@@ -129,13 +132,15 @@ def verdict(solution, models, *, suggest=True, **options):
     models : dict of str to CameraModel
     suggest : bool
         Also look for the next placement.
+    doubt : float
+        By how much all ranges may be wrong beside what the estimate knows, metres; see :func:`contradicts_stated`.
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
     groups, suggestion, problem = (solution.data.face, solution.data.beam), None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
-    found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution))
+    found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
     if suggest:
         try:
             suggestion = suggest_placement(solution, models, **options)
@@ -144,8 +149,12 @@ def verdict(solution, models, *, suggest=True, **options):
     return replace(found, suggestion=suggestion, no_suggestion=problem)
 
 
-def _expected(chains, models, pitch, noise, reasons):
+def _expected(chains, models, pitch, noise, reasons, doubt):
     """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
+    # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have taken it up
+    unsure = np.diag([doubt**2 * (name in ("range_offset", *POSE_NAMES[3:])) for name in COLUMNS])
+    more = {c: tuple(C + unsure for C in chain.covariances) for c, chain in chains.items()}
+    chains = {c: replace(chain, covariances=more[c]) for c, chain in chains.items()}
     low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
     middle = (low + high) / 2
     field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
@@ -181,7 +190,7 @@ def judge(calibration, method=None, **options):
     """
     prepared, joint = calibration.prepared, calibration.joint
     # also where the joint estimate is not handed over: a wrong size may be why
-    sizes = [] if joint is None else contradicts_stated(joint)
+    sizes, doubt = ([], 0.0) if joint is None else contradicts_stated(joint)
     try:
         method = method or handed_over(calibration)
     except ValueError as error:
@@ -189,9 +198,9 @@ def judge(calibration, method=None, **options):
         why = "; ".join([f"nothing can be handed over ({error})", *(f"{' '.join(k)}: {v}" for k, v in found)])
         return _answered(Verdict(NO, (), {}, np.nan, 0.0, None), [*sizes, Reason(NO, "handed over", why)])
     if method == "joint":
-        found = verdict(joint.solution, prepared.models, **sight_of(prepared) | options)
+        found = verdict(joint.solution, prepared.models, doubt=doubt, **sight_of(prepared) | options)
     else:
-        found = _without_joint(calibration, method)
+        found = _without_joint(calibration, method, doubt)
     reasons, words = _left_out(calibration, method)
     if reasons:  # with the words of those that the estimate excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
@@ -207,7 +216,7 @@ def sight_of(prepared):
     return {"field_of_view": prepared.session.lrf.field_of_view, "features": features}
 
 
-def _without_joint(calibration, method):
+def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared, problems, joint = calibration.prepared, calibration.problems, calibration.joint
     solved = {camera: found for (camera, name), found in calibration.solutions.items() if name == method}
@@ -232,12 +241,15 @@ def _without_joint(calibration, method):
         chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
     noise = np.median([board.sigma_range for board in prepared.scans.values()])
-    return replace(_expected(chains, prepared.models, pitch, noise, reasons), sweep_mm=0.0)
+    return replace(_expected(chains, prepared.models, pitch, noise, reasons, doubt), sweep_mm=0.0)
 
 
 def contradicts_stated(joint):
-    """Reasons to doubt what is stated of sizes: a range offset that no maker admits, edges of another length."""
-    solution, lrf, reasons = joint.solution.solution, joint.prepared.session.lrf, []
+    """Reasons to doubt what is stated of sizes, and by how much all ranges are off if they are wrong (metres).
+
+    The reasons are a range offset that no maker admits, and edges of another length in the cloud.
+    """
+    solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
@@ -246,6 +258,7 @@ def contradicts_stated(joint):
             f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
+        doubt = abs(offset)
     error, sigma = size_error(joint)
     if abs(error) > CONTRADICTS * sigma:
         length = 1000 * error * np.mean(list(joint.prepared.board.lengths().values()))
@@ -255,7 +268,8 @@ def contradicts_stated(joint):
             f"expected error: {SIZES}"
         )
         reasons.append(Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words))
-    return reasons
+        doubt = max(doubt, abs(error) * float(np.median(joint.solution.observations.face_range)))
+    return reasons, doubt
 
 
 def _left_out(calibration, method):

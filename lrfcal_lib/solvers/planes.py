@@ -312,62 +312,63 @@ def plane_error(obs, solution):
     return float(np.sqrt(np.mean((np.bincount(index, distance[known]) / np.bincount(index)) ** 2)))
 
 
-def planes_and_pattern(state, planes, obs):
+def planes_and_pattern(state, planes, obs, lens=9):
     """Residuals by placement of pose, intrinsics and board poses (p, 3, 4): point-plane distances, pattern corners.
 
     `planes` are triangles, offsets and whiteners of :func:`plane_terms`; zero where nothing was scanned. Unknowns: pose
-    6 and intrinsics 9 are shared, the board's pose 6 is the placement's own.
+    6 and intrinsics (the first `lens`) are shared, the board's pose 6 is the placement's own.
     """
     pose, intrinsics, boards = state
     triangles, offset, whitener = planes
     residuals, by_pose, by_board = plane_terms(pose, triangles, boards, offset)
-    by_lens = np.zeros(residuals.shape + (9,))
+    by_lens = np.zeros(residuals.shape + (lens,))
     distances = Block(residuals, np.concatenate([by_pose, by_lens, by_board], axis=-1), whitener[:, None])
     camera, pixels, seen = obs.model.with_parameters(intrinsics), obs.pattern_pixels, np.isfinite(obs.pattern_pixels)
     q, rotated = apply_pose(boards, obs.pattern_points), geometry.rotate_points(boards, obs.pattern_points)
     by_point, by_lens = project_jacobians(q, camera)
     errors = np.where(seen, project(q, camera) - np.where(seen, pixels, 0.0), 0.0)
     by_board = np.stack([geometry.gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
-    jacobian = np.concatenate([np.zeros_like(by_board), by_lens, by_board], axis=-1)
+    jacobian = np.concatenate([np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1)
     p = len(boards)
     sigma = seen.reshape(p, -1) / obs.pattern_sigma_px
-    return [distances, Block(errors.reshape(p, -1), jacobian.reshape(p, sigma.shape[1], 21), sigma)]
+    return [distances, Block(errors.reshape(p, -1), jacobian.reshape(p, sigma.shape[1], 12 + lens), sigma)]
 
 
-def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, **options):
+def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens=9, **options):
     """Pose, intrinsics and board poses together: pattern reprojection plus point-plane distances.
 
-    The start is the estimate from planes with the board poses and the model that the observations hold. An error that
-    all points of a placement have in common (a bent board, a wrong pitch; see :func:`plane_error`) is allowed for:
-    without it thousands of points would overrule the pattern. The solution's ``model`` holds the refined intrinsics
-    with their covariance, ``board_poses`` the refined boards. Raises ValueError without pattern corners.
+    Of the intrinsics the first `lens` are free: 4 is K alone (as published), 9 with the distortion. The start is the
+    estimate from planes with the board poses and the model that the observations hold; points are compressed once more
+    at the first solution. An error that all points of a placement have in common (a bent board, a wrong pitch; see
+    :func:`plane_error`) is allowed for: without it thousands of points would overrule the pattern. The solution's
+    ``model`` holds the refined intrinsics with their covariance, ``board_poses`` the refined boards. Raises ValueError
+    without pattern corners.
     """
     if obs.pattern_points.shape[0] < 4 or not np.isfinite(obs.pattern_pixels).any():
         raise ValueError(
             f"camera '{obs.camera}': {len(obs.pattern_points)} pattern corners, a joint "
             "refinement needs a printed pattern"
         )
-    first = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
-    sets, pose = plane_sets(obs, 3 if required else 1), geometry.pose_array(first.transform)
-    p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, first)
-    triangles, offset, rest = correct_and_compress(sets, pose)
+    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
+    sets = plane_sets(obs, 3 if required else 1)
+    p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, solution)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
+    numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
+    pose, fixed = geometry.pose_array(solution.transform), np.zeros(9 - lens)
+    triangles, offset, rest = correct_and_compress(sets, pose)
     whitener = board_whitener(pose, triangles, sets.boards, common)
     planes = np.zeros((p, 4, 4)), np.zeros((p, 4)), np.zeros((p, 4, 4))
     for every, scanned in zip(planes, (triangles, offset, whitener), strict=True):
         every[sets.rows] = scanned
-    numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
     solution = solve(
-        lambda state: residual(state, planes, obs),
-        (pose, obs.model.parameters, obs.board_poses[:, :3]),
-        lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + step[0][6:], move_pose(s[2], step[1])),
-        read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1]])),
-        names=POSE_NAMES + INTRINSIC_NAMES, method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES, shared=15,
-        freedom=numbers - 15 - 6 * p, required=required, chi2_rest=rest, n_observations=numbers, **options,
-    )  # fmt: skip
+        lambda state: residual(state, planes, obs, lens), (pose, obs.model.parameters, obs.board_poses[:, :3]),
+        lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + np.r_[step[0][6:], fixed], move_pose(s[2], step[1])),
+        read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1][:lens]])),
+        names=POSE_NAMES + INTRINSIC_NAMES[:lens], method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES[:lens],
+        shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, required=required, chi2_rest=rest,
+        n_observations=numbers, **options,
+    )
     errors = solution.residuals[:, -2 * count :] * obs.pattern_sigma_px
     rms = float(np.sqrt(2 * np.sum(errors**2) / np.isfinite(obs.pattern_pixels).sum()))  # per corner, as OpenCV has it
-    model = obs.model.with_parameters(solution.parameters[6:], solution.covariance[6:, 6:], rms)
-    poses = np.tile(np.eye(4), (p, 1, 1))
-    poses[:, :3] = solution.state[2]
-    return replace(solution, model=model, board_poses=poses)
+    model = obs.model.with_parameters(solution.state[1], np.pad(solution.covariance[6:, 6:], (0, 9 - lens)), rms)
+    return replace(solution, model=model, board_poses=pose_transform(solution.state[2]).as_matrix())

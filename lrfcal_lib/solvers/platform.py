@@ -228,12 +228,13 @@ def move_platform(state, step):
     return move_head(state[0], common), geometry.move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
 
 
-def solve_projected(obs, T0=None, *, required=True):
+def solve_projected(obs, T0=None, *, printed=False, required=True):
     """The tilt axis by the paper's projected line fits; for parameters and errors see :func:`solve_platform`.
 
     Of the observations the edge points are used, without their covariance; that of the result comes from the scatter of
     the residuals. Placements with an edge parallel to a coordinate plane are skipped: their projected fits would divide
-    by zero.
+    by zero. Which planes these are is a matter of the chart: of that of this repository, where the LRF is turned least,
+    or (`printed`) of the paper's, where it lies on the y axis of the head, ``t = (0, t_y, 0)``.
 
     Notes
     -----
@@ -244,7 +245,8 @@ def solve_projected(obs, T0=None, *, required=True):
     result depends on that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
-    groups, skipped = _slanted(obs, lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge))
+    turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real if printed else 0.0
+    groups, skipped = _slanted(obs, tilt(lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge), turn))
     if not groups:
         raise DegenerateGeometry(f"projected fits: no placement can be used: {skipped}; use the 3D fits instead")
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
@@ -252,9 +254,10 @@ def solve_projected(obs, T0=None, *, required=True):
     def solved(head, scatter, **earlier):
         """The fits with a given scatter about the lines."""
         return solve(
-            lambda head: projected_block(head, obs, groups.values(), scatter), geometry.pose_array(head), move_head,
-            names=AXIS_NAMES, method="platform_projected", words=WORDS, groups=np.repeat(list(groups), rows),
-            read=lambda head: (geometry.pose_transform(head), chart_parameters(head)), limit=np.inf, required=required,
+            partial(projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed),
+            geometry.pose_array(head), move_head, names=AXIS_NAMES, method="platform_projected", words=WORDS,
+            groups=np.repeat(list(groups), rows), limit=np.inf, required=required,
+            read=lambda head: (geometry.pose_transform(head), chart_parameters(head)),
             max_iterations=100, **earlier,
         )  # fmt: skip
 
@@ -285,7 +288,7 @@ def _slanted(obs, p_platform):
     return groups, skipped
 
 
-def projected_block(head, obs, groups, scatter=1.0):
+def projected_block(head, obs, groups, scatter=1.0, printed=False):
     """The six terms of equation (15) of every placement (rows of edge 1, rows of edge 2) over their common scatter.
 
     The Jacobian by the axis chart comes from complex steps, exact but for rounding.
@@ -294,8 +297,17 @@ def projected_block(head, obs, groups, scatter=1.0):
     by_axis = np.concatenate([-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1)
     by_axis = np.moveaxis(by_axis[..., AXIS_COLUMNS], -1, 0)
     q = tilt(rotated + head[:, 3], obs.edge_pitch) + TINY * 1j * tilt(by_axis, obs.edge_pitch)
+    if printed:
+        q = tilt(q, _to_printed_chart(head[:, 3] + TINY * 1j * np.eye(6)[AXIS_COLUMNS, 3:])[:, None])
     terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1) / scatter
     return Block(terms[0].real, terms.imag.T / TINY, np.ones(terms.shape[1]))
+
+
+def _to_printed_chart(t):
+    """Angle about the tilt axis that turns shifts (..., 3) of the LRF from it into the paper's t = (0, t_y, 0)."""
+    y, z = np.moveaxis(t[..., 1:], -1, 0)  # of an axis through the LRF's origin: none
+    change = (z.real * y.imag - y.real * z.imag) / np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
+    return -np.arctan2(z.real, y.real) + 1j * change
 
 
 def _six_terms(first, second):
