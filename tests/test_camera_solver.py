@@ -267,10 +267,8 @@ def test_parallel_edges_leave_a_motion_open():
     x, y, _ = obs.crossing_points.T
     points = rig.T_camera_lrf.inv().apply(np.column_stack([0 * x, x, 2 + y]))
     parallel = replace(obs, crossing_lines=lines, crossing_points=points)
-    with pytest.raises(DegenerateGeometry, match="do not determine .*translation along"):
+    with pytest.raises(DegenerateGeometry, match="do not determine .*translation along y"):
         solve_camera(parallel, "line", rig.T_camera_lrf)
-    found = solve_camera(parallel, "line", rig.T_camera_lrf, required=False)
-    assert len(found.unobservable) >= 2 and any("along y" in words for words in found.unobservable)
 
 
 def test_points_on_one_line_leave_a_rotation_open():
@@ -293,19 +291,10 @@ def test_a_product_of_distances_vanishes_when_one_edge_fits():
         cost_readings(single, rig.T_camera_lrf, np.ones(6), [0.0])
 
 
-@pytest.mark.parametrize("kind", ["planes", "lines"])
-def test_outlying_placements_are_found_untold(kind):
+def test_outlying_placements_are_found_untold():
     _, obs = camera_case(23, count=16, noise=1.0, source="platform")
-    poses, lines = obs.board_poses.copy(), obs.crossing_lines.copy()
+    assert find_outlying_placements(obs)[1] == {}
+    poses = obs.board_poses.copy()
     poses[[3, 8], :3, 3] += 0.08 * poses[[3, 8], :3, 2]
-    lines[np.isin(obs.crossing_placement, (4, 9)), 2] += 15.0
-    report = find_outlying_placements(replace(obs, board_poses=poses, crossing_lines=lines), kind)
-    assert set(report.outlying) == {4, 9} and len(report.inliers) == 14
-    assert np.all(report.rms[[3, 8]] > report.limit[[3, 8]])
-
-
-def test_good_placements_are_left_alone():
-    _, obs = camera_case(24, count=16, noise=1.0, source="platform")
-    assert find_outlying_placements(obs, "planes").outlying == ()
-    with pytest.raises(ValueError, match="unknown kind 'edges'"):
-        find_outlying_placements(obs, "edges")
+    inliers, outlying = find_outlying_placements(replace(obs, board_poses=poses))
+    assert set(outlying) == {4, 9} and min(outlying.values()) > 0.05 and len(inliers) == 14

@@ -68,7 +68,6 @@ def random_problem(rng, placements=3):
         pose_array(random_pose(rng, 0.2, (0, 0, 0.1))),
         np.stack([pose_array(random_pose(rng, 0.2)) for _ in range(2)]),
         np.array([0.01, 0.3, np.log(0.4), 0.02, 0.01]),
-        rng.normal(0, 0.01, 3),
         np.stack([pose_array(random_pose(rng) * facing) for _ in range(placements)]),
         rng.normal(0, 0.02, (placements, 2)),
         rng.normal(0, 0.2, (placements, 3)),

@@ -84,23 +84,21 @@ def test_batch_equals_single():
     assert batch.converged.shape == (7,) and batch.converged.all()
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_losses_resist_outliers(data, loss):
+def test_loss_resists_outliers(data):
     x, y = data
     y = y.copy()
     y[::8] += 5.0
     plain = fit(line_problem(x, y, 0.1), np.zeros(2))
-    robust = fit(line_problem(x, y, 0.1), np.zeros(2), loss=loss, scale="auto")
+    robust = fit(line_problem(x, y, 0.1), np.zeros(2), loss="cauchy", scale="auto")
     assert abs(plain.parameters[1] - 0.5) > 0.4
     assert np.abs(robust.parameters - [2, 0.5]).max() < 0.1
     assert robust.weights[::8].max() < 0.2
 
 
-@pytest.mark.parametrize("loss", [None, "huber", "cauchy"])
-def test_weights_are_the_slope_of_the_loss(loss):
+def test_weights_are_the_slope_of_the_loss():
     z = np.array([0.01, 0.5, 1.0, 1.4, 3.0, 20.0])
-    slope = (robust(z + 1e-6, loss)[0] - robust(z - 1e-6, loss)[0]) / 2e-6
-    np.testing.assert_allclose(robust(z, loss)[1], slope / (2 * z), rtol=1e-6)
+    slope = (robust(z + 1e-6, "cauchy")[0] - robust(z - 1e-6, "cauchy")[0]) / 2e-6
+    np.testing.assert_allclose(robust(z, "cauchy")[1], slope / (2 * z), rtol=1e-6)
 
 
 def test_robust_result_matches_scipy(data):

@@ -256,14 +256,13 @@ def rough_poses(prepared):
     for camera in prepared.views:
         obs = observe(prepared, camera)
         try:
-            judged = find_outlying_placements(obs, "planes")
-            rough[camera] = solve_camera(obs.select(judged.inliers), "zhang_pless").transform
+            inliers, outlying = find_outlying_placements(obs)
+            rough[camera] = solve_camera(obs.select(inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
             problems[f"camera {camera}"] = str(error)
             continue
-        for placement in judged.outlying:
-            miss = 1000 * judged.rms[judged.placements == placement][0]
-            problems[placement] = f"camera {camera}: its plane is {miss:.0f} mm rms off the scan; left out"
+        for placement, miss in outlying.items():
+            problems[placement] = f"camera {camera}: its plane is {1000 * miss:.0f} mm rms off the scan; left out"
     return rough, problems
 
 

@@ -22,7 +22,7 @@ from scipy.stats import chi2 as chi2_distribution
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
-HUBER, CAUCHY = 1.345, 2.385  # 95 % efficiency for normal errors
+CAUCHY = 2.385  # 95 % efficiency for normal errors
 RANK = 1e-13  # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 
 
@@ -73,15 +73,11 @@ def whiten(block, jacobian=True):
 
 
 def robust(z, loss):
-    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale: huber, cauchy or None."""
-    z = np.abs(z)
-    if loss is None:
-        return z**2, np.ones_like(z)
-    if loss == "huber":
-        return np.where(z <= HUBER, z**2, HUBER * (2 * z - HUBER)), HUBER / np.maximum(z, HUBER)
-    if loss == "cauchy":
-        return CAUCHY**2 * np.log1p((z / CAUCHY) ** 2), 1.0 / (1.0 + (z / CAUCHY) ** 2)
-    raise ValueError(f"unknown loss {loss!r}: use None, 'huber' or 'cauchy'")
+    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale."""
+    if loss != "cauchy":
+        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
+    square = (z / CAUCHY) ** 2
+    return CAUCHY**2 * np.log1p(square), 1.0 / (1.0 + square)
 
 
 @lru_cache(maxsize=4096)
@@ -187,7 +183,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
     shared : int, optional
         Number of unknowns common to all entries of the leading axis.
-    loss : {None, 'huber', 'cauchy'}
+    loss : {None, 'cauchy'}
     scale : float or 'auto'
         Unit of the loss in standard deviations; 'auto' takes it from the median of the residuals in every iteration.
     max_iterations : int

@@ -177,15 +177,12 @@ class CameraObservations(_Groups):
         parts = (self.crossing_placement, self.plane_placement, self.placements, self.scene_placement)
         return np.unique(np.concatenate(parts))
 
-    def posed_faces(self):
-        """Placements with a board pose and points on the board, sorted."""
-        return np.intersect1d(self.placements, self.plane_placement)
-
     def require(self, kind, least):
         """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for what they leave open."""
+        faces = np.intersect1d(self.placements, self.plane_placement)
         found, what = {
             "crossing": (self.crossing_placement, "crossings of scan lines with edges"),
-            "plane": (self.posed_faces(), "placements with a board pose and points on the board"),
+            "plane": (faces, "placements with a board pose and points on the board"),
             "scene": (self.scene_placement, "scene points"),
         }[kind]
         if len(found) < least:
@@ -335,20 +332,15 @@ class JointObservations(_Groups):
 
     def select(self, placements):
         """The observations of some placements (numbers) only."""
-        kept = np.flatnonzero(np.isin(self.placements, np.asarray(list(placements))))
-        new = np.full(len(self.placements), -1)
-        new[kept] = np.arange(len(kept))
-        rows = {name: new[getattr(self, f"{name}_placement")] >= 0 for name in GROUPS}
-        out = self.keep(**rows)
-        moved = {f"{name}_placement": new[getattr(out, f"{name}_placement")] for name in GROUPS}
-        cut = {key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")}
-        return replace(out, **moved, **cut)
+        kept = np.flatnonzero(np.isin(self.placements, list(placements)))
+        out = self.keep(**{name: np.isin(getattr(self, f"{name}_placement"), kept) for name in GROUPS})
+        moved = {f"{name}_placement": np.searchsorted(kept, getattr(out, f"{name}_placement")) for name in GROUPS}
+        return replace(out, **moved, **{key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")})
 
     def with_cameras(self, names):
         """The observations of some cameras only."""
         kept = [i for i, name in enumerate(self.cameras) if name in names]
         out = self.keep(view=np.isin(self.view_camera, kept))
-        camera = np.searchsorted(kept, out.view_camera) if kept else out.view_camera
         chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
-        chosen["lens_covariance"] = self.lens_covariance[kept]
-        return replace(out, view_camera=camera, **chosen)
+        camera = np.searchsorted(kept, out.view_camera)
+        return replace(out, view_camera=camera, lens_covariance=self.lens_covariance[kept], **chosen)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import edge_shift, interval_terms, line_block, read_pose, sight_block, sight_normals
@@ -180,7 +178,7 @@ def freeze_intervals(state, obs, sight, lengths, softness):
     return half, np.sqrt(np.take_along_axis(variance, best, axis=0)[0])
 
 
-def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
+def estimate_likely(residual, obs, pose, *, method, uses):
     """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges lie.
 
     `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is
@@ -205,8 +203,7 @@ def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_ite
     problem, state, earlier = minimise_in_rounds(freeze, state, move_biased, ROUNDS, max_iterations=30)
     return solve(
         problem, state, move_biased, names=(*geometry.POSE_NAMES, "log_odds"), method=method, read=read, words=words,
-        scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, required=required, earlier=earlier,
-        max_iterations=max_iterations,
+        scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, earlier=earlier,
     )  # fmt: skip
 
 
@@ -221,34 +218,31 @@ def edge_bias(solution, radius=1.0, background=0.0):
 
 
 def start_from_lines(obs):
-    """Many rotations at once, each with its best translation, refined on planes of sight; robust vote."""
+    """From crossings and the image lines of their edges."""
     obs.require("crossing", 6)
-    normals, points, rotations = sight_normals(obs.crossing_lines, obs.model)[0], obs.crossing_points, start_rotations()
-    right = -np.sum(normals * (points @ np.swapaxes(rotations, -1, -2)), axis=-1)
-    found = shifted(rotations, normals, right)
+    return _start_from_sights(obs.crossing_points, obs.crossing_lines, obs)
+
+
+def start_from_scene(obs):
+    """From named points: each is seen where a column and a row of the image cross."""
+    obs.require("scene", 4)
+    u, v = obs.scene_pixels.T
+    lines = np.concatenate([np.column_stack([1 + 0 * u, 0 * u, -u]), np.column_stack([0 * v, 1 + 0 * v, -v])])
+    return _start_from_sights(np.tile(obs.scene_points, (2, 1)), lines, obs)
+
+
+def _start_from_sights(points, lines, obs):
+    """Many rotations at once, each with its best translation, refined on planes of sight; robust vote."""
+    normals, rotations = sight_normals(lines, obs.model)[0], start_rotations()
+    found = shifted(rotations, normals, -np.sum(normals * (points @ np.swapaxes(rotations, -1, -2)), axis=-1))
     for loss in (None, "cauchy"):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
         found = minimise(lambda pose: sight_block(pose, points, normals, 0.005), found, move_pose, **options)[0]
     z = geometry.apply_pose(found, points)[..., 2]
     keep = (z > 0).mean(axis=1) > 0.8
     if not keep.any():
-        raise DegenerateGeometry(
-            f"camera '{obs.camera}': no pose puts the {len(points)} crossings in front of the camera"
-        )
+        raise DegenerateGeometry(f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera")
     found, z = found[keep], z[keep]
     distance = np.abs(sight_block(found, points, normals, 1.0).residuals) / np.abs(z)
     count = max(6, int(0.75 * len(points)))
     return geometry.pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])
-
-
-def start_from_scene(obs):
-    """Perspective n points (SQPnP within RANSAC) from points that LRF and camera both name."""
-    obs.require("scene", 4)
-    arguments = (np.ascontiguousarray(obs.scene_points), np.ascontiguousarray(obs.scene_pixels), obs.model.matrix, None)
-    options = {"flags": cv2.SOLVEPNP_SQPNP, "reprojectionError": 20.0, "iterationsCount": 500}
-    found, rotvec, translation, _ = cv2.solvePnPRansac(*arguments, **options)
-    if not found:
-        raise DegenerateGeometry(
-            f"camera '{obs.camera}': no pose agrees with four of the {len(obs.scene_points)} scene points"
-        )
-    return RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))

@@ -37,9 +37,9 @@ class PlaneSets:
         return self.used.sum(axis=1)
 
 
-def plane_sets(obs, least=3):
-    """Group the face points of the placements (at least so many) whose board pose the camera knows."""
-    obs.require("plane", least)
+def plane_sets(obs):
+    """Group the face points of the placements (three at least) whose board pose the camera knows."""
+    obs.require("plane", 3)
     placements, rows, _ = np.intersect1d(obs.placements, obs.plane_placement, return_indices=True)
     mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
     where = np.searchsorted(placements, obs.plane_placement[mine])
@@ -150,14 +150,10 @@ INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 INTRINSIC_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 
 
-def start_from_planes(obs, required=True):
-    """A start value of ``T_camera_source``: closed form in random subsets of the placements, least trimmed squares.
-
-    Needs three placements where `required`; otherwise a pose that fits the planes all the same.
-    """
-    sets = plane_sets(obs, 3 if required else 1)
-    if required:
-        check_normals(sets, obs.camera)
+def start_from_planes(obs):
+    """A start value of ``T_camera_source``: closed form in random subsets of the placements, least trimmed squares."""
+    sets = plane_sets(obs)
+    check_normals(sets, obs.camera)
     triangles, p = compress(sets, 1.0), len(sets.placements)
     (frame, flat), found = common_plane(triangles), []
     if p >= 3 and not flat:
@@ -253,10 +249,7 @@ def _rotation_grid_on_planes(sets, triangles):
     rotations, (_, centre), normal = start_rotations(), _centred(triangles), sets.boards[:, :, 2]
     moved = np.sum(normal * (centre @ np.swapaxes(rotations, -1, -2)), axis=-1)
     start = shifted(rotations, normal, np.sum(normal * sets.boards[:, :, 3], axis=1) - moved)
-    sigma = 0.005
-    found, *_ = minimise(
-        lambda pose: plane_block(pose, triangles / sigma, sets.boards), start, move_pose, max_iterations=40
-    )
+    found = minimise(lambda pose: plane_block(pose, triangles / 0.005, sets.boards), start, move_pose)[0]
     ahead = (apply_pose(found, centre)[..., 2] > 0).all(axis=1)
     return found[ahead] if ahead.any() else found
 
@@ -267,7 +260,7 @@ def start_rotations():
     return np.concatenate([Rotation.create_group("O").as_matrix(), some])
 
 
-def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
+def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, **options):
     """The pose of a camera from the board's planes (Zhang and Pless).
 
     Weighted by the points' covariance across the board and, correlated within a placement, that of the board's pose;
@@ -276,8 +269,8 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
     unweighted estimate on: weights of a bad pose would hold it there. A loss judges whole placements, because a bad
     board pose spoils all points of its placement.
     """
-    sets = plane_sets(obs, 3 if required else 1)
-    if required and sets.boards.ndim == 3:
+    sets = plane_sets(obs)
+    if sets.boards.ndim == 3:
         check_normals(sets, obs.camera)
 
     def freeze(pose, number):
@@ -294,8 +287,8 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
     return solve(
         problem, pose, move_pose, names=POSE_NAMES, method=method, read=read_pose,
         words=lambda d: geometry.motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
-        required=required, n_observations=count, earlier=earlier,
-        chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0, **options,
+        n_observations=count, earlier=earlier, **options,
+        chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0,
     )  # fmt: skip
 
 
@@ -334,7 +327,7 @@ def planes_and_pattern(state, planes, obs, lens=9):
     return [distances, Block(errors.reshape(p, -1), jacobian.reshape(p, sigma.shape[1], 12 + lens), sigma)]
 
 
-def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens=9, **options):
+def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     """Pose, intrinsics and board poses together: pattern reprojection plus point-plane distances.
 
     Of the intrinsics the first `lens` are free: 4 is K alone (as published), 9 with the distortion. The start is the
@@ -349,8 +342,8 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens
             f"camera '{obs.camera}': {len(obs.pattern_points)} pattern corners, a joint "
             "refinement needs a printed pattern"
         )
-    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
-    sets = plane_sets(obs, 3 if required else 1)
+    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, **options)
+    sets = plane_sets(obs)
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, solution)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
     numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
@@ -365,8 +358,8 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens
         lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + np.r_[step[0][6:], fixed], move_pose(s[2], step[1])),
         read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1][:lens]])),
         names=POSE_NAMES + INTRINSIC_NAMES[:lens], method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES[:lens],
-        shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, required=required, chi2_rest=rest,
-        n_observations=numbers, **options,
+        shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, chi2_rest=rest, n_observations=numbers,
+        **options,
     )
     errors = solution.residuals[:, -2 * count :] * obs.pattern_sigma_px
     rms = float(np.sqrt(2 * np.sum(errors**2) / np.isfinite(obs.pattern_pixels).sum()))  # per corner, as OpenCV has it

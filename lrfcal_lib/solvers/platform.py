@@ -61,7 +61,7 @@ def start_head(T0):
     return head_from_axis(axis_of(RigidTransform.identity() if T0 is None else T0))
 
 
-def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
+def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
     """The tilt axis from 3D line fits, weighted by propagated noise.
 
     Parameters
@@ -71,8 +71,6 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
         Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
     sigma_pitch : float
         Standard deviation of a recorded pitch, radians.
-    required : bool
-        False: report unobservable motions instead of raising.
 
     Returns
     -------
@@ -101,7 +99,7 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
             names=AXIS_NAMES, method="platform_3d", words=WORDS, shared=4,
             read=lambda state: (geometry.pose_transform(state[0]), chart_parameters(state[0])),
             freedom=points + number + 2 * p - 4 - 8 * p, limit=0.5, max_iterations=100,
-            n_observations=points, required=required and final, earlier=earlier,
+            n_observations=points, required=final, earlier=earlier,
         )
         gauge, earlier = head_from_axis(axis_of(found.transform)), [found.cost_history]
     return PlatformSolution(found, np.array(list(boards)), *found.state[2].T, skipped)
@@ -228,7 +226,7 @@ def move_platform(state, step):
     return move_head(state[0], common), geometry.move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
 
 
-def solve_projected(obs, T0=None, *, printed=False, required=True):
+def solve_projected(obs, T0=None, *, printed=False):
     """The tilt axis by the paper's projected line fits; for parameters and errors see :func:`solve_platform`.
 
     Of the observations the edge points are used, without their covariance; that of the result comes from the scatter of
@@ -256,7 +254,7 @@ def solve_projected(obs, T0=None, *, printed=False, required=True):
         return solve(
             partial(projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed),
             geometry.pose_array(head), move_head, names=AXIS_NAMES, method="platform_projected", words=WORDS,
-            groups=np.repeat(list(groups), rows), limit=np.inf, required=required,
+            groups=np.repeat(list(groups), rows), limit=np.inf,
             read=lambda head: (geometry.pose_transform(head), chart_parameters(head)),
             max_iterations=100, **earlier,
         )  # fmt: skip
