@@ -30,6 +30,11 @@ class Rig:
     model: CameraModel
 
 
+def numeric(function, count, step=1e-6):
+    """Derivative of a function of increments (count,) about zero, along the last axis."""
+    return np.stack([(function(s) - function(-s)) / (2 * step) for s in step * np.eye(count)], axis=-1)
+
+
 def random_rig(rng):
     """A camera beside the LRF looking the same way, off by some 10 degrees and 20 cm."""
     ahead = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])

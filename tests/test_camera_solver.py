@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case, camera_observations
+from synthetic import camera_case, camera_observations, numeric
 
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m, sight_normals
@@ -19,7 +19,6 @@ from lrfcal_lib.solvers.planes import start_from_planes
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 RESIDUALS = {"line": line_block, "wasielewski_strauss": distance_block, "bauermann": point_block}
-STEPS = 1e-6 * np.eye(6)
 
 
 def increment(found, truth):
@@ -126,9 +125,8 @@ def test_jacobians_against_numeric_ones(name):
     rig, obs = camera_case(9, noise=1.0)
     residual, pose = RESIDUALS[name], pose_array(rig.T_camera_lrf * OFF)
     J = residual(pose, obs).jacobian
-    for k, step in enumerate(STEPS):
-        high, low = (residual(move_pose(pose, s), obs).residuals for s in (step, -step))
-        np.testing.assert_allclose(J[:, k], (high - low) / 2e-6, rtol=1e-6, atol=1e-8 * np.abs(J).max())
+    expected = numeric(lambda s: residual(move_pose(pose, s), obs).residuals, 6)
+    np.testing.assert_allclose(J, expected, rtol=1e-6, atol=1e-8 * np.abs(J).max())
 
 
 @pytest.mark.parametrize("name", RESIDUALS)
@@ -136,9 +134,8 @@ def test_corrected_jacobians_are_the_gradient_of_chi_square(name):
     rig, obs = camera_case(10, 6, noise=1.0)
     residual, pose = RESIDUALS[name], pose_array(rig.T_camera_lrf)
     r, J = whiten(residual(pose, obs))
-    for k, step in enumerate(STEPS):
-        high, low = (np.sum(whiten(residual(move_pose(pose, s), obs))[0] ** 2) for s in (step, -step))
-        assert (J.T @ r)[k] == pytest.approx((high - low) / 4e-6, rel=1e-4, abs=1e-3)
+    half = numeric(lambda s: 0.5 * np.sum(whiten(residual(move_pose(pose, s), obs))[0] ** 2), 6)
+    np.testing.assert_allclose(J.T @ r, half, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["line", "wasielewski_strauss"])
@@ -188,18 +185,6 @@ def test_a_distance_from_the_plane_of_sight_is_the_pixel_distance_scaled_by_dept
     assert (np.abs(sight.parameters - lines.parameters) / lines.sigma).max() < 0.1
 
 
-def test_many_trials_equal_single_ones():
-    rig, obs = camera_case(11, noise=1.0)
-    points = obs.crossing_points + np.random.default_rng(12).normal(0, 0.002, (4, *obs.crossing_points.shape))
-    points *= [1, 1, 0]
-    batch = solve_camera(replace(obs, crossing_points=points), "line", rig.T_camera_lrf)
-    for i in range(4):
-        single = solve_camera(replace(obs, crossing_points=points[i]), "line", rig.T_camera_lrf)
-        np.testing.assert_allclose(batch.transform.as_matrix()[i], single.transform.as_matrix(), atol=1e-8)
-        np.testing.assert_allclose(batch.covariance[i], single.covariance, rtol=1e-4)
-        np.testing.assert_allclose(batch.covariance_placements[i], single.covariance_placements, rtol=1e-3)
-
-
 def test_predicted_covariance_in_a_thousand_trials():
     rig, obs = camera_case(13, count=20)
     rng = np.random.default_rng(14)
@@ -230,17 +215,6 @@ def test_robust_loss_resists_wrong_points_without_a_guess():
     found = solve_camera(replace(obs, scene_pixels=pixels), "bauermann", loss="cauchy", scale="auto")
     assert miss(found, rig)[1] < 0.03
     assert found.weights.reshape(-1, 2)[::9].max() < 0.05
-
-
-def test_a_point_known_badly_is_weighed_down():
-    rig, obs = camera_case(3, 10)
-    points, covariance = obs.scene_points.copy(), obs.scene_covariance.copy()
-    points[0] += [0.3, 0.0, 0.2]
-    covariance[0] += 0.5**2 * np.eye(3)
-    trusted = replace(obs, scene_points=points)
-    weighed = replace(trusted, scene_covariance=covariance)
-    near, far = (miss(solve_camera(some, "bauermann", rig.T_camera_lrf), rig)[1] for some in (weighed, trusted))
-    assert near < 1e-3 < far
 
 
 @pytest.mark.parametrize("start", [start_from_planes, start_from_lines, start_from_scene])

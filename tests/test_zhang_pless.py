@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case, camera_observations, near_lines, random_board_poses, random_rig
+from synthetic import camera_case, camera_observations, near_lines, numeric, random_board_poses, random_rig
 
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m
 from lrfcal_lib.model.camera import project
@@ -61,13 +61,10 @@ def test_plane_jacobians_against_numeric_ones():
     sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
     triangles = compress(sets, 100.0)
     _, by_pose, by_board = plane_terms(pose, triangles, sets.boards)
-    for k, step in enumerate(1e-6 * np.eye(6)):
-        high, low = (plane_terms(move_pose(pose, s), triangles, sets.boards)[0] for s in (step, -step))
-        np.testing.assert_allclose(by_pose[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_pose).max())
-        high, low = (
-            plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0] for s in (step, -step)
-        )
-        np.testing.assert_allclose(by_board[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_board).max())
+    expected = numeric(lambda s: plane_terms(move_pose(pose, s), triangles, sets.boards)[0], 6)
+    np.testing.assert_allclose(by_pose, expected, atol=1e-6 * np.abs(by_pose).max())
+    expected = numeric(lambda s: plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0], 6)
+    np.testing.assert_allclose(by_board, expected, atol=1e-6 * np.abs(by_board).max())
 
 
 def test_correlated_weighting_equals_the_full_covariance():
@@ -103,23 +100,6 @@ def test_plain_least_squares_agrees_with_scipy():
     ours = solve_camera(obs, "zhang_pless", weighted=False)
     np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=1e-7)
     assert ours.n_observations == len(obs.plane_points)
-
-
-def test_predicted_covariance_in_many_trials():
-    rig, obs = camera_case(10, count=20, source="platform")
-    rng, trials = np.random.default_rng(11), 300
-    root = np.linalg.cholesky(obs.plane_covariance)
-    points = obs.plane_points + (root @ rng.normal(size=(trials, *obs.plane_points.shape, 1)))[..., 0]
-    moves = rng.normal(size=(trials, 20, 6)) * np.sqrt(np.diag(obs.board_covariance[0]))
-    poses = np.tile(obs.board_poses, (trials, 1, 1, 1))
-    poses[..., :3, :] = move_pose(poses[..., :3, :], moves)
-    many = replace(obs, plane_points=points, board_poses=poses)
-    found = solve_camera(many, "zhang_pless", rig.T_camera_lrf)
-    turn = found.transform.rotation * rig.T_camera_lrf.rotation.inv()
-    e = np.concatenate([turn.as_rotvec(), found.transform.translation - rig.T_camera_lrf.translation], axis=1)
-    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(found.covariance), e) / 6
-    assert 0.85 < nees.mean() < 1.15
-    assert np.abs(e.mean(axis=0) / (e.std(axis=0) / np.sqrt(trials))).max() < 4.5
 
 
 def test_robust_loss_resists_bad_board_poses():
@@ -231,14 +211,6 @@ def test_single_lines_near_by_are_no_sweeps(seed):
         found, right = solve_camera(some, "zhang_pless"), solve_camera(some, "zhang_pless", rig.T_camera_lrf)
         assert transform_difference(found.transform, right.transform)[0] < 1e-6
     assert len(find_outlying_placements(obs)[0]) == 36
-
-
-def test_lines_in_another_common_plane_of_the_source():
-    """Single shots of a head that was pitched and shifted, in the frame of its base."""
-    rig, obs = camera_case(22)
-    moved = replace(obs, plane_points=OFF.apply(obs.plane_points))
-    found = solve_camera(moved, "zhang_pless")
-    assert transform_difference(found.transform * OFF, rig.T_camera_lrf)[1] < 1e-9
 
 
 @pytest.mark.parametrize("source", ["lrf", "platform"])

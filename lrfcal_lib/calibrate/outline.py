@@ -305,7 +305,7 @@ def side_block(rays, lines, middle, model):
     u = (np.sum(normal * rays["at"], axis=-1) + lines[:, 2:]) * factor  # distance from the edge, positive outside
     shift, _ = edge_shift(model.log_odds, rays["radius"], rays["background"])
     sigma, _ = flip_sigma(model.softness, np.where(rays["used"], rays["radius"], 1.0), rays["step"])
-    cost, score, information, _ = beam_terms(shift - u, sigma, rays["hit"], LAPSE)
+    cost, score, information = beam_terms(shift - u, sigma, rays["hit"], LAPSE)
     turned = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
     J = np.stack([factor, -factor * np.sum(turned * (rays["at"] - middle[:, None]), axis=-1)], axis=-1)
     root = np.sqrt(information) * rays["used"]

@@ -153,9 +153,9 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
 
     Returns
     -------
-    cost, score, information, by_log_sigma : ndarray
-        Negative log likelihood, its derivative by the margin, the observed information on the margin (never negative;
-        with `lapse` that of the majorising function of an EM step), and the cost's derivative by ``ln sigma``.
+    cost, score, information : ndarray
+        Negative log likelihood, its derivative by the margin, and the observed information on the margin (never
+        negative; with `lapse` that of the majorising function of an EM step).
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
@@ -165,7 +165,7 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
     if lapse:
         cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
         weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
-    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2, weight * mills * z
+    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2
 
 
 def interval_terms(inner, outer, sigma):
@@ -173,7 +173,7 @@ def interval_terms(inner, outer, sigma):
 
     A uniform distribution over the interval, blurred; `inner` and `outer` are the margins (see :func:`beam_terms`) of
     the last beam on the board and the first one off it. Returned are cost, score and observed information by a shift
-    of both margins, and the derivative of the cost by ``ln sigma``, as by :func:`beam_terms`.
+    of both margins, as by :func:`beam_terms`.
     """
     a, b = np.asarray(outer, float) / sigma, np.asarray(inner, float) / sigma
     flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
@@ -184,7 +184,7 @@ def interval_terms(inner, outer, sigma):
     ratio = pb - pa
     curvature = ratio**2 + (b * pb - a * pa)
     score = np.where(flip, 1.0, -1.0) * ratio / sigma
-    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2, b * pb - a * pa
+    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2
 
 
 SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the beam has no range noise across it
@@ -422,7 +422,7 @@ def beam_block(state, data, unknowns):
     radius = np.where(group["used"], group["radius"], 1.0)
     sigma, share_soft = flip_sigma(np.exp(state.sensor[2]), radius, group["step"])
     margin = shift - u
-    cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
+    cost, score, information = beam_terms(margin, sigma, group["hit"], data.lapse)
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
     sides = slope[..., None] * (group["edge"][..., None] == np.arange(unknowns.edges))

@@ -148,7 +148,7 @@ def interval_block(state, obs, sight, half, sigma):
     edge: the same to first order where the camera is near the LRF.
     """
     margin, jacobian = interval_margins(state, obs, sight)
-    cost, score, information, _ = interval_terms(margin + half, margin - half, sigma)
+    cost, score, information = interval_terms(margin + half, margin - half, sigma)
     root = np.sqrt(np.maximum(information, LEAST_INFORMATION / (half**2 / 3 + sigma**2)))
     return Block(score / root, root[..., None] * jacobian, np.ones_like(root), cost=cost)
 
