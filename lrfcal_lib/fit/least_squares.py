@@ -110,8 +110,7 @@ def _blocks(evaluate, state):
 
 def linearise(blocks, loss, scale, axes):
     """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the robust weights."""
-    hessian = gradient = cost = 0.0
-    roots = []
+    hessian, gradient, cost, roots = 0.0, 0.0, 0.0, []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
         roots.append(np.sqrt(weights))
@@ -125,10 +124,8 @@ def linearise(blocks, loss, scale, axes):
 
 def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
-    each = (
-        0.5 * (root * whiten(block, jacobian=False)[0]) ** 2 if block.cost is None else block.cost
-        for block, root in zip(blocks, roots, strict=True)
-    )
+    pairs = zip(blocks, roots, strict=True)
+    each = (0.5 * (root * whiten(b, False)[0]) ** 2 if b.cost is None else b.cost for b, root in pairs)
     return sum(np.sum(cost, axis=axes) for cost in each)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -300,6 +300,11 @@ class JointData:
     side_sigma: float = 0.35
     prior: PlatformPrior | None = None
 
+    @property
+    def levels(self):
+        """Noise levels and prior: all that has a default."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.default is not MISSING}
+
 
 def pad(group, count, width=1):
     """Arrays of a group (with `placement`, an index below `count`) sorted into rectangles (count, n, ...).
@@ -317,20 +322,18 @@ def pad(group, count, width=1):
     return out
 
 
-def gather(obs):
-    """JointObservations as padded arrays, a JointData."""
+def gather(obs, **levels):
+    """JointObservations as padded arrays, a JointData, with noise levels other than those stated."""
     count = len(obs.placements)
     face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
     for group in (face, beam):
-        b = group["bearing"]
-        group["ray"] = np.stack([np.cos(b), np.sin(b), 0 * b], axis=-1)
+        group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     view["covariance"] = np.where(view["used"][..., None, None], view["covariance"], np.eye(6))
     view["whitener"] = np.linalg.inv(np.linalg.cholesky(view["covariance"])) * view["used"][..., None, None]
     view["pose"] = np.where(view["used"][..., None, None], view["pose"], np.eye(4))
     on_head = np.array([m == "head" for m in obs.mounts], bool)
-    return JointData(
-        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, view_scale=np.ones(len(obs.cameras))
-    )
+    levels = {"view_scale": np.ones(len(obs.cameras))} | levels
+    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, **levels)
 
 
 def true_pitch(state, data, pitch):
@@ -467,9 +470,8 @@ def view_block(state, data, unknowns):
     turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
     by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
     own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
-    cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
-    np.put_along_axis(cameras, view["camera"][..., None, None, None], own[..., None, :], axis=-2)
-    cameras = cameras.reshape(cameras.shape[:3] + (-1,))
+    mine = view["camera"][..., None] == np.arange(unknowns.cameras)
+    cameras = (own[..., None, :] * mine[:, :, None, :, None]).reshape(A.shape[:2] + (6, -1))
     J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
     p, v = pitch.shape
     return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
@@ -486,11 +488,9 @@ def view_whitener(data, by_pitch):
 
 
 def own_jacobian(unknowns, p, name):
-    """Jacobian of the own unknowns of p placements by themselves."""
-    where = unknowns.columns[name]
-    J = np.zeros((p, where.stop - where.start, unknowns.shared + unknowns.own))
-    J[..., where] = np.eye(where.stop - where.start)
-    return J
+    """Jacobian of unknowns that all p placements have (or share) by themselves."""
+    rows = np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
+    return np.broadcast_to(rows, (p, *rows.shape))
 
 
 def sweep_block(state, data, unknowns):
@@ -523,15 +523,13 @@ def prior_block(state, data, unknowns):
 
 def usual_block(state, unknowns, name):
     """A weak expectation of one of `USUAL`, for data that do not show it; every placement holds a part."""
-    (usual, spread), number, p = USUAL[name], SENSOR.index(name), len(state.boards)
-    J = np.zeros((p, 1, unknowns.shared + unknowns.own))
-    J[..., unknowns.columns[name]] = 1.0
-    away = (state.sensor[number] - usual) / (spread * np.sqrt(p))
+    (usual, spread), value, one = USUAL[name], state.sensor[SENSOR.index(name)], np.ones((len(state.boards), 1))
+    scale = spread * np.sqrt(len(one))
     # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with the softness squared:
     # without this curvature steps overshoot twofold
-    bend = np.sqrt(1 + 2 * max(usual - state.sensor[number], 0.0)) if name == "edge_log_softness" else 1.0
-    cost = np.full((p, 1), 0.5 * away**2)
-    return Block(np.full((p, 1), away / bend), J * bend / (spread * np.sqrt(p)), np.ones((p, 1)), cost=cost)
+    bend = np.sqrt(1 + 2 * max(usual - value, 0.0)) if name == "edge_log_softness" else 1.0
+    away, J = (value - usual) / scale, own_jacobian(unknowns, len(one), name)
+    return Block(away / bend * one, J * bend / scale, one, cost=0.5 * away**2 * one)
 
 
 def joint_blocks(state, data, unknowns):

@@ -21,10 +21,6 @@ SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0,
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
 START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 60
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
-LEVELS = (
-    "face_scale", "view_scale", "sigma_pitch", "face_share", "beam_share", "lapse", "sweep_sigma", "side_sigma",
-    "prior",
-)  # fmt: skip
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
@@ -217,7 +213,7 @@ def solve_joint(
         obs, lost = without_lost_placements(obs)
         obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
-    data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), prior=prior)
+    data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     state = converged(start, data, coarse(unknowns))
     state = converged(state, data, unknowns, LAST_STEP)
     data = replace(data, lapse=lapse)
@@ -240,7 +236,7 @@ def solve_again(obs, like):
     known = list(like.boards)
     rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
     obs = obs.select([known[row] for row in rows])
-    data = gathered(obs, like.data)
+    data = gather(obs, **like.data.levels)
     state = converged(of_placements(like.state, rows), data, like.unknowns, LAST_STEP)
     return finished(obs, state, data, like.unknowns, like.excluded, True)
 
@@ -297,11 +293,6 @@ def coarse(unknowns):
     return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
 
 
-def gathered(obs, like):
-    """Padded observations with the noise levels of others."""
-    return replace(gather(obs), **{key: getattr(like, key) for key in LEVELS})
-
-
 def of_placements(state, rows):
     """The state of some placements (by index)."""
     return replace(state, **{key: getattr(state, key)[rows] for key in OWN})
@@ -325,7 +316,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
-    data, least = replace(gather(obs), sweep_sigma=tuple(sweep_sigma)), np.inf
+    data, least = gather(obs, sweep_sigma=tuple(sweep_sigma)), np.inf
     for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
@@ -366,7 +357,7 @@ def agreeing_start(obs, state, data, unknowns):
     few = coarse(unknowns)
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
-        cut = gathered(kept, data) if bad else data
+        cut = gather(kept, **data.levels) if bad else data
         found = converged(fitting, cut, few, steps=START_STEPS)
         if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
@@ -424,7 +415,7 @@ def drop_contradictions(obs, state, data, unknowns):
             words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
     if words:
         obs, state = without(obs, state, views, out)
-        data = gathered(obs, data)
+        data = gather(obs, **data.levels)
     return obs, state, data, words
 
 
@@ -469,22 +460,20 @@ def count_rows(obs):
 
 def total_cost(state, data, unknowns):
     """Half the squared residuals and the negative log likelihood of all observations."""
-    total = 0.0
-    for block in joint_blocks(state, data, unknowns):
-        total += block.cost.sum() if block.cost is not None else 0.5 * np.sum(whiten(block, False)[0] ** 2)
+    blocks = joint_blocks(state, data, unknowns)
+    total = sum(np.sum(0.5 * whiten(b, False)[0] ** 2 if b.cost is None else b.cost) for b in blocks)
     return float(total) if np.isfinite(total) else np.inf
 
 
 def in_stated_gauge(state, obs):
     """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
-    axis, stated = (None if T is None else geometry.head_from_axis(geometry.axis_of(T)) for T in
-                    (pose_transform(state.head), obs.T_head_lrf))  # fmt: skip
-    head = axis if stated is None else obs.T_head_lrf * stated.inv() * axis
-    change = head * pose_transform(state.head).inv()
-    cameras = state.cameras.copy()
-    for i, mount in enumerate(obs.mounts):
-        if mount == "platform":
-            cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
+    found = pose_transform(state.head)
+    head = geometry.head_from_axis(geometry.axis_of(found))
+    if obs.T_head_lrf is not None:
+        head = obs.T_head_lrf * geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf)).inv() * head
+    change, cameras = head * found.inv(), state.cameras.copy()
+    for i in np.flatnonzero(np.array(obs.mounts) == "platform"):
+        cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 
@@ -492,15 +481,12 @@ def in_stated_gauge(state, obs):
 def joint_words(direction, names, cameras):
     """A direction of the shared unknowns in words."""
     direction = np.asarray(direction) / np.max(np.abs(direction))
-    words = []
+    large, words = np.abs(direction) > 0.3, []
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
-        if index and np.max(np.abs(direction[index])) > 0.3:
+        if large[index].any():
             words.append(geometry.motion_words(direction[index], camera))
-    for name, value in zip(names, direction, strict=True):
-        if abs(value) > 0.3 and not any(name.startswith(f"{c}_") for c in cameras):
-            words.append(WORDS.get(name, name.replace("_", " ")))
-    return " with ".join(words)
+    return " with ".join(words + [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS])
 
 
 def finished(obs, state, data, unknowns, excluded, required):

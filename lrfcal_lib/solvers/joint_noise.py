@@ -216,19 +216,15 @@ def joint_warnings(blocks, data, unknowns, found, names):
     words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
-    axis, offset = (
-        [sigma for name, sigma in zip(found.names, found.sigma, strict=True) if name.startswith(prefix)]
-        for prefix in ("axis_", "offset_")
-    )
-    turn, shift = np.linalg.norm(axis), np.linalg.norm(offset)
-    if axis and (turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET):
+    turn, shift = np.linalg.norm(found.sigma[:4].reshape(2, 2), axis=1) if unknowns.axis else (0.0, 0.0)
+    if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
         words.append(
             f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger "
             "pitch range, take images at more pitch angles, or state the platform with its accuracy"
         )
     held = [name for name in TERMS if name not in unknowns.sensor]
     wider = replace(unknowns, sensor=(*unknowns.sensor, *held))
-    for name, (square, value) in score_tests(found.state, data, wider, held).items() if held else ():
+    for name, square, value in score_tests(found.state, data, wider, held):
         least, what, factor, unit = TERMS[name]
         if square > ASKED and abs(value) > least:
             words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
@@ -237,37 +233,35 @@ def joint_warnings(blocks, data, unknowns, found, names):
 
 def noise_words(blocks, data, names):
     """Groups of observations that scatter more or less than stated."""
-    scatter = {}
+    groups = []
     if "face" in blocks:
         z = whiten(blocks["face"], False)[0][data.face["used"]] / np.sqrt(data.face_share)
-        scatter["ranges", "face_sigma"] = np.sqrt(np.mean(z**2))
-    if "view" in blocks:
-        z = whiten(blocks["view"], False)[0].reshape(data.view["used"].shape + (6,))
-        for number, name in enumerate(names):
-            mine = data.view["used"] & (data.view["camera"] == number)
-            if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
-                scatter[f"poses of the board in camera '{name}'", "view_covariance"] = np.sqrt(np.mean(z[mine] ** 2))
-    low, high = NOISE_LIMITS
+        groups.append(("ranges", "face_sigma", z))
+    for number, name in enumerate(names if "view" in blocks else ()):
+        mine = data.view["used"] & (data.view["camera"] == number)
+        if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
+            z = whiten(blocks["view"], False)[0].reshape(mine.shape + (6,))[mine]
+            groups.append((f"poses of the board in camera '{name}'", "view_covariance", z))
+    levels = [(what, field, np.sqrt(np.mean(z**2))) for what, field, z in groups]
     return [
         f"the {what} scatter {level:.2g} times what is stated ({field}): standard deviations of the result are off "
         "alike; noise='estimate' takes the level from the residuals"
-        for (what, field), level in scatter.items()
-        if not low < level < high
+        for what, field, level in levels
+        if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]
     ]
 
 
 def score_tests(state, data, unknowns, held):
-    """Squared scores of shared unknowns held at zero, in standard deviations, and the values they would take.
+    """Names, squared scores (standard deviations) of shared unknowns held at zero, and the values they would take.
 
     Each one is tested by itself, with all that was estimated free.
     """
     hessian, gradient, *_ = linearise(residuals.joint_blocks(state, data, unknowns), None, 1.0, (-2, -1))
     whole, score = (np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2])
     names = unknowns.names(range(unknowns.cameras))
-    others, out = [i for i, name in enumerate(names) if name not in held], {}
+    others = [i for i, name in enumerate(names) if name not in held]
     for name in held:
         free = [*others, names.index(name)]
         covariance = np.linalg.pinv(whole[np.ix_(free, free)], rcond=1e-14, hermitian=True)
         step = -(covariance @ score[free])[-1]
-        out[name] = float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
-    return out
+        yield name, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
