@@ -15,10 +15,7 @@ from lrfcal_lib.fit.least_squares import (
     robust,
     solve,
 )
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    motion_words,
-)
+from lrfcal_lib.model.geometry import DegenerateGeometry, motion_words
 
 
 def line_problem(x, y, sigma=1.0):
@@ -55,10 +52,9 @@ def test_linear_problem_matches_the_normal_equations(data):
     assert np.all(np.diff(found.cost_history) <= 1e-9)
 
 
-def test_too_small_stated_noise_inflates_the_covariance(data):
-    x, y = data
-    honest, boastful = fit(line_problem(x, y, 0.1), np.zeros(2)), fit(line_problem(x, y, 0.01), np.zeros(2))
-    assert boastful.inflation > 50
+def test_too_small_stated_noise_inflates_the_covariance_and_too_large_never_shrinks_it(data):
+    honest, boastful, modest = (fit(line_problem(*data, sigma), np.zeros(2)) for sigma in (0.1, 0.01, 1.0))
+    assert boastful.inflation > 50 and modest.inflation == 1.0
     np.testing.assert_allclose(boastful.sigma, honest.sigma, rtol=0.3)
 
 
@@ -83,22 +79,17 @@ def test_robust_result_matches_scipy(data):
     x, y = data
     y = y + 3.0 * (np.arange(40) % 9 == 0)
     ours = fit(line_problem(x, y, 0.1), np.zeros(2), loss="cauchy")
-
-    def residual(p):
-        return (p[0] * x + p[1] - y) / 0.1
-
-    theirs = scipy.optimize.least_squares(residual, [0, 0], loss="cauchy", f_scale=2.385, xtol=1e-15, gtol=1e-15)
+    options = {"loss": "cauchy", "f_scale": 2.385, "xtol": 1e-15, "gtol": 1e-15}
+    theirs = scipy.optimize.least_squares(lambda p: (p[0] * x + p[1] - y) / 0.1, [0, 0], **options)
     np.testing.assert_allclose(ours.parameters, theirs.x, atol=1e-6)
 
 
-def test_unknown_loss_is_refused(data):
-    with pytest.raises(ValueError, match="unknown loss 'tukey'"):
-        fit(line_problem(*data), np.zeros(2), loss="tukey")
-
-
-def test_start_that_is_not_finite_is_refused(data):
-    with pytest.raises(ValueError, match="not finite"):
-        fit(line_problem(*data), np.array([np.nan, 0.0]))
+@pytest.mark.parametrize(
+    ("start", "options", "words"), [(0.0, {"loss": "tukey"}, "unknown loss 'tukey'"), (np.nan, {}, "not finite")]
+)
+def test_bad_settings_are_refused(data, start, options, words):
+    with pytest.raises(ValueError, match=words):
+        fit(line_problem(*data), np.array([start, 0.0]), **options)
 
 
 def test_not_converging_is_a_result(data):

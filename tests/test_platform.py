@@ -6,18 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy.optimize
+import synthetic
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import (
-    CORNERS,
-    TRIANGLE,
-    camera_observations,
-    edge_sweeps,
-    meet,
-    numeric,
-    random_board_poses,
-    random_rig,
-    sweep_boards,
-)
+from synthetic import CORNERS, TRIANGLE, edge_sweeps, numeric, sweep_boards
 
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import move_head, prior_terms
@@ -215,13 +206,13 @@ ALTERNATING = np.where(np.arange(1, 25) % 2 == 1, 1.0, -1.0)
 def pitched(seed, offset, stretch, *, count=24, noise=0.0, cameras=("left",)):
     """Sweeps whose recorded pitch is the true one minus an error, and cameras on the base."""
     rng = np.random.default_rng(seed)
-    rig = random_rig(rng)
-    poses = random_board_poses(rng, count, rig, spread=0.7)
-    obs = camera_observations(rng, rig, poses, noise=0.0, source="platform", face=80)
-    middle = np.array([meet(obs.plane_points[obs.plane_placement == p], TRUTH)[1].mean() for p in range(1, count + 1)])
+    rig = synthetic.random_rig(rng)
+    poses = synthetic.random_board_poses(rng, count, rig, spread=0.7)
+    obs = synthetic.camera_observations(rng, rig, poses, noise=0.0, source="platform", face=80)
+    middle = np.array([synthetic.meet(obs.plane_points[obs.plane_placement == p], TRUTH)[1].mean() for p in range(1, count + 1)])
     given = {}
     for name in ("crossing", "plane"):
-        (p, true), rows = meet(getattr(obs, f"{name}_points"), TRUTH), getattr(obs, f"{name}_placement") - 1
+        (p, true), rows = synthetic.meet(getattr(obs, f"{name}_points"), TRUTH), getattr(obs, f"{name}_placement") - 1
         m, o, s = (np.broadcast_to(x, count)[rows] for x in (middle, offset, stretch))
         pitch = m + (true - m - o) / (1 + s)
         p = p + noise * rng.normal(size=(len(p), 1)) * p / np.linalg.norm(p, axis=1, keepdims=True)

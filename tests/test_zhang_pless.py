@@ -14,8 +14,6 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array,
 from lrfcal_lib.solvers import find_outlying_placements, planes, solve_camera
 from lrfcal_lib.solvers.planes import (
     board_whitener,
-    closed_form,
-    common_plane,
     compress,
     correct_and_compress,
     plane_block,
@@ -31,8 +29,8 @@ def test_closed_form_is_exact_on_exact_data(source):
     rig, obs = camera_case(1, source=source)
     sets = plane_sets(obs)
     triangles = compress(sets, 1.0)
-    assert common_plane(triangles)[1] == (source == "lrf")
-    found = pose_transform(closed_form(triangles, sets.boards, source == "platform"))
+    assert planes.common_plane(triangles)[1] == (source == "lrf")
+    found = pose_transform(planes.closed_form(triangles, sets.boards, source == "platform"))
     angle, distance = transform_difference(found, rig.T_camera_lrf)
     assert angle < 1e-9 and distance < 1e-9
 
@@ -50,10 +48,8 @@ def test_compression_keeps_every_sum_of_squares():
     triangles = compress(sets, 1.0)
     for _ in range(5):
         T = rig.T_camera_lrf * RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
-        full = np.sum(plane_residuals_m(obs, T) ** 2)
-        assert np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2) == pytest.approx(
-            full, rel=1e-12
-        )
+        found = np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2)
+        assert found == pytest.approx(np.sum(plane_residuals_m(obs, T) ** 2), rel=1e-12)
 
 
 def test_plane_jacobians_against_numeric_ones():
@@ -90,12 +86,9 @@ def test_correlated_weighting_equals_the_full_covariance():
 def test_plain_least_squares_agrees_with_scipy():
     rig, obs = camera_case(7, noise=1.0, source="platform")
     start = pose_array(rig.T_camera_lrf)
+    options = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
     theirs = scipy.optimize.least_squares(
-        lambda d: plane_residuals_m(obs, pose_transform(move_pose(start, d))),
-        np.zeros(6),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
+        lambda d: plane_residuals_m(obs, pose_transform(move_pose(start, d))), np.zeros(6), **options
     )
     ours = solve_camera(obs, "zhang_pless", weighted=False)
     np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=1e-7)
