@@ -209,7 +209,8 @@ def pitched(seed, offset, stretch, *, count=24, noise=0.0, cameras=("left",)):
     rig = synthetic.random_rig(rng)
     poses = synthetic.random_board_poses(rng, count, rig, spread=0.7)
     obs = synthetic.camera_observations(rng, rig, poses, noise=0.0, source="platform", face=80)
-    middle = np.array([synthetic.meet(obs.plane_points[obs.plane_placement == p], TRUTH)[1].mean() for p in range(1, count + 1)])
+    faces = (obs.plane_points[obs.plane_placement == p] for p in range(1, count + 1))
+    middle = np.array([synthetic.meet(points, TRUTH)[1].mean() for points in faces])
     given = {}
     for name in ("crossing", "plane"):
         (p, true), rows = synthetic.meet(getattr(obs, f"{name}_points"), TRUTH), getattr(obs, f"{name}_placement") - 1
