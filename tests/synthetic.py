@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.evaluate.uncertainty import beams_to
 from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole, project
-from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.model.observations import CameraObservations
 
 CORNERS = np.array([[-0.30, -0.22], [0.32, -0.25], [0.28, 0.24], [-0.33, 0.20]])
@@ -212,12 +213,6 @@ def sweep_boards(rng, count, turn=0.7):
 
 
 def meet(p_platform, T_head_lrf):
-    """LRF points and pitch at which the scan plane passes through platform points (the pitch nearest to 0)."""
-    normal, point = T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), T_head_lrf.translation
-    x, y, z = p_platform.T
-    # n . (Rx(-pitch) p - t) = 0:  a cos(pitch) + b sin(pitch) = c
-    a, b, c = normal[1] * y + normal[2] * z, normal[1] * z - normal[2] * y, normal @ point - normal[0] * x
-    base, reach = np.arctan2(b, a), np.arccos(np.clip(c / np.hypot(a, b), -1, 1))
-    both = (np.stack([base + reach, base - reach]) + np.pi) % (2 * np.pi) - np.pi
-    pitch = np.where(np.abs(both[0]) < np.abs(both[1]), both[0], both[1])
-    return T_head_lrf.inv().apply(tilt(p_platform, -pitch)) * [1.0, 1.0, 0.0], pitch
+    """LRF points and pitch at which the scan plane passes through platform points."""
+    bearing, pitch, away = beams_to(p_platform, T_head_lrf)
+    return polar_to_points(away, bearing), pitch
