@@ -100,15 +100,15 @@ def face_levels(state, data, block):
     return {"face_scale": float(scale), "face_share": float(1 / max(ratio, 1.0))}
 
 
-def on_board(state, data):
-    """Measured face points in the boards' frames, shape (p, n, 3)."""
-    return (_face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
-
-
-def _face_points(state, data):
+def face_points(state, data):
     """Measured face points in the platform frame, shape (p, n, 3)."""
     o, d = rays(state, data, data.face)[:2]
     return o + (data.face["range"] - state.sensor[0])[..., None] * d
+
+
+def on_board(state, data):
+    """Measured face points in the boards' frames, shape (p, n, 3)."""
+    return (face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
 
 
 def _part(values, used):
@@ -148,8 +148,7 @@ def view_levels(data, block, state):
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
     turned = replace(data, direction=np.ones(len(data.direction)))
     by_pitch = view_block(state, turned, lone).jacobian[..., 0].reshape(used.shape + (6,))
-    free = 1 - 6 * used.any(axis=1).sum() / max(6 * used.sum(), 1)  # the boards' own poses take up the rest
-    free = max(free, LEAST_FREEDOM)
+    free = max(1 - used.any(axis=1).sum() / max(used.sum(), 1), LEAST_FREEDOM)  # the boards' own poses take up the rest
 
     def level(sigma):
         """Negative log likelihood at an error of the pitch of images, and the data with the scale that fits it."""
@@ -162,8 +161,8 @@ def view_levels(data, block, state):
         z = (whitener @ r)[..., 0][used]
         return 0.5 * np.sum(z**2) / free - np.log(np.diagonal(whitener[used], axis1=-2, axis2=-1)).sum(), trial
 
-    found = [level(sigma) for sigma in (PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1])]
-    return min(found, key=lambda pair: pair[0])[1]
+    sigmas = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
+    return min(map(level, sigmas), key=lambda pair: pair[0])[1]
 
 
 def side_level(square, sigma):
@@ -192,7 +191,7 @@ def misfits(blocks, data, groups=("face", "view")):
 
 def face_misses(state, data, boards, placement):
     """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
-    x = _face_points(state, data)[placement] - boards[:, None, :, 3]
+    x = face_points(state, data)[placement] - boards[:, None, :, 3]
     return _medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
 
 

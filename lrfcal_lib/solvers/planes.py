@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,11 +17,11 @@ from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, apply_pose, move_pose, pose_transform
 
 
-@dataclass(frozen=True)
-class PlaneSets:
+class PlaneSets(NamedTuple):
     """Face points (..., p, n, 3) by placement, padded with zeros to the same number, source frame, metres.
 
-    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the observations' own.
+    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the observations' own,
+    `number` (p,) that of each one's points.
     """
 
     placements: np.ndarray
@@ -30,11 +31,7 @@ class PlaneSets:
     boards: np.ndarray
     board_covariance: np.ndarray
     rows: np.ndarray
-
-    @property
-    def count(self):
-        """Number of points of each placement, shape (p,)."""
-        return self.used.sum(axis=1)
+    number: np.ndarray
 
 
 def plane_sets(obs):
@@ -47,7 +44,8 @@ def plane_sets(obs):
     index, used = padded["row"], padded["used"]
     points, covariance = obs.plane_points[..., index, :], obs.plane_covariance[..., index, :, :]
     boards, spread = obs.board_poses[..., rows, :3, :], obs.board_covariance[..., rows, :, :]
-    return PlaneSets(placements, np.where(used[..., None], points, 0.0), covariance, used, boards, spread, rows)
+    points = np.where(used[..., None], points, 0.0)
+    return PlaneSets(placements, points, covariance, used, boards, spread, rows, used.sum(axis=1))
 
 
 def compress(sets, weights):
@@ -156,7 +154,7 @@ def start_from_planes(obs):
     check_normals(sets, obs.camera)
     triangles, p = compress(sets, 1.0), len(sets.placements)
     (frame, flat), found = common_plane(triangles), []
-    if p >= 3 and not flat:
+    if not flat:
         found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
     if p >= 5:
         found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
@@ -165,11 +163,11 @@ def start_from_planes(obs):
     def trimmed(candidates):
         """Mean square (m^2) of candidates over more placements than a closed form uses."""
         residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
-        squares = np.sort(np.sum(residuals**2, axis=2) / sets.count, axis=1)
+        squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
         return squares[:, : max(squares.shape[1] // 2 + 2, 7 if flat else 5)].mean(axis=1)
 
     def evaluate(pose):
-        return plane_block(pose, triangles / 0.005, sets.boards, None, sets.count)
+        return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
 
     best = candidates[np.argsort(trimmed(candidates))[:8]]
     refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
@@ -277,13 +275,13 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, **
         """The residuals with weights and compressed points as they are at a pose."""
         if not (weighted and number):
             triangles = compress(sets, equal_weights(sets, pose))
-            return lambda p: residual(p, triangles, sets.boards, None, sets.count)
+            return lambda p: residual(p, triangles, sets.boards, None, sets.number)
         triangles, offset, _ = correct_and_compress(sets, pose)
         whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
         return lambda p: residual(p, triangles, sets.boards, whitener, offset=offset)
 
     problem, pose, earlier = minimise_in_rounds(freeze, pose, move_pose, 5 if weighted else 0, **options)
-    count = int(sets.count.sum())
+    count = int(sets.number.sum())
     return solve(
         problem, pose, move_pose, names=POSE_NAMES, method=method, read=read_pose,
         words=lambda d: geometry.motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
@@ -346,7 +344,7 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     sets = plane_sets(obs)
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, solution)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
-    numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
+    numbers = int(sets.number.sum() + np.isfinite(obs.pattern_pixels).sum())
     pose, fixed = geometry.pose_array(solution.transform), np.zeros(9 - lens)
     triangles, offset, rest = correct_and_compress(sets, pose)
     whitener = board_whitener(pose, triangles, sets.boards, common)
