@@ -18,7 +18,7 @@ from lrfcal_lib.model.geometry import (
     transform_difference,
 )
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint, total_cost
+from lrfcal_lib.solvers.joint import solve_joint, total_cost
 
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
 PLAIN = ("range_offset", "edge_log_odds", "edge_log_softness")
@@ -181,17 +181,6 @@ def test_exact_observations_give_the_truth():
 
 
 @MOUNTS
-def test_sharp_edges_tie_down_the_rest(mount):
-    """Without noise only the beams' spacing leaves anything open, and that within its own prediction."""
-    obs, truth, _ = draw(rng(), 8, mount=mount, see_noise=0.0)
-    sharp = solve_joint(replace(obs, beam_step=0 * obs.beam_step), required=False)  # every reading counts in full
-    error = np.abs(state_errors(sharp.state, truth, sharp.unknowns))
-    assert error[:4].max() < (1e-3 if mount == "head" else 8e-3)
-    found = solve_joint(obs, required=False)  # with the floor of the softness: no farther off than it says
-    assert np.abs(scores(found, truth))[:4].max() < 2
-
-
-@MOUNTS
 def test_errors_are_as_predicted(mount):
     """Forty unknown numbers of two draws: none beyond 4.5 standard deviations, and not all too small."""
     draws = [draw(rng(seed), mount=mount) for seed in (5, 6)]
@@ -259,6 +248,7 @@ def test_single_shots_do_not_show_the_axis():
         solve_joint(obs, sensor=PLAIN[:2])
     found = solve_joint(obs, required=False, sensor=PLAIN[:2])
     assert sum("axis" in words for words in found.unobservable) == 4
+    assert not np.any(found.solution.sigma[:4] < 0.5)  # what the data do not show has no small sigma
     cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
     assert np.abs(scores(found, truth)[cameras]).max() < 4.5
 
@@ -336,11 +326,3 @@ def test_observations_are_checked(field, change, words):
         replace(obs, **{field: change(getattr(obs, field))})
     with pytest.raises(DegenerateGeometry, match="no placement"):
         solve_joint(obs.select([]))
-
-
-def test_gauge_change_keeps_the_cost():
-    obs, state = random_problem(rng(9))
-    data = gather(obs)
-    other = in_stated_gauge(state, obs)
-    plain = Unknowns(2, 3)
-    assert np.isclose(total_cost(state, data, plain), total_cost(other, data, plain), rtol=1e-12)
