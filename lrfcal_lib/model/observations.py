@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -27,8 +27,22 @@ def check_finite(record, whose="", missing=()):
                 )
 
 
+def rows(*shape, of, each=0.0):
+    """A field of arrays with a row for each member of a group; `each` row is this by default, None: its number."""
+    return field(default=None, metadata={"shape": shape, "of": of, "each": each})
+
+
 class _Groups:
     """Arrays in groups of equal length; the first word of a field's name tells its group."""
+
+    def fill(self, **counts):
+        """Give every array that is missing its default, for so many members of each group."""
+        for f in fields(self):
+            if f.metadata and getattr(self, f.name) is None:
+                shape, of, each = f.metadata.values()
+                n = counts.get(of, 0)
+                value = np.arange(n) if each is None else np.broadcast_to(each, (n, *shape)).copy()
+                object.__setattr__(self, f.name, value)
 
     def group(self, name):
         """Fields of one group of observations: dict of arrays without the group's prefix."""
@@ -122,53 +136,41 @@ class CameraObservations(_Groups):
     model: CameraModel
     camera: str = "camera"
     source: str = "lrf"
-    crossing_points: np.ndarray | None = None
-    crossing_covariance: np.ndarray | None = None
-    crossing_lines: np.ndarray | None = None
-    crossing_line_sigma: np.ndarray | None = None
-    crossing_placement: np.ndarray | None = None
-    crossing_edge: np.ndarray | None = None
-    crossing_pitch: np.ndarray | None = None
-    crossing_across: np.ndarray | None = None
-    crossing_half_step: np.ndarray | None = None
-    crossing_noise: np.ndarray | None = None
-    crossing_radius: np.ndarray | None = None
-    crossing_background: np.ndarray | None = None
-    plane_points: np.ndarray | None = None
-    plane_covariance: np.ndarray | None = None
-    plane_placement: np.ndarray | None = None
-    plane_pitch: np.ndarray | None = None
-    placements: np.ndarray | None = None
-    board_poses: np.ndarray | None = None
-    board_covariance: np.ndarray | None = None
-    pattern_points: np.ndarray | None = None
-    pattern_pixels: np.ndarray | None = None
+    crossing_points: np.ndarray = rows(3, of="crossing")
+    crossing_covariance: np.ndarray = rows(3, 3, of="crossing", each=ROUGH_NOISE)
+    crossing_lines: np.ndarray = rows(3, of="nothing")
+    crossing_line_sigma: np.ndarray = rows(of="crossing", each=0.5)
+    crossing_placement: np.ndarray = rows(of="crossing", each=None)
+    crossing_edge: np.ndarray = rows(of="crossing", each="")
+    crossing_pitch: np.ndarray = rows(of="crossing")
+    crossing_across: np.ndarray = rows(of="crossing", each=False)
+    crossing_half_step: np.ndarray = rows(3, of="crossing")
+    crossing_noise: np.ndarray = rows(3, 3, of="crossing")
+    crossing_radius: np.ndarray = rows(of="crossing", each=0.005)
+    crossing_background: np.ndarray = rows(of="crossing")
+    plane_points: np.ndarray = rows(3, of="plane")
+    plane_covariance: np.ndarray = rows(3, 3, of="plane", each=ROUGH_NOISE)
+    plane_placement: np.ndarray = rows(of="plane", each=None)
+    plane_pitch: np.ndarray = rows(of="plane")
+    placements: np.ndarray = rows(of="board", each=None)
+    board_poses: np.ndarray = rows(4, 4, of="board")
+    board_covariance: np.ndarray = rows(6, 6, of="board")
+    pattern_points: np.ndarray = rows(3, of="pattern")
+    pattern_pixels: np.ndarray = None
     pattern_sigma_px: float = 0.2
-    scene_points: np.ndarray | None = None
-    scene_covariance: np.ndarray | None = None
-    scene_pixels: np.ndarray | None = None
-    scene_sigma_px: np.ndarray | None = None
-    scene_placement: np.ndarray | None = None
+    scene_points: np.ndarray = rows(3, of="scene")
+    scene_covariance: np.ndarray = rows(3, 3, of="scene", each=ROUGH_NOISE)
+    scene_pixels: np.ndarray = rows(2, of="nothing")
+    scene_sigma_px: np.ndarray = rows(of="scene", each=0.5)
+    scene_placement: np.ndarray = rows(of="scene", each=None)
 
     def __post_init__(self):
-        points = (self.crossing_points, self.plane_points, self.scene_points, self.pattern_points)
-        n, m, q, k = (0 if rows is None else rows.shape[-2] for rows in points)
-        p = 0 if self.board_poses is None else self.board_poses.shape[-3]
-        zeros = {
-            "crossing_lines": (0, 3), "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3),
-            "crossing_background": n, "crossing_pitch": n, "plane_pitch": m, "board_poses": (0, 4, 4),
-            "board_covariance": (p, 6, 6), "pattern_points": (0, 3), "scene_pixels": (0, 2),
-        }
-        defaults = {name: np.zeros(shape) for name, shape in zeros.items()}
-        defaults |= {"crossing_edge": np.full(n, ""), "crossing_across": np.zeros(n, bool), "placements": np.arange(p)}
-        defaults |= {"crossing_line_sigma": np.full(n, 0.5), "scene_sigma_px": np.full(q, 0.5)}
-        defaults |= {"crossing_radius": np.full(n, 0.005), "pattern_pixels": np.full((p, k, 2), np.nan)}
-        for group, count in (("crossing", n), ("plane", m), ("scene", q)):
-            defaults[f"{group}_points"] = np.zeros((0, 3))
-            defaults[f"{group}_covariance"] = np.tile(ROUGH_NOISE, (count, 1, 1))
-            defaults[f"{group}_placement"] = np.arange(count)
-        for name in (name for name in defaults if getattr(self, name) is None):
-            object.__setattr__(self, name, defaults[name])
+        points = {group: getattr(self, f"{group}_points") for group in ("crossing", "plane", "pattern", "scene")}
+        counts = {group: 0 if p is None else p.shape[-2] for group, p in points.items()}
+        self.fill(board=0 if self.board_poses is None else self.board_poses.shape[-3], **counts)
+        if self.pattern_pixels is None:
+            unseen = np.full((self.board_poses.shape[-3], counts["pattern"], 2), np.nan)
+            object.__setattr__(self, "pattern_pixels", unseen)
         check_finite(self, f" of camera '{self.camera}'", missing=("pattern_pixels",))
 
     @property
@@ -310,14 +312,11 @@ class JointObservations(_Groups):
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
-    view_lens: np.ndarray | None = None
-    lens_covariance: np.ndarray | None = None
+    view_lens: np.ndarray = rows(6, 9, of="view")
+    lens_covariance: np.ndarray = rows(9, 9, of="camera")
 
     def __post_init__(self):
-        if self.view_lens is None:
-            object.__setattr__(self, "view_lens", np.zeros((len(self.view_camera), 6, 9)))
-        if self.lens_covariance is None:
-            object.__setattr__(self, "lens_covariance", np.zeros((len(self.cameras), 9, 9)))
+        self.fill(view=len(self.view_camera), camera=len(self.cameras))
         check_finite(self)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")
