@@ -127,24 +127,6 @@ def _crossings(rng, T_source_board, source, corners):
     return (outline + share[:, None] * (following - outline))[hit] * [1.0, 1.0, 0.0], np.flatnonzero(hit)
 
 
-def near_lines(rng, count):
-    """Rig and observations of single scan lines on small boards 0.4 to 0.9 m away, the camera turned by up to a radian.
-
-    Ranges have 4 mm of noise: a few per cent of a line's length.
-    """
-    rig, poses, corners = random_rig(rng), [], 0.5 * CORNERS
-    turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3))
-    T = RigidTransform.from_components(rig.T_camera_lrf.translation, turn * rig.T_camera_lrf.rotation)
-    for _ in range(count):
-        turn = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)) * Rotation.from_euler("x", 180, degrees=True)
-        centre = np.array([rng.uniform(-0.3, 0.3), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(0.4, 0.9)
-        middle = turn.apply([*corners.mean(axis=0), 0.0])
-        poses.append(RigidTransform.from_components(T.apply(centre) - middle, turn))
-    rig = Rig(T, rig.T_head_lrf, rig.model)
-    options = {"noise": 1.0, "sigma": (0.004, 1e-3), "pattern": False}
-    return rig, camera_observations(rng, rig, poses, corners=corners, **options)
-
-
 def _face(rng, T_source_board, crossings, source, count):
     """Points on the board: between the two crossings of a scan line, or anywhere inside for a sweep."""
     if source == "platform":

@@ -12,7 +12,7 @@ from synthetic import camera_case, camera_observations, numeric
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m, sight_normals
 from lrfcal_lib.model import observations
-from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import cost_readings, distance_block, point_block, start_from_lines, start_from_scene
 from lrfcal_lib.solvers.planes import start_from_planes
@@ -132,20 +132,26 @@ def test_corrected_jacobians_are_the_gradient_of_chi_square(name):
     np.testing.assert_allclose(J.T @ r, half, rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["line", "wasielewski_strauss"])
-@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize(
+    ("name", "weighted"),
+    [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False)],
+)
 def test_scipy_agrees(name, weighted):
-    rig, obs = camera_case(10, noise=1.0)
-    residual, start = RESIDUALS[name], pose_array(rig.T_camera_lrf)
+    rig, obs = camera_case(10, noise=1.0, source="platform" if name == "planes" else "lrf")
+    start, options = pose_array(rig.T_camera_lrf), dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
 
     def residuals(d):
-        block = residual(move_pose(start, d), obs)
+        pose = move_pose(start, d)
+        if name == "planes":
+            return plane_residuals_m(obs, pose_transform(pose))
+        block = RESIDUALS[name](pose, obs)
         return whiten(block)[0] if weighted else block.residuals
 
-    theirs = scipy.optimize.least_squares(residuals, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    ours = solve_camera(obs, name, rig.T_camera_lrf, weighted=weighted)
+    theirs = scipy.optimize.least_squares(residuals, np.zeros(6), **options)
+    ours = solve_camera(obs, "zhang_pless" if name == "planes" else name, rig.T_camera_lrf, weighted=weighted)
     np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=2e-6)
     assert not weighted or ours.chi2 / 2 == pytest.approx(theirs.cost, rel=1e-9)
+    assert ours.n_observations == len(obs.plane_points if name == "planes" else obs.crossing_points)
 
 
 def test_residuals_are_pixels_with_their_sign():
@@ -179,20 +185,6 @@ def test_a_distance_from_the_plane_of_sight_is_the_pixel_distance_scaled_by_dept
     assert (np.abs(sight.parameters - lines.parameters) / lines.sigma).max() < 0.1
 
 
-def test_predicted_covariance_in_a_thousand_trials():
-    rig, obs = camera_case(13, count=20)
-    rng = np.random.default_rng(14)
-    root = np.linalg.cholesky(obs.crossing_covariance + 1e-16 * np.eye(3))
-    points = obs.crossing_points + (root @ rng.normal(size=(1000, *obs.crossing_points.shape, 1)))[..., 0]
-    lines = np.repeat(obs.crossing_lines[None], 1000, axis=0)
-    lines[..., 2] += rng.normal(0, obs.crossing_line_sigma, lines.shape[:2])
-    found = solve_camera(replace(obs, crossing_points=points, crossing_lines=lines), "line", rig.T_camera_lrf)
-    e = increment(found.transform, rig.T_camera_lrf)
-    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(found.covariance), e) / 6
-    assert found.converged.all() and 0.9 < nees.mean() < 1.1
-    assert np.abs(e.mean(axis=0) / (e.std(axis=0) / np.sqrt(1000))).max() < 4.5
-
-
 def test_robust_loss_resists_wrong_edges():
     rig, obs = camera_case(15, count=20, noise=1.0)
     lines = obs.crossing_lines.copy()
@@ -216,12 +208,6 @@ def test_robust_loss_resists_wrong_points_without_a_guess():
 def test_starts_without_a_guess(start, source):
     rig, obs = camera_case(17, count=15, noise=1.0, source=source)
     assert (miss(start(obs), rig) < [0.05, 0.1]).all()
-
-
-def test_lines_alone_are_enough_to_start():
-    rig, obs = camera_case(18, count=15)
-    bare = rows_of(rows_of(obs, ("plane_", "scene_"), slice(0)), ("placements", "board_", "pattern_pixels"), slice(0))
-    assert (miss(solve_camera(bare), rig) < 1e-9).all()
 
 
 def test_nothing_to_start_from():
