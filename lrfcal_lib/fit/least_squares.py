@@ -238,41 +238,17 @@ def solve(
     loss=None, scale=1.0, max_iterations=60, tolerance=1e-8, required=True, n_observations=None, limit=1.0,
     chi2_rest=0.0, earlier=(),
 ):  # fmt: skip
-    """Minimise, then report covariances and what was not observed.
+    """Minimise (see :func:`minimise`), then report covariances and what was not observed: a Solution.
 
-    Parameters
-    ----------
-    evaluate, start, retract, shared, loss, scale, max_iterations, tolerance
-        See :func:`minimise`.
-    names : sequence of str
-        Of the unknowns reported (with `shared`, the shared ones).
-    method : str
-    read : callable
-        ``state -> (transform or None, parameters)``.
-    scales, limit : array_like and float, optional
-        See :func:`null_space`; ones by default.
-    words : callable, optional
-        ``direction (k,) -> str``; the names with the largest components by default.
-    groups : array_like, optional
-        Placement of every residual, or of every few in a row, for `covariance_placements` (with `shared` the leading
-        axis is the placement).
-    freedom, n_observations : optional
-        Degrees of freedom of chi-square, and number of observations; by default those of the residuals.
-    required : bool
-        Raise when something stays unobservable (single problems only).
-    chi2_rest, earlier
-        Chi-square that no unknown can change (compressed away), and cost histories of earlier rounds.
+    `names` are those of the unknowns reported (with `shared`, the shared ones), `read` makes ``(transform or None,
+    parameters)`` of a state, `scales` and `limit` are those of :func:`null_space`, `words` puts a direction (k,) into
+    words (the names with its largest components by default). `groups` tell the placement of every residual, or of every
+    few in a row, for `covariance_placements`; with `shared` the leading axis is the placement. `freedom` and
+    `n_observations` are by default those of the residuals; `chi2_rest` is chi-square that no unknown can change
+    (compressed away), `earlier` are cost histories of earlier rounds.
 
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry
-        Naming the unobservable motions, when `required`.
-    ValueError
-        When residuals at the start are not finite.
+    Raises DegenerateGeometry naming unobservable motions when `required` (single problems only), and ValueError when
+    residuals at the start are not finite.
     """
     axes = -1 if shared is None else (-2, -1)
     if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
@@ -323,19 +299,9 @@ def _by_placement(r, J, weights, groups, shared):
 def null_space(hessian, scales, limit=1.0):
     """Directions that normal equations (k, k) of whitened residuals do not determine.
 
-    Parameters
-    ----------
-    scales : array_like, shape (k,)
-        What counts as a change by one: 1 rad, 1 m, 1000 px, ...
-    limit : float
-        A direction is also unobservable when its standard deviation exceeds this many scales.
-
-    Returns
-    -------
-    directions : ndarray, shape (m, k)
-        Increments, largest component 1, the worst first; m = 0 when everything is observable.
-    values : ndarray, shape (k,)
-        Singular values of the scaled, whitened Jacobian, ascending: reciprocal standard deviations.
+    `scales` (k,) are what counts as a change by one: 1 rad, 1 m, 1000 px, ...; a direction is also unobservable when its
+    standard deviation exceeds `limit` scales. Returned are increments (m, k), largest component 1, the worst first, and
+    the singular values (k,) of the scaled, whitened Jacobian, ascending: reciprocal standard deviations.
     """
     scales = np.asarray(scales, float)
     values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)

@@ -141,21 +141,11 @@ def flip_sigma(softness, radius, step):
 def beam_terms(margin, sigma, hit, lapse=0.0):
     """Negative log likelihood of single beams near an edge, a probit: ``P(hit) = Phi(margin / sigma)``.
 
-    Parameters
-    ----------
-    margin, sigma : array_like
-        How far inside the place where readings flip the beam's centre lies (shift - distance from the edge), and the
-        standard deviation of that place, metres.
-    hit : ndarray of bool
-        Whether the board was read.
-    lapse : float
-        Share of beams that say nothing (something hid or bent the edge there); their pull fades with distance.
-
-    Returns
-    -------
-    cost, score, information : ndarray
-        Negative log likelihood, its derivative by the margin, and the observed information on the margin (never
-        negative; with `lapse` that of the majorising function of an EM step).
+    `margin` and `sigma` (metres) are how far inside the place where readings flip the beam's centre lies (shift -
+    distance from the edge), and the standard deviation of that place; `hit` tells whether the board was read, `lapse`
+    is the share of beams that say nothing (something hid or bent the edge there): their pull fades with distance.
+    Returned are cost, score (its derivative by the margin) and the observed information on the margin, never negative;
+    with `lapse` that of the majorising function of an EM step.
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
