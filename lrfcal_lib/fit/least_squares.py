@@ -299,7 +299,7 @@ def _by_placement(r, J, weights, groups, shared):
 def null_space(hessian, scales, limit=1.0):
     """Directions that normal equations (k, k) of whitened residuals do not determine.
 
-    `scales` (k,) are what counts as a change by one: 1 rad, 1 m, 1000 px, ...; a direction is also unobservable when its
+    `scales` (k,) are what counts as a change by one: 1 rad, 1 m, 1000 px; a direction is also unobservable when its
     standard deviation exceeds `limit` scales. Returned are increments (m, k), largest component 1, the worst first, and
     the singular values (k,) of the scaled, whitened Jacobian, ascending: reciprocal standard deviations.
     """
