@@ -230,11 +230,8 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     T0, sigma = prepared.session.T_head_lrf, prepared.session.platform_sigma
     stated = None if T0 is None else (T0, stated_covariance(sigma))
     solutions, problems = {}, {}
-    methods = {
-        "projected_last_beam": ("last_beam", solve_projected),
-        "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
-    }
-    for name, (variant, solve) in methods.items():
+    fit = partial(solve_platform, sigma_pitch=sigma_pitch)
+    for name, variant, solve in (("projected_last_beam", "last_beam", solve_projected), ("line_3d", "half_step", fit)):
         try:
             solutions[name] = solve(platform_observations(prepared, variant), T0)
         except DegenerateGeometry as error:
