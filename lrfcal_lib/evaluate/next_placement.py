@@ -199,8 +199,8 @@ def _beams(boards, solution, rate):
     across = np.linalg.norm(np.cross(ray, direction), axis=-1)
     radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
     step = np.sqrt(rate.bearing_step * rate.pitch_step) * distance
-    sigma = flip_sigma(np.exp(solution.state.sensor[2]), radius, step)[0]
-    shift = edge_shift(solution.state.sensor[1], radius, rate.background)[0]
+    sigma = flip_sigma(np.exp(solution.sensor["edge_log_softness"]), radius, step)[0]
+    shift = edge_shift(solution.sensor["edge_log_odds"], radius, rate.background)[0]
     # beams per metre off the edge; those near a corner are not used
     number = density * np.maximum(length[edge] - 4 * radius, 0.0) * across / len(ALONG)
     rows = np.sum((number * 4 * step).reshape(n, edges, -1), axis=2)

@@ -337,20 +337,19 @@ def _largest_range(values, groups):
 
 def _of_residuals(solution):
     """What residuals and their scatter say against the model: rows of whether, answer, kind and words."""
-    level = max(np.median([*solution.misfit.values()]), 1.0) if solution.misfit else 1.0
-    bad = {p: np.sqrt(value / level) for p, value in solution.misfit.items() if value > MISFIT * level}
-    misfits = ", ".join(f"{p} ({times:.1f} times)" for p, times in bad.items())
+    level, misfit = max(np.median([*solution.misfit.values()]), 1.0), solution.misfit.items()
+    misfits = ", ".join(f"{p} ({np.sqrt(z / level):.1f} times)" for p, z in misfit if z > MISFIT * level)
     clustered, ratio, worst = solution.solution.covariance_placements, {"axis": 0.0}, "axis"
     if clustered is not None:
         plain, scatter = (group_sigma(C, solution) for C in (solution.solution.covariance, clustered))
         ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
         worst = max(ratio, key=ratio.get)
     what = "the axis" if worst == "axis" else f"camera '{worst}'"
-    noise = {"ranges": solution.noise.get("face_scale", 1.0), "images": solution.noise.get("view_scale", 1.0)}
+    noise = {"ranges": solution.noise["face_scale"], "images": solution.noise.get("view_scale", 1.0)}
     large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
-    share = solution.noise.get("face_share", 1.0)  # beams about an edge always repeat errors: they share a background
+    share = solution.noise["face_share"]  # beams about an edge always repeat errors: they share a background
     return [
-        (bad, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
+        (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
         (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
         (ratio[worst] > MODEL_ERROR, CARE, "model error",
          f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: an error of the model"),
