@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table, size_error
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
@@ -308,9 +309,9 @@ def _of_placements(solution):
     place = np.concatenate([obs.face_placement, obs.beam_placement, shown])
     # the pitch shows the axis: of each placement, of the whole recording where a camera stands on the base
     within = "" if "platform" in obs.mounts else " within a placement"
-    span = _largest_range(pitch, place if within else 0 * place)
+    span = largest_range(pitch, place if within else 0 * place)
     axis = any(name in solution.solution.names for name in AXIS_NAMES)
-    flat = len(turned) and _largest_range(turned, shown) < SMALL_IMAGE_PITCH
+    flat = len(turned) and largest_range(turned, shown) < SMALL_IMAGE_PITCH
     mean = boards[:, :, 2].mean(axis=0)
     off = np.arccos(np.clip(boards[:, :, 2] @ mean / np.linalg.norm(mean), -1, 1)).max()
     middles = boards[:, :, :3] @ outline(solution).mean(axis=0) + boards[:, :, 3]
@@ -328,11 +329,6 @@ def _of_placements(solution):
          f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): errors elsewhere are "
          "extrapolated, and the range offset is hard to tell from shifts"),
     ]  # fmt: skip
-
-
-def _largest_range(values, groups):
-    """Largest range of the values of one group, 0 where there are none."""
-    return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
 
 
 def _of_residuals(solution):
