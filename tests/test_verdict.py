@@ -23,17 +23,6 @@ def lrf(model="SICK LMS400", **options):
     return LrfInfo(model, (0.9, 2.2), 0.002, 0.005, **options)
 
 
-def contradictions(monkeypatch, offset_mm, sigma_mm, size_error):
-    """Reasons to doubt what is stated, and by how much, of as much of a joint calibration as tells the range offset."""
-    monkeypatch.setattr(verdict, "size_error", lambda joint: size_error)
-    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma_mm / 1000]))
-    seen = SimpleNamespace(face_range=np.array([2.0]))
-    solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset_mm / 1000}, observations=seen)
-    board = SimpleNamespace(lengths=lambda: {"ab": 0.8, "bc": 0.8})
-    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(systematic_error=0.004)), board=board)
-    return verdict.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
-
-
 @pytest.mark.parametrize(
     ("stated", "admitted"),
     [
@@ -48,26 +37,29 @@ def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted)
     assert from_json(LrfInfo, json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted
 
 
-@pytest.mark.parametrize(
-    ("offset", "sigma", "answers"),
-    [(-5.2, 2.2, []), (9, 2, []), (11, 2, ["with care"]), (-87, 3.9, ["no"]), (68, 14, ["no"]), (30, 14, [])],
-)
-def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers):
-    found, doubt = contradictions(monkeypatch, offset, sigma, (np.nan, np.nan))
-    assert [reason.answer for reason in found] == answers
-    assert doubt == (abs(offset) / 1000 if found else 0.0)
-    assert all("board" in r.words and "squares" in r.words and f"{offset} mm" in r.words for r in found)
+UNKNOWN = np.nan, np.nan
 
 
-@pytest.mark.parametrize(
-    ("error", "sigma", "answers"),
-    [(0.004, 0.002, []), (-0.007, 0.002, ["with care"]), (-0.048, 0.003, ["no"]), (np.nan, np.nan, [])],
-)
-def test_edges_that_contradict_the_stated_ones(monkeypatch, error, sigma, answers):
-    found, doubt = contradictions(monkeypatch, 0, 1, (error, sigma))
+@pytest.mark.parametrize(("offset", "sigma", "size_error", "answers"), [
+    (-5.2, 2.2, UNKNOWN, []), (9, 2, UNKNOWN, []), (11, 2, UNKNOWN, ["with care"]), (-87, 3.9, UNKNOWN, ["no"]),
+    (68, 14, UNKNOWN, ["no"]), (30, 14, UNKNOWN, []), (0, 1, UNKNOWN, []), (0, 1, (0.004, 0.002), []),
+    (0, 1, (-0.007, 0.002), ["with care"]), (0, 1, (-0.048, 0.003), ["no"]),
+])  # fmt: skip
+def test_ranges_or_edges_that_contradict_what_is_stated(monkeypatch, offset, sigma, size_error, answers):
+    """A range offset (mm) that no maker admits, edges of another length; and how wrong all ranges at 2 m may be then."""
+    monkeypatch.setattr(verdict, "size_error", lambda joint: size_error)
+    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
+    seen = SimpleNamespace(face_range=np.array([2.0]))
+    solution = SimpleNamespace(solution=inner, sensor={"range_offset": offset / 1000}, observations=seen)
+    board = SimpleNamespace(lengths=lambda: {"ab": 0.8, "bc": 0.8})
+    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(systematic_error=0.004)), board=board)
+    found, doubt = verdict.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
     assert [reason.answer for reason in found] == answers
-    assert doubt == (2.0 * abs(error) if found else 0.0)
-    assert all("shorter in the cloud than stated" in reason.words for reason in found)
+    words, wrong = f"{offset} mm", abs(offset) / 1000
+    if not offset:
+        words, wrong = "shorter in the cloud than stated", 2.0 * abs(size_error[0])
+    assert doubt == (wrong if found else 0.0)
+    assert all(part in reason.words for reason in found for part in (words, "board", "squares"))
 
 
 @pytest.fixture(scope="module")
