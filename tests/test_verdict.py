@@ -46,7 +46,7 @@ UNKNOWN = np.nan, np.nan
     (0, 1, (-0.007, 0.002), ["with care"]), (0, 1, (-0.048, 0.003), ["no"]),
 ])  # fmt: skip
 def test_ranges_or_edges_that_contradict_what_is_stated(monkeypatch, offset, sigma, size_error, answers):
-    """A range offset (mm) that no maker admits, edges of another length; and how wrong all ranges at 2 m may be then."""
+    """A range offset (mm) that no maker admits, edges of another length; and how wrong ranges at 2 m may be then."""
     monkeypatch.setattr(verdict, "size_error", lambda joint: size_error)
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
     seen = SimpleNamespace(face_range=np.array([2.0]))
