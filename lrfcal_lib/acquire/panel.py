@@ -158,17 +158,8 @@ def scan_picture(ranges, bearings, field_of_view):
 def sweep_picture(rows, bearings, field_of_view, pitch, step):
     """A sweep as it grows: ranges as colours, near is bright, grey where there is none; BGR.
 
-    Bearing grows to the left as in the scene, pitch upwards.
-
-    Parameters
-    ----------
-    rows : dict of float to ndarray, shape (B,)
-        Ranges by pitch.
-    bearings : ndarray, shape (B,)
-    field_of_view, pitch : (float, float)
-        Ends, radians.
-    step : float
-        Between scan lines, radians; of a continuous sweep the most between two.
+    Bearing grows to the left as in the scene, pitch upwards; radians, of field of view and pitch their ends. `rows` has
+    ranges (B,) by pitch, `step` is that between scan lines, of a continuous sweep the most between two.
     """
     half, width, height = np.degrees(step) / 2, RIGHT - LEFT, BOTTOM - TOP
     across = np.degrees([max(field_of_view), min(field_of_view)])

@@ -94,16 +94,9 @@ class Stopped(DeviceError):
 class Motion:
     """Motions of one axis, its speeds, and where it must be by now; rad, rad/s, instants of the host.
 
-    Attributes
-    ----------
-    abort : threading.Event
-        Set to end what runs; nothing moves the head while it is set.
-    feedback : bool
-        The head tells its tilt, if maybe not while it moves.
-    calibrated : bool
-        The speed was stated or measured, not assumed.
-    rows : list of (float, float, bool, float)
-        Of a sweep: host time, pitch, whether it was measured, and dead reckoning before that was known.
+    While the event `abort` is set nothing moves the head. `feedback`: it tells its tilt, if maybe not while it moves;
+    `calibrated`: its speed was stated or measured, not assumed; `rows` are of a sweep: host time, pitch, whether it was
+    measured, and dead reckoning before that was known.
     """
 
     def __init__(self, line, settings, log, clock):
@@ -367,17 +360,7 @@ class Motion:
 
 
 def drawn_to_readings(rows):
-    """Track of a sweep: what lies between two readings is stretched to both, before the first and after the last not.
-
-    Parameters
-    ----------
-    rows : list of (float, float, bool, float)
-        Time, pitch, whether it was measured, dead reckoning before that was known.
-
-    Returns
-    -------
-    list of (float, float, bool)
-    """
+    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what lies outside is not."""
     track, told = [row[:3] for row in rows], [i for i, row in enumerate(rows) if row[2]]
     for first, last in itertools.pairwise(told):
         start, way = rows[first][1], rows[last][3] - rows[first][1]
@@ -402,7 +385,6 @@ class PanTilt(port.Closed):
     ----------
     has_feedback : bool
         It tells its tilt.
-    motion : Motion
 
     Raises
     ------
@@ -480,14 +462,8 @@ class PanTilt(port.Closed):
     def pitch(self):
         """Where the head points now, rad, up positive, and whether it was measured (else it is dead reckoning).
 
-        Raises
-        ------
-        NoReply
-            If a head with feedback rests and does not answer.
-        LineLost
-            If the port vanished and did not come back.
-        DeviceError
-            If the head was closed, or the pitch of one without feedback is unknown after its line was lost.
+        NoReply if it rests and does not answer, LineLost if the port did not come back, DeviceError if the head was
+        closed, or the pitch of one without feedback is unknown after its line was lost.
         """
         self._need_open()
         if self.has_feedback:
@@ -603,12 +579,7 @@ class PanTilt(port.Closed):
     def finish_sweep(self, timeout=None):
         """Wait for the end of the sweep; its :attr:`track`.
 
-        Raises
-        ------
-        NoReply
-            If it goes on after `timeout` s; the head is stopped.
-        DeviceError
-            Why it ended too early.
+        NoReply if it goes on after `timeout` s (the head is stopped), DeviceError if it ended too early.
         """
         if self._thread is None:
             raise DeviceError("there was no sweep: start one")
@@ -622,9 +593,8 @@ class PanTilt(port.Closed):
 
     @property
     def track(self):
-        """Host time, pitch in rad and whether it was measured, of the sweep that runs or ran last.
+        """List of host time, pitch in rad and whether it was measured, of the sweep that runs or ran last.
 
-        list of (float, float, bool)
-            Between readings the pitch is dead reckoning, which is drawn to the readings.
+        Between readings the pitch is dead reckoning, which is drawn to the readings.
         """
         return drawn_to_readings(list(self.motion.rows))

@@ -338,17 +338,8 @@ def unchanged(scans):
 
     By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
     something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same wall
-    at any pitch: a head that moves is never accused, one that does not is believed where much else moves.
-
-    Parameters
-    ----------
-    scans : sequence of array_like, shape (B,)
-        Ranges in the order in which they were taken, metres; beams without a range in one of them do not count.
-
-    Returns
-    -------
-    bool
-        False where no beam has a range in all scans.
+    at any pitch: a head that moves is never accused, one that does not is believed where much else moves. Beams without
+    a range in one of the scans, (B,) each, do not count; False where all lack one.
     """
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]

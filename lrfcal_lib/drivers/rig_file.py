@@ -98,23 +98,12 @@ class ListedPlacement(Stated):
 
 @dataclass(frozen=True)
 class Placement:
-    """What is recorded while the board stays where it is.
-
-    Attributes
-    ----------
-    number : int
-    pitch : ndarray, shape (n,)
-        Where scans are taken, radians, in the order of motion; of a continuous sweep its ends.
-    image_pitch : tuple of float
-        Where images are taken, radians.
-    purpose : {'board', 'scene'}
-        Of the images.
-    """
+    """What is recorded while the board stays where it is."""
 
     number: int
-    pitch: np.ndarray
-    image_pitch: tuple[float, ...]
-    purpose: str = "board"
+    pitch: np.ndarray  # where scans are taken, radians, in the order of motion; of a continuous sweep its ends
+    image_pitch: tuple[float, ...]  # where images are taken, radians
+    purpose: str = "board"  # of the images, or "scene"
 
     @property
     def direction(self):
@@ -162,22 +151,14 @@ class Plan(Stated):
 
 @dataclass(frozen=True)
 class RigFile:
-    """A rig file; RigFileError if its head or its laser range finder cannot do the plan.
-
-    Attributes
-    ----------
-    about : dict
-        licence, source, simulated.
-    platform_sigma : (float, float)
-        How well the platform is known: direction (radians) and offset (metres).
-    """
+    """A rig file; RigFileError if its head or its laser range finder cannot do the plan."""
 
     path: Path
-    about: dict
+    about: dict  # licence, source, simulated
     board: Board
     lrf: LrfInfo
     T_head_lrf: RigidTransform | None
-    platform_sigma: tuple[float, float]
+    platform_sigma: tuple[float, float]  # how well the platform is known: direction (radians) and offset (metres)
     cameras: dict[str, CameraInfo]
     devices: Devices
     plan: Plan
