@@ -355,8 +355,8 @@ class Panel(Closed):
             parts, collector = self.parts, self.collector
             collector.connect(parts.rig.value.strip(), Path(parts.session.value.strip()).expanduser())
             low, high = collector.limits_deg
-            parts.slider.min, parts.slider.max = min(low, parts.slider.max), high
-            parts.slider.min = low
+            with parts.slider.hold_trait_notifications():
+                parts.slider.min, parts.slider.max = low, high
             parts.show_pictures(collector.rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()

@@ -69,8 +69,7 @@ class HeadSettings(Stated):
 
     def pitch(self, elevation):
         """The pitch of an elevation that the head tells, rad, in [-pi, pi)."""
-        turn = elevation - math.radians(self.position_zero_deg)
-        turn = (turn + math.pi) % (2 * math.pi) - math.pi
+        turn = (elevation - math.radians(self.position_zero_deg) + math.pi) % math.tau - math.pi
         return -turn if self.invert else turn
 
 
@@ -313,20 +312,17 @@ class Motion:
             self._longest = max(self._longest, took)
         raise self._short_of(pitch, target)
 
-    def timed(self, target, deadline):
-        """Move by time; the pitch that results is dead reckoning.
+    def timed(self, target, seconds, deadline):
+        """Move by time, unless the shortest motion would lead further away; the pitch that results is dead reckoning.
 
         Raises LineLost if the port vanished: the pitch is unknown then; Refused if there is not enough time.
         """
-        start, step = self.estimate(), self.settings.tilt_speed
-        seconds = abs(target - start) / self.speed(target - start, step)
-        if seconds < self._shortest_s / 2:
-            return start  # the shortest motion would lead further away
         needed_s = seconds + self.settings.start_delay_s
-        if self._now() + needed_s > deadline:
-            raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
-        self.run(target, step)
-        self.pause(self.settings.settle_s)
+        if seconds >= self._shortest_s / 2:
+            if self._now() + needed_s > deadline:
+                raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
+            self.run(target, self.settings.tilt_speed)
+            self.pause(self.settings.settle_s)
         return self.estimate()
 
     def sweep(self, goal, step):
@@ -360,7 +356,7 @@ class Motion:
 
 
 def drawn_to_readings(rows):
-    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what lies outside is not."""
+    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what is outside is not."""
     track, told = [row[:3] for row in rows], [i for i, row in enumerate(rows) if row[2]]
     for first, last in itertools.pairwise(told):
         start, way = rows[first][1], rows[last][3] - rows[first][1]
@@ -542,7 +538,7 @@ class PanTilt(port.Closed):
                     if now() >= deadline:
                         raise
                     self._line.opened()
-            return motion.timed(pitch, deadline)
+            return motion.timed(pitch, seconds, deadline)
         except BaseException:
             self.emergency_stop()
             raise

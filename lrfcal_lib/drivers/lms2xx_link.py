@@ -365,7 +365,7 @@ AGAIN_S = 0.1
 
 
 class ScanReader:
-    """A thread that reads scans until the event `leave` is set: `readings` has the last 256 and is replaced, not changed.
+    """A thread that reads scans until the event `leave` is set; `readings`, the last 256, is replaced, never changed.
 
     ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
     ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.

@@ -32,8 +32,8 @@ CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 class MjpegStream:
     """Reads like cv2.VideoCapture; `timeout` in s, to connect and between any two bytes.
 
-    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was waited
-    for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names no host.
+    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was
+    waited for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names none.
     """
 
     def __init__(self, url, timeout):
