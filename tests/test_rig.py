@@ -16,10 +16,9 @@ import pytest
 from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, raising, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
-from lrfcal_lib.drivers.head import HeadSettings
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
-from lrfcal_lib.drivers.rig_file import Plan, RigFileError, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import HeadSettings, Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import find_source
 from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
 
