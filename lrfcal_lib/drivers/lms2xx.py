@@ -53,8 +53,6 @@ class LMS2xx(Closed):
         As read last.
     configuration : Configuration
         As read last.
-    variant : tuple of float
-        Field of view and resolution, degrees.
 
     Raises
     ------
@@ -123,7 +121,7 @@ class LMS2xx(Closed):
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         self._link.senders = {0x80, 0x80 | self.status.address}
         model, *rest = self._told(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
@@ -198,9 +196,10 @@ class LMS2xx(Closed):
 
     # ------------------------------------------------------------------------------------------------- settings
 
-    def _read_status(self):
-        self.status = self._told(wire.STATUS, codec.parse_status)
-        self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
+    @property
+    def variant(self):
+        """Field of view and resolution, degrees."""
+        return self.status.scan_angle_deg, self.status.resolution_deg
 
     def _read_configuration(self):
         def parse(raw):
@@ -243,7 +242,7 @@ class LMS2xx(Closed):
         if wanted not in POINTS:
             known = ", ".join(f"{fov:g}/{step:g}" for fov, step in POINTS)
             raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         differs = self.variant != wanted
         if differs:
             self._set_variant(wanted)
@@ -256,7 +255,7 @@ class LMS2xx(Closed):
             self._opened().ask(wire.VARIANT, words)
         except NoReply as error:  # the reply may be lost and the variant set
             self._log.warning("%s; reading the variant", error)
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
             raise Refused(f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}")
