@@ -136,7 +136,7 @@ def test_the_recording_calibrates_as_the_simulated_session(recorded_session, pre
     platforms, cameras = [], []
     for one in prepared:
         platforms.append(calibrate_platform(one, one.pitch_noise.offset))
-        solutions, problems = calibrate_cameras(observe_all(one, platforms[-1].T_head_lrf), [METHOD])
+        solutions, problems = calibrate_cameras(observe_all(one, platforms[-1].transform("combined")), [METHOD])
         assert problems == {}
         cameras.append(solutions["left", METHOD])
     compare(*cameras, setup[0].rig.cameras[0].mounting, 6, 0.15)
