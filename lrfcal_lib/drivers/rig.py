@@ -95,25 +95,9 @@ class Rig(Closed):
     def open(cls, stated, *, log=LOG, clock=None, host=REAL, camera=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
-        Parameters
-        ----------
-        stated : RigFile
-        log : logging.Logger
-        clock : callable, optional
-            :func:`host_clock` by default.
-        host : Host
-            Machine that the drivers run on; tests have a VirtualHost.
-        camera : callable, optional
-            Opens a camera by its name, for images that come from elsewhere than the source stated.
-
-        Returns
-        -------
-        Rig
-
-        Raises
-        ------
-        DeviceError
-            With the device in the message; those opened before are closed again.
+        The host is the machine that the drivers run on, its clock :func:`host_clock` by default; ``camera(name)`` opens
+        cameras whose images come from elsewhere than the source stated. DeviceError, with the device in the message:
+        those opened before are closed again.
         """
         common, devices = {"log": log, "clock": clock or host_clock()}, stated.devices
         lrf = devices.lrf.model_dump(exclude_none=True, exclude={"port", "interlaced"})
@@ -184,22 +168,13 @@ class Rig(Closed):
     # ---------------------------------------------------------------------------------------------- recording
 
     def acquire(self, placement):
-        """Record one placement: a generator of events, in the order in which things happen.
+        """Record a Placement of the plan: a generator of Moved, Scanned, Photographed and Tracked, as they happen.
 
-        The Placement is of the plan, which also says how (stop-and-go or continuous).
-
-        Yields
-        ------
-        Moved, Scanned, Photographed or Tracked
-            Scans and images of a stop are later than the instant at which the head came to rest there. In a
-            continuous sweep every scan has the pitch at the instant of its middle beam, interpolated between the
-            head's readings (dead reckoning without them), and is handed out as soon as that is known.
-
-        Raises
-        ------
-        DeviceError
-            Whatever happens, also when the generator is closed: the head is stopped, and the scans are. After a sweep
-            with a head that tells nothing, if the scans are all alike: it did not move.
+        Scans and images of a stop are later than the instant at which the head came to rest there. In a continuous
+        sweep every scan has the pitch at the instant of its middle beam, interpolated between the head's readings (dead
+        reckoning without them), and is handed out as soon as that is known. Whatever happens, also when the generator
+        is closed, the head is stopped, and the scans are. DeviceError, too, after a sweep with a head that tells
+        nothing if the scans are all alike: it did not move.
         """
         sweep, seen = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go, []
         try:
