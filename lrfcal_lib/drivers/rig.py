@@ -100,12 +100,11 @@ class Rig(Closed):
         those opened before are closed again.
         """
         common, devices = {"log": log, "clock": clock or host_clock()}, stated.devices
-        lrf = devices.lrf.model_dump(exclude_none=True, exclude={"port", "interlaced"})
-        if devices.lrf.interlaced:  # such a stream chooses its own
-            lrf.pop("variant", None)
+        skipped = {"port", "interlaced"} | ({"variant"} if devices.lrf.interlaced else set())  # it chooses its own
+        asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
         openers = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host, **common),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **lrf, **common),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked, **common),
         }
         camera = camera or partial(_camera, stated, common)
         openers |= {f"camera '{name}'": partial(camera, name) for name in stated.cameras}
@@ -120,8 +119,9 @@ class Rig(Closed):
                 except ValueError as error:
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
                 stack.callback(opened[-1].close)
-            cameras = dict(zip(stated.cameras, opened[2:], strict=True))
-            rig = cls(stated, opened[1], opened[0], cameras, clock=common["clock"], host=host)
+            head, lrf, *cameras = opened
+            cameras = dict(zip(stated.cameras, cameras, strict=True))
+            rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
             rig._closing = stack.pop_all()
         return rig
 
