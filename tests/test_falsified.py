@@ -20,7 +20,7 @@ SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 def judged(change, seed, mount="head"):
     """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
-    obs, truth, rig = draw(rng(seed), 12, mount=mount)
+    obs, truth, rig = draw(rng(seed), 16, mount=mount)
     prior = PlatformPrior(rig.T_head_lrf, *STATED)
     settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
     solution = solve_joint(change(replace(obs, T_head_lrf=rig.T_head_lrf)), required=False, **settings)
