@@ -1,4 +1,4 @@
-"""Calibrations on disk: the native ``calibration.json``."""
+"""Calibrations and clouds on disk: ``calibration.json``, PLY, PCD, surface meshes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, color_cloud
+from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, color_cloud
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.jointly import edge_misses_px, joint_fit
+from lrfcal_lib.evaluate.scene import with_sigma
 from lrfcal_lib.evaluate.tables import handed_over, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
@@ -110,8 +111,57 @@ def write_calibration(path, record):
     path.write_text(json.dumps(plain(record), indent=1, allow_nan=False) + "\n")
 
 
+def write_clouds(folder, calibration, method):
+    """Write ``cloud.ply`` (the boards) and, of a session with scenes, ``scene.ply`` and ``scene.pcd``: their paths.
+
+    A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
+    """
+    session, folder, files = calibration.prepared.session, Path(folder), []
+    said = [f"session {session.name}, method {method}, lrfcal {__version__}"]
+    for name, scene in (("cloud", False), ("scene", True)):
+        if session.scene_placements if scene else calibration.prepared.scans:
+            blocks = cloud_blocks(calibration, method, scene)
+            if method == "joint":
+                blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
+            files.append(folder / f"{name}.ply")
+            write_ply(files[-1], blocks, said)
+    if session.scene_placements:
+        files.append(folder / "scene.pcd")
+        write_pcd(files[-1], color_cloud(calibration, method, scene=True))
+    return files
+
+
+def write_pcd(path, cloud):
+    """Write points, normals, colours and intensities as PCD. Raises OSError if the file cannot be written."""
+    import open3d as o3d
+
+    geometry = o3d.t.geometry.PointCloud(o3d.core.Tensor(cloud.points.astype(np.float32)))
+    geometry.point.normals = o3d.core.Tensor(cloud.normals.astype(np.float32))
+    geometry.point.colors = o3d.core.Tensor(np.ascontiguousarray(cloud.colors))
+    geometry.point.intensity = o3d.core.Tensor(cloud.intensity.astype(np.float32)[:, None])
+    if not o3d.t.io.write_point_cloud(str(path), geometry):
+        raise OSError(f"{path}: the cloud could not be written; is the disk full?")
+
+
+def write_mesh(path, cloud, octree=9):
+    """Write a closed coloured surface through a cloud (Poisson reconstruction, cut where points are sparse) as PLY.
+
+    `octree` levels decide how fine it is. Raises OSError if the file cannot be written.
+    """
+    import open3d as o3d
+
+    use, geometry = np.isfinite(cloud.normals).all(axis=1), o3d.geometry.PointCloud()
+    for name, values in (("points", cloud.points), ("normals", cloud.normals), ("colors", cloud.colors / 255)):
+        setattr(geometry, name, o3d.utility.Vector3dVector(values[use]))
+    mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(geometry, depth=octree, n_threads=1)
+    density = np.asarray(density)
+    mesh.remove_vertices_by_mask(density < np.quantile(density, 0.1))
+    if not o3d.io.write_triangle_mesh(str(path), mesh):
+        raise OSError(f"{path}: the mesh could not be written; is the disk full?")
+
+
 def calibrate_session(path, out=None):
-    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and ``cloud.ply``.
+    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and clouds.
 
     They go to `out`, ``reports/<name>`` under the current folder when left out. Returns 0, or 3 where the verdict is
     'no' (also when no camera could be calibrated and nothing is written).
@@ -127,8 +177,7 @@ def calibrate_session(path, out=None):
     judged = judge(found)
     print(*judged.sentences(), sep="\n")
     if judged.errors:  # otherwise nothing can be handed over
-        method, file, cloud = handed_over(found), folder / "calibration.json", folder / "cloud.ply"
+        method, file = handed_over(found), folder / "calibration.json"
         write_calibration(file, calibration_record(found, method, judged))
-        write_ply(cloud, color_cloud(found, method))
-        print(f"written: {file}, {cloud}")
+        print("written:", *(f"{path}," for path in write_clouds(folder, found, method)), file)
     return UNTRUSTED if judged.answer == NO else 0
