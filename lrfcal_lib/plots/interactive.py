@@ -48,7 +48,8 @@ def rig_lines(T_head_lrf, cameras, boards=None, size=0.15):
 
     `cameras` are (``T_camera_platform``, CameraModel) by name, `boards` corners (n, 3) by name; `size` in metres.
     """
-    lines, gap = {"tilt axis": (COLORS["platform"], np.array([[-4 * size, 0, 0], [4 * size, 0, 0]]))}, np.full((1, 3), np.nan)
+    gap, lines = np.full((1, 3), np.nan), {}
+    lines["tilt axis"] = COLORS["platform"], np.array([[-4 * size, 0.0, 0.0], [4 * size, 0.0, 0.0]])
     frames = {"lrf": T_head_lrf} | {name: T.inv() for name, (T, _) in cameras.items()}
     for axis, color in enumerate(AXES_RGB):
         ends = [np.vstack([T.apply(np.outer([0, size], np.eye(3)[axis])), gap]) for T in frames.values()]
