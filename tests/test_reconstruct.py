@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate import reconstruct as rec
 from lrfcal_lib.calibrate.outline import as_recorded, measure_board
 from lrfcal_lib.evaluate.export import write_mesh, write_pcd
-from lrfcal_lib.evaluate.scene import flatness, largest_plane
+from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.session.read import Sweep
@@ -274,7 +274,7 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
 
 def test_a_bent_wall_is_not_flat():
     cloud = whole(scan(wall(2.0))[1])
-    assert largest_plane(cloud.points).mean() > 0.99
+    assert largest_plane(cloud).mean() > 0.97
     flat = flatness(cloud.points)[1]
     bent = flatness(cloud.points + np.array([[0, 0.05, 0]]) * cloud.points[:, :1] ** 2)[1]
     assert flat < 0.001 and 0.01 < bent < 0.03

@@ -237,7 +237,7 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
         raise ValueError(f"placement {sweep.placement}: an empty sweep ({lines} scan lines, no range in them)")
     turns = np.abs(np.diff(sweep.pitch))
     step = max(lrf.bearing_step, float(np.median(turns[turns > 0])) if turns.any() else 0.0)
-    painter = Painter(views, step, 3 * lrf.sigma_range)
+    painter = Painter(views, step, 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
     blocks = _Blocks(sweep, T_head_lrf, correct, lrf, continuous)
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
     for points, normals, hiding, good, _ in blocks:

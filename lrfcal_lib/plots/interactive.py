@@ -9,7 +9,7 @@ from lrfcal_lib.plots.recording import AXES_RGB, COLORS, color_of
 MOST_POINTS = 150_000  # that browsers turn smoothly
 
 
-def scene_page(path, points, colors, lines, eye=(-0.4, -1.6, 0.7)):
+def scene_page(path, points, colors, seen, lines, eye=(-0.3, -1.5, 0.55)):
     """Write a page that needs no other file and no network.
 
     Parameters
@@ -18,6 +18,8 @@ def scene_page(path, points, colors, lines, eye=(-0.4, -1.6, 0.7)):
     points : ndarray, shape (n, 3)
         Metres; every so many are left out beyond `MOST_POINTS`.
     colors : ndarray of uint8, shape (n, 3)
+    seen : ndarray of bool, shape (n,)
+        The others are hidden until one clicks on them in the legend.
     lines : dict of str to (str, ndarray of shape (m, 3))
         What else to draw, by its name in the legend: a colour and a line, NaN rows where it breaks.
     eye : tuple of float
@@ -25,11 +27,12 @@ def scene_page(path, points, colors, lines, eye=(-0.4, -1.6, 0.7)):
     """
     import plotly.graph_objects as go
 
-    every = -(-len(points) // MOST_POINTS) or 1
-    points, colors = np.asarray(points[::every], np.float32), np.asarray(colors[::every], int)
-    shades = [f"#{value:06x}" for value in (colors @ [65536, 256, 1]).tolist()]
-    dots = {"size": 1.6, "color": shades}
-    clouds = [go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], mode="markers", marker=dots, name="points")]
+    every, clouds = -(-len(points) // MOST_POINTS) or 1, []
+    for name, which, shown in (("points", seen, True), ("points that no image saw", ~seen, "legendonly")):
+        x, y, z = np.asarray(points[which][::every], np.float32).T
+        shades = [f"#{value:06x}" for value in (colors[which][::every].astype(int) @ [65536, 256, 1]).tolist()]
+        dots = {"mode": "markers", "marker": {"size": 1.6, "color": shades}}
+        clouds.append(go.Scatter3d(x=x, y=y, z=z, name=name, visible=shown, **dots))
     for name, (color, line) in lines.items():
         x, y, z = np.asarray(line, np.float32).T
         clouds.append(go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": color, "width": 4}, name=name))
@@ -38,9 +41,9 @@ def scene_page(path, points, colors, lines, eye=(-0.4, -1.6, 0.7)):
     view = {"eye": dict(zip("xyz", eye, strict=True)), "up": {"x": 0, "y": 0, "z": 1}}
     figure.update_layout(
         scene={**axes, "aspectmode": "data", "camera": view}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"itemsizing": "constant"}, hovermode=False,
+        legend={"itemsizing": "constant", "x": 0, "y": 1}, hovermode=False,
     )  # fmt: skip
-    figure.write_html(path, include_plotlyjs=True, full_html=True, div_id="scene")
+    figure.write_html(path, include_plotlyjs=True, full_html=True, div_id="scene", default_height="100vh")
 
 
 def rig_lines(T_head_lrf, cameras, boards=None, size=0.15):

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.calibrate.pipeline import views_of
+from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.tables import read_truth
 from lrfcal_lib.evaluate.uncertainty import point_sigma
 from lrfcal_lib.model.geometry import fit_plane, tilt
@@ -26,14 +28,15 @@ def with_sigma(cloud, solution):
     return replace(cloud, sigma=RegularGridInterpolator((distances, *axes), whole)(at))
 
 
-def largest_plane(points, tolerance=0.04):
-    """Which points (n,) lie within a tolerance (metres) of the plane that holds most of them (RANSAC, seeded)."""
+def largest_plane(cloud, tolerance=0.04):
+    """Which points of a Cloud lie on its largest plane: within a tolerance (metres), facing as it does to 15 deg."""
     import open3d as o3d
 
     o3d.utility.random.seed(0)
-    geometry = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    _, index = geometry.segment_plane(tolerance, 3, 500)
-    return np.isin(np.arange(len(points)), index)
+    geometry = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
+    plane, _ = geometry.segment_plane(tolerance, 3, 500)
+    near = np.abs(cloud.points @ plane[:3] + plane[3]) < tolerance
+    return near & (np.abs(cloud.normals @ plane[:3]) > np.cos(np.radians(15)))
 
 
 def flatness(points):
@@ -113,3 +116,10 @@ def scene_errors(cloud, calibration, method):
         far = np.linalg.norm(way, axis=1)
         blocked[mine] = world.cast(np.broadcast_to(eye, way.shape), way / far[:, None]).distance < far - 0.02
     return SceneErrors(depth, normal, color, blocked)
+
+
+def as_stated(calibration):
+    """The first scene with the platform as it is stated, ranges and pitch as recorded, and no colours; a Cloud."""
+    session = calibration.prepared.session
+    sweep, T_head_lrf = session.sweep(session.scene_placements[0]), calibration.platform.transform("stated")
+    return join(reconstruct(sweep, [], T_head_lrf, as_recorded, lrf=session.lrf))
