@@ -103,7 +103,7 @@ REFUSED = [
     (codec.parse_status, encode_telegram(0xB1, bytes(100), status=16), "100 bytes of data, needs 123"),
     (codec.parse_configuration, encode_telegram(0xF4, bytes(6), status=16), "6 bytes of data, needs 7"),
     (codec.parse_configuration, encode_telegram(0xF7, bytes(7), status=16), "7 bytes of data, needs 8"),
-    (codec.parse_errors, A0[:-1], "states 9 bytes, got 8"),
+    (codec.parse_type, A0[:-1], "states 9 bytes, got 8"),
     (lambda block: codec.Configuration(block).unit, b"\0\0\0\0\0\0\7", "unit 7 is neither 0"),
     (lambda values: codec.scan_quarters(*values), (100,), "101, 181, 201, 361, 401 values, got 100"),
     (lambda values: codec.scan_quarters(*values), (181, 1), "partial scan 1 has 180 values, got 181"),
@@ -289,12 +289,9 @@ def test_configuration_survives_and_says_its_mode():
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
-def test_type_and_errors():
+def test_the_type_is_told():
     by_code = {raw[4]: raw for raw in REPLIES}
     assert codec.parse_type(by_code[0xBA]) == ("LMS221", "302063", "X01.27")
-    assert codec.parse_errors(by_code[0xB2]) == []
-    old = encode_telegram(0xB2, bytes.fromhex("84 16 01 31 07 02"), status=0x12)
-    assert codec.parse_errors(old) == [("fatal", True, 0x16), ("info", False, 0x31), ("unknown", False, 2)]
 
 
 # --------------------------------------------------------------------------------------------- real recordings

@@ -14,7 +14,7 @@ from shared import STRINGS
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, crc16, decode_scans, encode_scan, encode_telegram
 
-PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xB2: codec.parse_errors, 0xBA: codec.parse_type,
+PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_type,
            0xF4: codec.parse_configuration, 0xF7: codec.parse_configuration}  # fmt: skip
 ROUNDS, TRACED = 10, 3  # in the last rounds every byte is traced, which takes time; in all of them objects are counted
 MEMORY, OBJECTS = 200_000, 2000  # bytes and objects that may stay allocated

@@ -136,33 +136,29 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
-    suggestion, problem = None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
     found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
-    if suggest:
-        try:
-            suggestion = suggest_placement(solution, models, **options)
-        except DegenerateGeometry as error:
-            problem = f"No placement can be suggested: {error}."
-    return replace(found, suggestion=suggestion, no_suggestion=problem)
+    try:
+        return replace(found, suggestion=suggest_placement(solution, models, **options) if suggest else None)
+    except DegenerateGeometry as error:
+        return replace(found, no_suggestion=f"No placement can be suggested: {error}.")
 
 
 def _expected(chains, models, pitch, noise, reasons, doubt):
     """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
     # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have taken it up
     unsure = np.diag([doubt**2 * (name in ("range_offset", *POSE_NAMES[3:])) for name in COLUMNS])
-    more = {c: tuple(C + unsure for C in chain.covariances) for c, chain in chains.items()}
-    chains = {c: replace(chain, covariances=more[c]) for c, chain in chains.items()}
+    chains = {k: replace(v, covariances=tuple(C + unsure for C in v.covariances)) for k, v in chains.items()}
     low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
     middle = (low + high) / 2
     field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
     cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
-    maps, looks = {"cloud_mm": 1000 * cloud.rms()}, {"image_pitch": sum(field) / 2, "pitches": field}
-    for camera, chain in chains.items():
-        if camera is not None:
-            found = projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks)
-            maps[f"{camera}_px"] = found.rms()
+    looks = {"image_pitch": sum(field) / 2, "pitches": field}
+    maps = {"cloud_mm": 1000 * cloud.rms()} | {
+        f"{camera}_px": projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks).rms()
+        for camera, chain in chains.items() if camera is not None
+    }  # fmt: skip
     errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
     if large:
@@ -231,7 +227,7 @@ def _without_joint(calibration, method, doubt):
     # the range offset of the cloud may be what the maker admits
     platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
-    head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
+    head, offset = pose_array(platform.transform("combined")), np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
