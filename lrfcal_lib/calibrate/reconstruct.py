@@ -72,10 +72,8 @@ ROWS = tuple(f.name for f in fields(Cloud) if f.name != "removed")
 
 
 def join(clouds):
-    """One cloud of several; a ValueError if there is none."""
+    """One cloud of several."""
     clouds = list(clouds)
-    if not clouds:
-        raise ValueError("no cloud to join: no sweep has a range")
     rows = (np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ROWS)
     return Cloud(*rows, sum(cloud.removed for cloud in clouds))
 
@@ -142,7 +140,9 @@ class Painter:
     """
 
     def __init__(self, views, step, noise):
-        self.views, self.noise, self.exposures = tuple(views), noise, np.zeros((len(views), 2))
+        from lrfcal_lib.calibrate import colouring  # numba, which nothing else needs
+
+        self.loops, self.views, self.noise, self.exposures = colouring, views, noise, np.zeros((len(views), 2))
         self.cells = [max(2.0, 2 * step * view.model.fx) for view in self.views]
         self.nearest = []
         for view, cell in zip(self.views, self.cells, strict=True):
@@ -151,21 +151,17 @@ class Painter:
 
     def hide(self, points):
         """Let points (n, 3) hide what is behind them."""
-        from lrfcal_lib.calibrate import colouring
-
         for view, cell, nearest in zip(self.views, self.cells, self.nearest, strict=True):
-            colouring.hide(_single(points), view.pose, view.lens, view.model.width, view.model.height, cell, nearest)
+            self.loops.hide(_single(points), view.pose, view.lens, view.model.width, view.model.height, cell, nearest)
 
     def paint(self, points, normals, only=slice(None)):
         """Colours (n, 3), whether any image sees the points (n,), and the number of the one that counts most."""
-        from lrfcal_lib.calibrate import colouring
-
         points, normals, n = _single(points), _single(np.nan_to_num(normals)), len(points)
         sums, best, source = np.zeros((n, 4), np.float32), np.zeros(n, np.float32), np.full(n, -1, np.int32)
         for k in range(len(self.views))[only]:
             v, loops = self.views[k], (sums, best, source, self.views[k].number)
             near = self.cells[k], self.nearest[k], self.noise, self.exposures[k]
-            colouring.paint(points, normals, v.pose, v.lens, np.ascontiguousarray(v.image), *near, *loops)
+            self.loops.paint(points, normals, v.pose, v.lens, np.ascontiguousarray(v.image), *near, *loops)
         seen = sums[:, 3] > 0
         mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-30)
         return np.where(seen[:, None], mean, np.nan), seen, source
@@ -178,9 +174,7 @@ class Painter:
         """
         if len(self.views) < 2 or not len(points):
             return
-        self.exposures[:] = 0.0
-        cameras = [view.camera for view in self.views]
-        names = list(dict.fromkeys(cameras))
+        names, which = np.unique([view.camera for view in self.views], return_inverse=True)
         logs, radii = (np.full((len(self.views), len(points)), np.nan) for _ in range(2))
         for k, view in enumerate(self.views):
             grey = self.paint(points, normals, slice(k, k + 1))[0].mean(axis=1)
@@ -191,9 +185,7 @@ class Painter:
         for _ in range(4):
             use &= use.sum(axis=0) > 1
             k, i = np.nonzero(use)
-            rows = np.zeros((len(k), len(found)))
-            rows[np.arange(len(k)), k] = 1
-            rows[np.arange(len(k)), [len(self.views) + names.index(cameras[j]) for j in k]] = radii[use]
+            rows = np.hstack([np.eye(len(self.views))[k], radii[use][:, None] * np.eye(len(names))[which[k]]])
             both, count = np.column_stack([rows, logs[use]]), np.maximum(use.sum(axis=0), 1)
             means = np.stack([np.bincount(i, column, len(points)) for column in both.T], axis=1) / count[:, None]
             both -= means[i]  # the brightness of the surface itself is nobody's concern
@@ -202,7 +194,7 @@ class Painter:
             miss = both[:, -1] - both[:, :-1] @ found
             use[use] = np.abs(miss) < 3 * max(1.4826 * np.median(np.abs(miss)), 1e-3) if len(miss) else True
         self.exposures[:, 0] = found[: len(self.views)] - found[: len(self.views)].mean()
-        self.exposures[:, 1] = [min(found[len(self.views) + names.index(camera)], 0.0) for camera in cameras]
+        self.exposures[:, 1] = np.minimum(found[len(self.views) :], 0.0)[which]
 
 
 def _single(points):
@@ -232,13 +224,12 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     Cloud
         Blocks of whole scan lines. Mixed pixels are left out, and hide what is behind the nearer of their surfaces.
     """
-    lines = sweep.ranges.shape[0]
-    if lines < 1 or not np.isfinite(sweep.ranges).any():
-        raise ValueError(f"placement {sweep.placement}: an empty sweep ({lines} scan lines, no range in them)")
+    if not np.isfinite(sweep.ranges).any():
+        raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range in them)")
     turns = np.abs(np.diff(sweep.pitch))
-    step = max(lrf.bearing_step, float(np.median(turns[turns > 0])) if turns.any() else 0.0)
-    painter = Painter(views, step, 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
-    blocks = _Blocks(sweep, T_head_lrf, correct, lrf, continuous)
+    steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
+    painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
+    blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
     for points, normals, hiding, good, _ in blocks:
         painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
@@ -262,8 +253,8 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
 class _Blocks:
     """Points, normals, what hides others, which are no mixed pixels, and the scan lines, block by block."""
 
-    def __init__(self, sweep, T_head_lrf, correct, lrf, continuous):
-        self.sweep, self.T_head_lrf, self.correct, self.lrf = sweep, T_head_lrf, correct, lrf
+    def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
+        self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
         self.rate = np.gradient(sweep.pitch, sweep.time_s) if continuous and len(sweep.pitch) > 1 else None
 
     def __iter__(self):
@@ -278,7 +269,7 @@ class _Blocks:
             points = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
             nearer = np.zeros(ranges.shape)
             if self.lrf.spot_divergence is not None:
-                nearer = mixed(ranges, self._steps(slice(low, high)), self.lrf)
+                nearer = mixed(ranges, self.steps, self.lrf)
             good, toward = np.isfinite(ranges) & (nearer == 0), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
             hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
             origin = geometry.lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
@@ -293,11 +284,6 @@ class _Blocks:
         turns = max(1, round(np.radians(1.0) / self.lrf.bearing_step))  # of the mirror, for lines finer than a degree
         after = bearings / (2 * np.pi) * MIRROR_TURN + np.arange(len(bearings)) % turns * MIRROR_TURN
         return pitch + self.rate[rows, None] * (after - after[len(after) // 2])
-
-    def _steps(self, rows):
-        """Radians between scan lines and between beams."""
-        turns = np.abs(np.gradient(self.sweep.pitch[rows])) if len(self.sweep.pitch[rows]) > 1 else np.zeros(1)
-        return float(np.median(turns)), self.lrf.bearing_step
 
 
 def mixed(ranges, steps, lrf):
@@ -327,8 +313,6 @@ def mixed(ranges, steps, lrf):
     place, size, tol = np.indices(r.shape), np.array(r.shape)[:, None, None], SIGMAS * lrf.sigma_range
     votes, nearer = np.zeros(r.shape, int), np.full(r.shape, np.inf)
     for a, b in DIRECTIONS:
-        if (a and not steps[0] > 0) or (b and not steps[1] > 0):
-            continue
         way, misses, behind = np.stack([a * far[0], b * far[1]]), [], []
         for side in (1, -1):
             there = [place + side * k * way for k in (1, 2)]
@@ -379,25 +363,24 @@ def grid_normals(points, origins):
     return np.where(away, -normals, normals)
 
 
-PLY = {
-    "x": "points", "y": "points", "z": "points", "nx": "normals", "ny": "normals", "nz": "normals", "red": "colors",
-    "green": "colors", "blue": "colors", "seen": "seen", "placement": "placement", "image": "image", "pitch": "pitch",
-    "bearing": "bearing", "range": "range", "intensity": "intensity", "sigma": "sigma",
+COLUMNS = {  # of a PLY file, of attributes that are no single float by the attribute's own name
+    "points": ("<f4", "x y z"), "normals": ("<f4", "nx ny nz"), "colors": ("u1", "red green blue"),
+    "seen": ("u1", "seen"), "placement": ("<i4", "placement"), "image": ("<i4", "image"),
 }  # fmt: skip
-KINDS = {"colors": ("u1", "uchar"), "seen": ("u1", "uchar"), "placement": ("<i4", "int"), "image": ("<i4", "int")}
-FLOAT = ("<f4", "float")
+COLUMNS |= {name: ("<f4", name) for name in ("pitch", "bearing", "range", "intensity", "sigma")}
+KINDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 
 
 def write_ply(path, clouds, comments=()):
     """Write a cloud, or blocks of one as they come, as binary PLY with all attributes; frame and units are comments.
 
-    Returns the number of points; OSError if the file cannot be written, ValueError if there is no block.
+    Returns the number of points; OSError if the file cannot be written.
     """
     clouds, path, count = [clouds] if isinstance(clouds, Cloud) else clouds, Path(path), 0
     path.parent.mkdir(parents=True, exist_ok=True)
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in (FRAME, UNITS, *comments))]
-    body = [f"property {KINDS.get(field, FLOAT)[1]} {name}" for name, field in PLY.items()]
-    kind = np.dtype([(name, KINDS.get(field, FLOAT)[0]) for name, field in PLY.items()])
+    body = [f"property {KINDS[kind]} {name}" for kind, names in COLUMNS.values() for name in names.split()]
+    table = np.dtype([(field, kind, (len(names.split()),)) for field, (kind, names) in COLUMNS.items()])
 
     def header(number):
         """The same length for every number of points."""
@@ -406,11 +389,9 @@ def write_ply(path, clouds, comments=()):
     with open(path, "wb") as file:
         file.write(header(0))
         for cloud in clouds:
-            rows, columns = np.empty(len(cloud.points), kind), {"x": 0, "y": 1, "z": 2, "red": 0, "green": 1, "blue": 2}
-            columns |= {"nx": 0, "ny": 1, "nz": 2}
-            for name, field in PLY.items():
-                values = getattr(cloud, field)
-                rows[name] = values[:, columns[name]] if values.ndim == 2 else values
+            rows = np.empty(len(cloud.points), table)
+            for field in COLUMNS:
+                rows[field] = getattr(cloud, field).reshape(len(rows), -1)
             rows.tofile(file)
             count += len(rows)
         file.seek(0)

@@ -1,4 +1,4 @@
-"""Calibrations and clouds on disk: ``calibration.json``, PLY, PCD, surface meshes."""
+"""Calibrations and clouds on disk: ``calibration.json``, PLY, PCD."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, color_cloud
+from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import edge_misses_px, handed_over, joint_fit, plane_residuals_of, rms
@@ -116,47 +116,25 @@ def write_clouds(folder, calibration, method):
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
     """
     session, folder, files = calibration.prepared.session, Path(folder), []
-    said = [f"session {session.name}, method {method}, lrfcal {__version__}"]
     for name, scene in (("cloud", False), ("scene", True)):
         if session.scene_placements if scene else calibration.prepared.scans:
             blocks = cloud_blocks(calibration, method, scene)
             if method == "joint":
                 blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
             files.append(folder / f"{name}.ply")
-            write_ply(files[-1], blocks, said)
+            write_ply(files[-1], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
     if session.scene_placements:
         files.append(folder / "scene.pcd")
-        write_pcd(files[-1], color_cloud(calibration, method, scene=True))
+        write_pcd(files[-1], files[-2])
     return files
 
 
-def write_pcd(path, cloud):
-    """Write points, normals, colours and intensities as PCD. Raises OSError if the file cannot be written."""
+def write_pcd(path, ply):
+    """Write what a PLY of :func:`write_ply` holds as PCD. Raises OSError if the file cannot be written."""
     import open3d as o3d
 
-    geometry = o3d.t.geometry.PointCloud(o3d.core.Tensor(cloud.points.astype(np.float32)))
-    geometry.point.normals = o3d.core.Tensor(cloud.normals.astype(np.float32))
-    geometry.point.colors = o3d.core.Tensor(np.ascontiguousarray(cloud.colors))
-    geometry.point.intensity = o3d.core.Tensor(cloud.intensity.astype(np.float32)[:, None])
-    if not o3d.t.io.write_point_cloud(str(path), geometry):
+    if not o3d.t.io.write_point_cloud(str(path), o3d.t.io.read_point_cloud(str(ply))):
         raise OSError(f"{path}: the cloud could not be written; is the disk full?")
-
-
-def write_mesh(path, cloud, octree=9):
-    """Write a closed coloured surface through a cloud (Poisson reconstruction, cut where points are sparse) as PLY.
-
-    `octree` levels decide how fine it is. Raises OSError if the file cannot be written.
-    """
-    import open3d as o3d
-
-    use, geometry = np.isfinite(cloud.normals).all(axis=1), o3d.geometry.PointCloud()
-    for name, values in (("points", cloud.points), ("normals", cloud.normals), ("colors", cloud.colors / 255)):
-        setattr(geometry, name, o3d.utility.Vector3dVector(values[use]))
-    mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(geometry, depth=octree, n_threads=1)
-    density = np.asarray(density)
-    mesh.remove_vertices_by_mask(density < np.quantile(density, 0.1))
-    if not o3d.io.write_triangle_mesh(str(path), mesh):
-        raise OSError(f"{path}: the mesh could not be written; is the disk full?")
 
 
 def calibrate_session(path, out=None):
