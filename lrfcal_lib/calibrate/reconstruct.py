@@ -60,8 +60,7 @@ class Cloud:
 
     def __repr__(self):
         share = 100 * self.seen.mean() if len(self.seen) else 0.0
-        places = len(np.unique(self.placement))
-        return f"Cloud({len(self.points)} points of {places} placements, {share:.1f} % coloured)"
+        return f"Cloud({len(self.points)} points of {len(set(self.placement))} placements, {share:.1f} % coloured)"
 
     def rows(self, index):
         """Some of the points."""
@@ -189,9 +188,9 @@ class Painter:
             both, count = np.column_stack([rows, logs[use]]), np.maximum(use.sum(axis=0), 1)
             means = np.stack([np.bincount(i, column, len(points)) for column in both.T], axis=1) / count[:, None]
             both -= means[i]  # the brightness of the surface itself is nobody's concern
-            prior = 1e-3 * np.eye(len(found))  # settles what no point compares
-            found = np.linalg.solve(both[:, :-1].T @ both[:, :-1] + prior, both[:, :-1].T @ both[:, -1])
-            miss = both[:, -1] - both[:, :-1] @ found
+            J, y = both[:, :-1], both[:, -1]
+            found = np.linalg.solve(J.T @ J + 1e-3 * np.eye(len(found)), J.T @ y)  # zero for what no point compares
+            miss = y - J @ found
             use[use] = np.abs(miss) < 3 * max(1.4826 * np.median(np.abs(miss)), 1e-3) if len(miss) else True
         self.exposures[:, 0] = found[: len(self.views)] - found[: len(self.views)].mean()
         self.exposures[:, 1] = np.minimum(found[len(self.views) :], 0.0)[which]
@@ -225,7 +224,7 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
         Blocks of whole scan lines. Mixed pixels are left out, and hide what is behind the nearer of their surfaces.
     """
     if not np.isfinite(sweep.ranges).any():
-        raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range in them)")
+        raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range)")
     turns = np.abs(np.diff(sweep.pitch))
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
     painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
