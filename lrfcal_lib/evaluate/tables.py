@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -33,7 +33,7 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 ALL = 10**9  # crossings
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
-    r"offset_.*|size_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
+    r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
 }  # fmt: skip
 NOISE_WORDS = {
@@ -562,32 +562,6 @@ def edge_misses_px(joint, camera):
     odds = obs.crossing_background + solution.state.sides[rows]
     shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
     return edge_residuals_px(obs, pose) - shift * obs.model.fx / pose.apply(obs.crossing_points)[:, 2]
-
-
-def size_error(joint):
-    """How much larger the board is in the cloud than stated, ranges as recorded, and the standard deviation of that.
-
-    An offset of all ranges would stretch the cloud until it fits a board whose size is stated wrong, so it is left out;
-    the offset that the maker admits is a part of the expected error, beside the scatter over placements and the edge
-    bias. The error is the mean relative one of the lengths whose ends beams decide; NaN with fewer than three
-    placements, or where nobody knows the outline.
-    """
-    prepared, model = joint.prepared, joint.edge_model()
-    model = replace(model, sensor=model.sensor | {"range_offset": 0.0})
-    if prepared.board.corners is None:
-        return np.nan, np.nan
-    true, edges, found = prepared.board.lengths(), prepared.board.edges, []
-    for placement in joint.solution.boards:
-        with suppress(DegenerateGeometry):
-            measured, across = likely_outline_of(prepared, placement, model)
-            own = [v / true[k] - 1 for k, v in measured.lengths.items() if ends_of(edges, k, across) == "scan"]
-            found += [np.mean(own)] if own else []
-    if len(found) < 3:
-        return np.nan, np.nan
-    slope = edge_shift(model.sensor["edge_log_odds"], np.median(joint.observations.beam_radius))[1]
-    bias = 2 * slope * model.sigma.get("edge_log_odds", 0.0) / np.mean(list(true.values()))
-    offset = prepared.session.lrf.admitted_offset / np.median(joint.observations.face_range)
-    return float(np.mean(found)), float(np.linalg.norm([np.std(found, ddof=1) / np.sqrt(len(found)), offset, bias]))
 
 
 def random_halves(joint, pairs=8):

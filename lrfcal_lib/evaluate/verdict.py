@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from lrfcal_lib.evaluate.alternatives import doubtful, far_from_stated, places_of_cameras
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
-from lrfcal_lib.evaluate.tables import handed_over, placements_table, size_error
+from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
@@ -27,6 +28,8 @@ MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the nois
 STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a word, and not that noise at all
 DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
+LARGE = {"squares": 0.02, "ranges": 0.02}  # errors of sizes that no estimate survives
+LARGE_SCALE = 0.01  # of the pitch
 LOST = 0.1  # share of the placements that may be left out without a warning
 SIZES = (
     "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
@@ -47,7 +50,8 @@ class Reason:
     ----------
     answer : {'with care', 'no'}
     kind : str
-        A key: 'handed over', 'left out', 'range offset', 'size', 'dependent', 'convergence', 'unobservable', 'cameras',
+        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', of
+        :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
         'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error', 'noise',
         'warning', 'error'.
     words : str
@@ -200,7 +204,8 @@ def judge(calibration, method=None, **options):
     if reasons:  # with the words of those that the estimate excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
-    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", words)
+    places = [] if joint is None else places_of_cameras(joint.solution)
+    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
     return replace(_answered(found, sizes + reasons), notes=notes)
 
 
@@ -242,11 +247,12 @@ def _without_joint(calibration, method, doubt):
 def contradicts_stated(joint):
     """Reasons to doubt what is stated of sizes, and by how much all ranges are off if they are wrong (metres).
 
-    The reasons are a range offset that no maker admits, and edges of another length in the cloud.
+    The reasons are a range offset that no maker admits, and what :mod:`lrfcal_lib.evaluate.alternatives` finds.
     """
     solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
-    margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
+    sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
+    margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
@@ -254,16 +260,23 @@ def contradicts_stated(joint):
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = abs(offset)
-    error, sigma = size_error(joint)
-    if abs(error) > CONTRADICTS * sigma:
-        length = 1000 * error * np.mean(list(joint.prepared.board.lengths().values()))
+    asked = doubtful(joint.solution, admitted)
+    if asked:
+        best = asked[0]
+        large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
+        words = f"statements contradict the data: {'; or '.join(doubt.words for doubt in asked)}"
+        reasons.append(Reason(NO if large else CARE, best.kind, words))
+        off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
+        doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
+    scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
+    if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (
-            f"the board's edges are {abs(length):.0f} mm ({100 * abs(error):.1f} %) "
-            f"{'longer' if error > 0 else 'shorter'} in the cloud than stated, {abs(error) / sigma:.0f} times the "
-            f"expected error: {SIZES}"
+            f"the platform turns {100 * abs(scale):.1f} +- {100 * spread:.1f} % {'more' if scale > 0 else 'less'} than "
+            "its recorded pitch says: check its gear or encoder (the estimate has taken this off)"
         )
-        reasons.append(Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words))
-        doubt = max(doubt, abs(error) * float(np.median(joint.solution.observations.face_range)))
+        reasons.append(Reason(CARE, "pitch scale", words))
+    for words, angle in far_from_stated(joint):
+        reasons.append(Reason(NO if angle > np.pi / 2 else CARE, "far from stated", words))
     return reasons, doubt
 
 
