@@ -11,10 +11,10 @@ from lrfcal_lib.calibrate.outline import as_recorded, cells_of, named_sides, out
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_source, tilt
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
-from lrfcal_lib.preprocess import survey
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
@@ -292,20 +292,6 @@ def _angle_to_line(points, line):
     angle = float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
     length = np.ptp(points @ direction)
     return angle, float(np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / length))
-
-
-def all_views(prepared):
-    """The board in all images of a session, by camera, with the intrinsics and outline that are known by now.
-
-    Images of no placement are left out. Where every placement has one image these are the prepared views.
-    """
-    session = prepared.session
-    records = [r for r in session.images(purpose="board") if r.placement >= 0 and r.camera in prepared.views]
-    known = sum(len(found) for found in prepared.views.values())
-    if len(records) <= known or prepared.board.pattern is None:
-        return {camera: list(found.values()) for camera, found in prepared.views.items()}
-    options = {"picks": session.picks, "settled": prepared.views}  # sides of scans bear the names of that turn
-    return survey.survey(records, session.read_image, prepared.board, prepared.models, **options).views
 
 
 def observe_joint(prepared, views=None):
