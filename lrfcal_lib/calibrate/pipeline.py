@@ -407,8 +407,14 @@ def cloud_blocks(calibration, method="line", scene=False):
         "continuous": str(session.reference.get("recording", "")).startswith("continuous"),
     }  # fmt: skip
     for placement, mask in masks.items():
-        views = views_of(calibration, method, placement)
-        yield from reconstruct.reconstruct(session.sweep(placement), views, **settings, mask=mask)
+        sweep, views = session.sweep(placement), views_of(calibration, method, placement)
+        if mask is not None:  # the board and what is around it
+            lines, beams = (slice(max(0, at.min() - 20), at.max() + 21) for at in np.nonzero(mask))
+            part = {"pitch": sweep.pitch[lines], "time_s": sweep.time_s[lines], "bearings": sweep.bearings[beams]}
+            echoes = None if sweep.intensities is None else sweep.intensities[lines, beams]
+            sweep = replace(sweep, ranges=sweep.ranges[lines, beams], intensities=echoes, **part)
+            mask = mask[lines, beams]
+        yield from reconstruct.reconstruct(sweep, views, **settings, mask=mask)
 
 
 def views_of(calibration, method, placement):

@@ -229,6 +229,7 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
     painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
     blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
+    blocks = list(blocks) if sweep.ranges.size <= 4 * BLOCK else blocks  # they are gone through twice
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
     for points, normals, hiding, good, _ in blocks:
         painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
@@ -281,8 +282,11 @@ class _Blocks:
         if self.rate is None:
             return np.broadcast_to(pitch, (len(pitch), len(bearings))).copy()
         turns = max(1, round(np.radians(1.0) / self.lrf.bearing_step))  # of the mirror, for lines finer than a degree
-        after = bearings / (2 * np.pi) * MIRROR_TURN + np.arange(len(bearings)) % turns * MIRROR_TURN
-        return pitch + self.rate[rows, None] * (after - after[len(after) // 2])
+        first, last = self.lrf.field_of_view
+        beams = np.rint((np.r_[bearings, last] - first) / self.lrf.bearing_step)
+        beams[-1] //= 2  # the middle one
+        after = (beams * self.lrf.bearing_step / (2 * np.pi) + beams % turns) * MIRROR_TURN
+        return pitch + self.rate[rows, None] * (after[:-1] - after[-1])
 
 
 def mixed(ranges, steps, lrf):
