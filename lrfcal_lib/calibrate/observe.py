@@ -106,7 +106,7 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
 
 def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
-    keys = [(camera, variant) for camera in prepared.views for variant in VARIANTS]
+    keys = [(camera, variant) for camera in prepared.views for variant in (*VARIANTS, ONE_SCAN)]
     return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
 
 

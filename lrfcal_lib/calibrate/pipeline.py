@@ -39,7 +39,7 @@ class PlatformCalibration:
         the one to use: the stated platform, corrected by what the data know better. Rotation about the axis and shift
         along it, which no data can show, are the stated ones.
     solutions : dict of str to PlatformSolution
-        ``projected_last_beam`` (the paper), ``line_3d``.
+        ``projected_printed`` (the paper), ``projected_last_beam`` (the same in the chart used here), ``line_3d``.
     problems : dict of str to str
         Why a method has no result.
     stated_sigma : tuple of float
@@ -248,6 +248,7 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     stated = None if T0 is None else (T0, stated_covariance(sigma))
     solutions, problems = {}, {}
     methods = {
+        "projected_printed": lambda: solve_projected(platform_observations(prepared, "last_beam"), T0, printed=True),
         "projected_last_beam": lambda: solve_projected(platform_observations(prepared, "last_beam"), T0),
         "line_3d": lambda: solve_platform(platform_observations(prepared), T0, sigma_pitch=sigma_pitch),
     }

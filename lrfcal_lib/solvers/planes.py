@@ -365,7 +365,7 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
     numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
     state, fixed, earlier = (pose_array(solution.transform), obs.model.parameters, poses[:, :3]), np.zeros(9 - lens), []
-    for _ in range(1):
+    for _ in range(2):
         sets = replace(sets, boards=state[2][sets.rows])
         triangles, offset, rest = correct_and_compress(sets, state[0])
         whitener = board_whitener(state[0], triangles, sets.boards, common)
