@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -34,6 +35,12 @@ def asks_for_session(path):
     return any("notebook.start(" in cell.source for cell in code_cells(read(path)))
 
 
+def solutions(path):
+    """Code of the exercises' solutions, folded away in the text of a notebook."""
+    texts = [cell.source for cell in read(path).cells if cell.cell_type == "markdown"]
+    return [code for text in texts for code in re.findall(r"<details>.*?```python\n(.*?)```", text, re.S)]
+
+
 def has_outputs(path):
     return any(cell.outputs for cell in code_cells(read(path)))
 
@@ -59,7 +66,10 @@ def run_nbval(path, session=None, report=None):
 
 
 def run_plainly(path, session, folder, report=None):
-    """Run the cells of a notebook on a session in this process, without a kernel; what it printed."""
+    """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
+
+    After them the solutions of its exercises.
+    """
     told, names = io.StringIO(), {"display": lambda shown: None}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         patch.setenv("LRFCAL_SESSION", str(session))
@@ -69,6 +79,8 @@ def run_plainly(path, session, folder, report=None):
             patch.setenv("LRFCAL_NOTEBOOK", path.stem)
         for number, cell in enumerate(code_cells(read(path))):
             exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
+        for number, code in enumerate(solutions(path), start=1):
+            exec(compile(code, f"{path.stem}, solution {number}", "exec"), names)
     return told.getvalue()
 
 

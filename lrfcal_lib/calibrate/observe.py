@@ -129,7 +129,8 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
     middle = np.mean(prepared.scans[placement].sweep.pitch)
     sides = list(named_sides(prepared, placement, variant))
     if one_scan:
-        sides = [part for part in sides if part[0] in prepared.board.features and not part[3]]
+        features = [name for name in prepared.board.features if view.edge(name) is not None]
+        sides = [part for part in sides if part[0] in features and not part[3]]
         lines = [found.line[found.side == side] for _, found, side, _ in sides]
         both = np.intersect1d(*lines) if len(lines) == 2 else np.zeros(0, int)
     for name, found, side, across in sides:
