@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate import next_placement
-from lrfcal_lib.evaluate.jointly import range_residuals, view_residuals
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
+from lrfcal_lib.evaluate.tables import range_residuals, view_residuals
 from lrfcal_lib.evaluate.uncertainty import beams_to, information
 from lrfcal_lib.evaluate.verdict import diagnose, verdict
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
@@ -257,9 +257,9 @@ def test_large_errors_forbid_trust(good):
 
 def test_residuals_are_what_the_noise_makes(good):
     rig, _, solution = good
-    distance, residual = range_residuals(solution)[:2]
+    distance, residual = range_residuals(solution)
     assert np.std(residual) == pytest.approx(rig.sigma_range, rel=0.05) and len(distance) == len(residual)
-    uv, shift = view_residuals(solution, "left", rig.model)[:2]
+    uv, shift = view_residuals(solution, "left", rig.model)
     assert len(uv) == 24 and (uv > 0).all() and (uv < [rig.model.width, rig.model.height]).all()
     assert 0.02 < np.sqrt(np.mean(shift**2)) < 0.5  # a board's middle is better known than a corner's 0.3 px
     with pytest.raises(ValueError, match="got 'rear'"):

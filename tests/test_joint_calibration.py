@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate import pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
-from lrfcal_lib.evaluate import jointly, tables
+from lrfcal_lib.evaluate import tables
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.session.read import open_session
@@ -73,7 +73,7 @@ def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
 
 
 def test_errors_agree_with_their_sigma(joint, truth):
-    table = jointly.joint_errors(joint, truth)
+    table = tables.joint_errors(joint, truth)
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
     assert (table.translation_error_mm < 3.5 * table.translation_sigma_mm).all()
     assert table.translation_error_mm.max() < 25
@@ -118,7 +118,7 @@ def test_it_is_handed_over_with_its_platform_and_sensor(found):
     assert record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
-    assert min(edges) <= jointly.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
+    assert min(edges) <= tables.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
     assert "sensor" not in calibration_record(found, "line")
 
 

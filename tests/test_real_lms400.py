@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from lrfcal_lib.calibrate import pipeline
-from lrfcal_lib.evaluate import jointly
+from lrfcal_lib.evaluate import tables
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
 from lrfcal_lib.session.stated import transform_from_json
@@ -91,7 +91,7 @@ def test_axis_and_cameras_are_close_to_the_authors(lms400):
 def test_the_joint_estimate_asks_for_errors_of_every_sweep(lms400):
     assert lms400.joint.settings["sweep"] == "offset_stretch"
     assert lms400.joint.solution.converged and not lms400.joint.solution.unobservable
-    fit = jointly.joint_fit(lms400.joint)
+    fit = tables.joint_fit(lms400.joint)
     assert fit["plane_rms_mm"] < 6.5 and fit["edge_rms_px"] < 2.0
 
 

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -16,20 +17,18 @@ from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.head import HeadSettings
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
-from lrfcal_lib.drivers.rig_file import Plan, RigFileError, checked, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import find_source
 from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
 
 # ------------------------------------------------------------------------------------------------------ rig file
 
 
-def changed(path, value):
+def changed(path, value, **plan):
     """A rig file with one key changed (or removed, where the value is None)."""
-    data = rig_data()
+    data = rig_data(**plan)
     *way, last = path.split(".")
-    at = data
-    for key in way:
-        at = at[key]
+    at = reduce(dict.__getitem__, way, data)
     at[last] = value
     if value is None:
         del at[last]
@@ -44,10 +43,10 @@ def read(tmp_path, data):
 
 def test_a_rig_file_is_read(tmp_path):
     rig = read(tmp_path, rig_data(cameras=("left", "right"), mode="continuous"))
-    assert rig.lrf_device["port"] == "/dev/fake_lrf" and rig.head_device == "/dev/fake_head"
-    assert list(rig.cameras) == list(rig.camera_devices) == ["left", "right"]
+    assert rig.devices.lrf.port == "/dev/fake_lrf" and rig.devices.head.port == "/dev/fake_head"
+    assert list(rig.cameras) == list(rig.devices.cameras) == ["left", "right"]
     assert rig.plan.mode == "continuous" and rig.with_mode("stop-and-go").plan.mode == "stop-and-go"
-    assert rig.with_mode(None) is rig and rig.control is None
+    assert rig.with_mode(None) is rig and rig.devices.control is None
 
 
 WRONG = {
@@ -139,15 +138,15 @@ def test_any_value_anywhere_is_taken_or_refused_in_words(tmp_path, way):
             if way[0] in ("devices", "plan"):
                 assert way[0] in str(error) or "head." in str(error), (value, error)
             continue
-        waits = [v for name, v in vars(stated.head_settings).items() if name.endswith("_s") and v is not None]
-        waits += [one.get("silence_s", 0) for one in stated.camera_devices.values()]
-        assert max(waits) <= 3600
-        for device in (stated.lrf_device["port"], stated.head_device):
+        head, cameras = stated.devices.head, stated.devices.cameras.values()
+        waits = [v for one in (head, *cameras) for name, v in vars(one).items() if name.endswith("_s")]
+        assert max(v or 0 for v in waits) <= 3600
+        for device in (stated.devices.lrf, head):
             with pytest.raises(PortError):
-                open_port(f"/nowhere{device}", stated.head_settings.baudrate, timeout=0.1)
-        bytes(7) * stated.head_settings.sends, range(stated.head_settings.retries)
-        for one in stated.camera_devices.values():
-            find_source(one["source"], one.get("silence_s", 1.0))
+                open_port(f"/nowhere{device.port}", head.baudrate, timeout=0.1)
+        bytes(7) * head.sends, range(head.retries)
+        for one in cameras:
+            find_source(one.source, one.silence_s or 1.0)
 
 
 @pytest.mark.parametrize("text", [b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b""])
@@ -244,8 +243,7 @@ def test_what_is_recorded_at_a_stop_is_later_than_its_rest():
 @pytest.mark.parametrize("interlaced", [False, True])
 def test_what_is_older_than_the_rest_is_refused(interlaced, monkeypatch):
     monkeypatch.setattr(rig_module, "SCAN_S", 0.05)
-    rig = make_rig()
-    rig.stated.lrf_device["interlaced"] = interlaced
+    rig = make_rig(changed("devices.lrf.interlaced", interlaced))
     newest = rig.cameras["left"].newest
     rig.cameras["left"].newest = lambda **options: replace(newest(), time_s=rig.clock() - 1)
     with pytest.raises(DeviceError, match="image of camera 'left' is .* older than the stop"):
@@ -282,8 +280,7 @@ def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
 
 
 def test_interlaced_scans_are_streamed():
-    rig = make_rig(rig_data(scans_per_stop=2))
-    rig.stated.lrf_device["interlaced"] = True
+    rig = make_rig(changed("devices.lrf.interlaced", True, scans_per_stop=2))
     assert [len(e.readings) for e in events_of(rig) if isinstance(e, Scanned)] == [2] * 9
     assert not rig.lrf.streaming
 
@@ -434,7 +431,7 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
 
 
 def stated_rig(**plan):
-    return checked(rig_of(json.loads(json.dumps(rig_data(**plan)))))
+    return rig_of(json.loads(json.dumps(rig_data(**plan))))
 
 
 def fake_drivers(monkeypatch, size=SIZE, **instead):
@@ -493,7 +490,7 @@ def test_what_the_device_says_about_itself_counts():
     for mode, unit, longest in ((0, "cm", 81.82), (0, "mm", 8.182), (4, "mm", 16.374), (6, "mm", 32.758)):
         rig.lrf.configuration = Configuration().changed(unit=unit, measuring_mode=mode)
         assert rig.lrf_info.max_range == pytest.approx(longest)
-    rig.stated.lrf_device["interlaced"] = True
+    rig = make_rig(changed("devices.lrf.interlaced", True))
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
 
 
@@ -519,7 +516,7 @@ def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
-    object.__setattr__(rig.stated, "control", path)
+    rig = make_rig(changed("devices.control", path))
     assert rig.move_board(3) is True and heard == [{"command": "place", "arguments": [3]}]
     with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
         rig.move_board(9)

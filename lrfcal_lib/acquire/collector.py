@@ -12,9 +12,9 @@ import numpy as np
 
 from lrfcal_lib.acquire.record import Recording, RecordingError
 from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, prepare
-from lrfcal_lib.drivers.port import DeviceError, LineLost
+from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
-from lrfcal_lib.drivers.rig_file import RigFileError, checked, read_rig_file, rig_of
+from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
 from lrfcal_lib.evaluate.tables import handed_over
 from lrfcal_lib.evaluate.verdict import YES, judge, sight_of, verdict
@@ -136,7 +136,7 @@ class View:
     trouble: str = ""  # what cannot be seen, and why
 
 
-class Collector:
+class Collector(Closed):
     """Connects a rig, records placements with it and calibrates what was recorded; a context manager.
 
     All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
@@ -151,9 +151,9 @@ class Collector:
     """
 
     connected = property(lambda self: self.rig is not None, doc="Whether a rig is open.")
-    emulated = property(lambda self: self.connected and self.rig.stated.control is not None,
+    emulated = property(lambda self: self.connected and self.rig.stated.devices.control is not None,
                         doc="Whether the board moves by itself.")  # fmt: skip
-    limits_deg = property(lambda self: self._needed().stated.head_settings.pitch_limits_deg,
+    limits_deg = property(lambda self: self._needed().stated.devices.head.pitch_limits_deg,
                           doc="Lowest and highest pitch of the head.")  # fmt: skip
     finished = property(lambda self: () if self.recording is None else self.recording.finished,
                         doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
@@ -162,12 +162,6 @@ class Collector:
         self.rig, self.recording = None, None
         self.view, self.lights, self._told = View(), {}, ""
         self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def connect(self, rig, session):
         """Open a rig and a session; a session that was recorded with the same rig goes on.
@@ -195,7 +189,7 @@ class Collector:
 
                 made, data, clock = emulated(str(rig))
                 stack.enter_context(made)
-                stated = checked(rig_of(data(), Path(f"emulated {made.setup.name}")))
+                stated = rig_of(data(), Path(f"emulated {made.setup.name}"))
             elif not Path(rig).suffix and not Path(rig).exists():
                 known = ", ".join(PRACTICE_RIGS)
                 raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ import numpy as np
 
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
-from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.recording import COLORS
 from lrfcal_lib.session.stated import escape
@@ -112,84 +112,53 @@ def result_html(found):
             f"</p>{table and f'<table>{table}</table>'}{text}{where}</div>")  # fmt: skip
 
 
-DPI, PICTURE = 100, (400, 300)  # pixels
+PICTURE = (400, 300)  # pixels
 REACHES = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0, 30.0, 50.0, 82.0)  # of the top view, metres
 SHIFT = 4  # binary digits of a pixel's fraction
-GREY, EMPTY = "#8a8a8a", (238, 238, 238)  # of a sweep's picture, where no range is
+LEFT, TOP, RIGHT, BOTTOM = 44, 12, 388, 255  # of a sweep in its picture, pixels
+SECTOR, CIRCLE, GREY, DARK, EMPTY = ((v,) * 3 for v in (246, 217, 138, 51, 238))  # EMPTY where there is no range
 DOT = tuple(int(COLORS["lrf"][i : i + 2], 16) for i in (5, 3, 1))
 
 
-class Canvas:
-    """Axes drawn once by ``draw(ax)``, at a place in the figure: left, bottom, width, height as fractions."""
-
-    def __init__(self, draw, place=(0, 0, 1, 1)):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        canvas = FigureCanvasAgg(Figure(figsize=(PICTURE[0] / DPI, PICTURE[1] / DPI), dpi=DPI, layout="none"))
-        ax = canvas.figure.add_axes(place)
-        draw(ax)
-        canvas.draw()
-        self.background = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 2::-1])
-        self._to_pixels = ax.transData.frozen()
-
-    def pixels(self, points):
-        """Pixels of points in the axes' own units, shape (n, 2); v goes down."""
-        return [0, len(self.background)] + [1, -1] * self._to_pixels.transform(points)
-
-
-@lru_cache(len(REACHES))
-def top_view(field_of_view, reach):
-    """Canvas for scans in their own plane: the laser range finder below, circles every metre or more."""
-    angle = np.linspace(*field_of_view, 91)
-    edge = reach * np.column_stack([np.cos(angle), np.sin(angle)])
-    shape = PICTURE[0] / PICTURE[1]
-    low, high, side = min(0.0, edge[:, 1].min()), edge[:, 1].max(), np.abs(edge[:, 0]).max()
-    middle, half = (low + high) / 2, 1.1 * max((high - low) / 2, side / shape)
-    step = 1.0 if reach <= 6 else 2.0 if reach <= 12 else 5.0 if reach <= 30 else 20.0
-
-    def draw(ax):
-        """The field of view and its circles."""
-        ax.set(xlim=(-half * shape, half * shape), ylim=(middle - half, middle + half), aspect="equal")
-        ax.set_axis_off()
-        ax.fill(*np.vstack([[0, 0], edge]).T, color="#f4f6f8", zorder=0)
-        for radius in np.arange(step, reach + 1e-6, step):
-            ax.plot(*edge.T * radius / reach, color="#d5d9dd", linewidth=0.8, zorder=1)
-            if radius < reach:
-                ax.text(*edge[0] * radius / reach, f" {radius:g} m", color=GREY, fontsize=8, va="top", ha="left")
-        ax.plot(0, 0, marker="^", color="#333333", markersize=9)
-
-    return Canvas(draw)
+def write(image, text, u, v):
+    """Small grey text about a pixel."""
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.36
+    (width, height), _ = cv2.getTextSize(text, font, scale, 1)
+    cv2.putText(image, text, (round(u - width / 2), round(v + height / 2)), font, scale, GREY, 1, cv2.LINE_AA)
 
 
 def scan_picture(ranges, bearings, field_of_view):
-    """A scan (metres, NaN for none, and radians) from above; BGR."""
+    """A scan (metres, NaN for none, and radians) from above, the laser range finder below; BGR."""
     points = polar_to_points(np.asarray(ranges, float), bearings)[:, :2]
     points = points[np.isfinite(points).all(axis=1)]
     far = np.percentile(np.linalg.norm(points, axis=1), 90) if len(points) else 0.0
-    canvas = top_view(tuple(field_of_view), next((reach for reach in REACHES if reach >= far), REACHES[-1]))
-    image = canvas.background.copy()
-    for pixel in np.rint(canvas.pixels(points) * 2**SHIFT).astype(int).tolist():
+    reach = next((reach for reach in REACHES if reach >= far), REACHES[-1])
+    angle = np.linspace(*field_of_view, 91)
+    edge = reach * np.column_stack([np.cos(angle), np.sin(angle)])
+    low, high = min(0.0, edge[:, 1].min()), edge[:, 1].max()
+    scale = min(PICTURE[1] / (high - low), PICTURE[0] / 2 / np.abs(edge[:, 0]).max()) / 1.1  # pixels a metre
+    origin = np.array(PICTURE) / 2 - 0.5 + [0, scale * (low + high) / 2]
+
+    def pixels(points):
+        return np.rint((origin + [scale, -scale] * np.asarray(points)) * 2**SHIFT).astype(int)
+
+    image = np.full((PICTURE[1], PICTURE[0], 3), 255, np.uint8)
+    cv2.fillPoly(image, [pixels([(0, 0), *edge])], SECTOR, cv2.LINE_AA, SHIFT)
+    step = 1.0 if reach <= 6 else 2.0 if reach <= 12 else 5.0 if reach <= 30 else 20.0
+    for radius in np.arange(step, reach + 1e-6, step):
+        cv2.polylines(image, [pixels(edge * radius / reach)], False, CIRCLE, 1, cv2.LINE_AA, SHIFT)
+        if radius < reach:
+            write(image, f"{radius:g} m", *(pixels(edge[0] * radius / reach) / 2**SHIFT + [14, 8]))
+    cv2.fillPoly(image, [pixels(np.array([(-6, -5), (6, -5), (0, 7)]) / scale)], DARK, cv2.LINE_AA, SHIFT)
+    for pixel in pixels(points).tolist():
         cv2.circle(image, pixel, 2 << SHIFT, DOT, -1, cv2.LINE_AA, SHIFT)
     return image
 
 
-@lru_cache(4)
-def sweep_canvas(field_of_view, pitch):
-    """Canvas for a sweep: bearing to the left as in the scene, pitch upwards, first and last in degrees."""
-
-    def draw(ax):
-        ax.set(xlim=np.degrees([max(field_of_view), min(field_of_view)]), ylim=pitch, facecolor="#eeeeee")
-        ax.tick_params(labelsize=7, colors=GREY)
-        ax.set_xlabel("bearing [deg]", fontsize=8, color=GREY)
-        ax.set_ylabel("pitch [deg]", fontsize=8, color=GREY, labelpad=1)
-        ax.spines[:].set_color("#cccccc")
-
-    return Canvas(draw, (0.11, 0.15, 0.86, 0.81))
-
-
 def sweep_picture(rows, bearings, field_of_view, pitch, step):
     """A sweep as it grows: ranges as colours, near is bright, grey where there is none; BGR.
+
+    Bearing grows to the left as in the scene, pitch upwards.
 
     Parameters
     ----------
@@ -201,9 +170,16 @@ def sweep_picture(rows, bearings, field_of_view, pitch, step):
     step : float
         Between scan lines, radians; of a continuous sweep the most between two.
     """
-    half = np.degrees(step) / 2
-    canvas = sweep_canvas(tuple(field_of_view), (np.degrees(min(pitch)) - half, np.degrees(max(pitch)) + half))
-    image = canvas.background.copy()
+    half, width, height = np.degrees(step) / 2, RIGHT - LEFT, BOTTOM - TOP
+    across = np.degrees([max(field_of_view), min(field_of_view)])
+    down = np.degrees(max(pitch)) + half, np.degrees(min(pitch)) - half
+    image = np.full((PICTURE[1], PICTURE[0], 3), 255, np.uint8)
+    image[TOP:BOTTOM, LEFT:RIGHT] = EMPTY
+    for share in (0, 0.5, 1):
+        write(image, f"{np.interp(share, (0, 1), across):.0f}", LEFT + share * width, BOTTOM + 12)
+        write(image, f"{np.interp(share, (0, 1), down):.0f}", LEFT - 18, TOP + share * height)
+    write(image, "bearing [deg]", LEFT + width / 2, BOTTOM + 30)
+    write(image, "pitch [deg]", 32, BOTTOM + 30)
     if not rows:
         return image
     ranges = np.array(list(rows.values()))
@@ -212,13 +188,11 @@ def sweep_picture(rows, bearings, field_of_view, pitch, step):
     scaled = (np.nan_to_num(ranges, nan=high) - low) / max(high - low, 0.1)
     shades = cv2.applyColorMap((255 * (1 - np.clip(scaled, 0, 1))).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     shades = np.where(known[..., None], shades.reshape(*ranges.shape, 3), np.uint8(EMPTY))
-    first, last = np.degrees([bearings[-1], bearings[0]])
-    for line, row in zip(np.degrees(list(rows)), shades, strict=True):
-        corners = np.rint(canvas.pixels([(first, line + half), (last, line - half)])).astype(int)
-        (left, top), (right, bottom) = corners + [[0, 0], [0, 1]]
-        if right > left and bottom > top:
-            size = (right - left, 1)
-            image[top:bottom, left:right] = cv2.resize(row[None, ::-1], size, interpolation=cv2.INTER_NEAREST)
+    u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    beam = np.rint(np.interp(np.interp(u, (0, 1), across), np.degrees(bearings), np.arange(len(bearings)))).astype(int)
+    away = np.abs(np.interp(v, (0, 1), down)[:, None] - np.degrees(list(rows)))
+    seen = away.min(axis=1) <= half + np.ptp(down) / height
+    image[TOP:BOTTOM, LEFT:RIGHT][seen] = shades[away.argmin(axis=1)[seen]][:, beam]
     return image
 
 
@@ -346,7 +320,7 @@ class Notes(logging.Handler):
         self.part.value = notes(self.lines)
 
 
-class Panel:
+class Panel(Closed):
     """Records a session with a rig, by buttons or by methods; a context manager that closes the rig.
 
     Methods raise what goes wrong, and the panel says it in words; buttons only say it.
@@ -372,12 +346,6 @@ class Panel:
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
         self._refresh()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def show(self):
         """Display the panel."""

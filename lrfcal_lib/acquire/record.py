@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from lrfcal_lib.acquire.checks import check_image, check_placement
-from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.session.read import open_session
@@ -32,7 +32,7 @@ class RecordingError(RuntimeError):
     """A recording that cannot go on; the message says what is safe and what to do."""
 
 
-class Recording:
+class Recording(Closed):
     """Writes what a rig records to a session; a context manager.
 
     Parameters
@@ -82,12 +82,6 @@ class Recording:
             stack.callback(writer.close)
             writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
             self.writer, _ = writer, stack.pop_all()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
 
     def close(self):
         """Record nothing any more: the session is free for others, who may go on with it."""

@@ -108,17 +108,11 @@ def plane_frame(points):
 
 def corners_and_lengths(lines, edges):
     """Corners where two neighbouring sides were found, and lengths between them, by edge."""
-    corners = {
-        name: corners_of_lines(np.stack([lines[before], lines[name]]))[1]
-        for before, name in zip(edges[-1:] + edges[:-1], edges, strict=True)
-        if before in lines and name in lines
-    }
-    lengths = {
-        name: float(np.linalg.norm(corners[after] - corners[name]))
-        for name, after in zip(edges, edges[1:] + edges[:1], strict=True)
-        if name in corners and after in corners
-    }
-    return corners, lengths
+    pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
+    both = {after: np.stack([lines[k], lines[after]]) for k, after in pairs if k in lines and after in lines}
+    corners = {name: corners_of_lines(sides)[1] for name, sides in both.items()}
+    known = [(name, after) for name, after in pairs if name in corners and after in corners]
+    return corners, {name: float(np.linalg.norm(corners[after] - corners[name])) for name, after in known}
 
 
 def measure_board(face, sides, edges):
@@ -128,19 +122,16 @@ def measure_board(face, sides, edges):
     board.
     """
     pose = plane_frame(face)
-    lines = {}
-    for name, points in sides.items():
-        centre, direction = _flat_line((points - pose[:3, 3]) @ pose[:3, :2])
-        normal = np.array([direction[1], -direction[0]])
-        lines[name] = np.r_[normal, -normal @ centre]
+    lines = {name: _flat_line((points - pose[:3, 3]) @ pose[:3, :2])[0] for name, points in sides.items()}
     scatter = {name: fit_line(points)[2] for name, points in sides.items()}
     return MeasuredBoard(pose, lines, *corners_and_lengths(lines, edges), scatter)
 
 
 def _flat_line(points):
-    """Middle and direction of the line through points of a plane, shape (2,) each."""
-    centre, direction, _ = fit_line(np.column_stack([points, np.zeros(len(points))]))
-    return centre[:2], direction[:2]
+    """The line ``a x + b y + c = 0`` (3,) through points (n, 2) of a plane, and their middle."""
+    middle, direction, _ = fit_line(np.column_stack([points, np.zeros(len(points))]))
+    normal = np.array([direction[1], -direction[0]])
+    return np.r_[normal, -normal @ middle[:2]], middle[:2]
 
 
 def named_sides(prepared, placement, variant="half_step", stretch=0.0):
@@ -204,9 +195,9 @@ def likely_outline_of(prepared, placement, model):
 
     Returns and raises what :func:`outline_of` does; also raises DegenerateGeometry when no side has enough beams.
     """
-    sides = list(named_sides(prepared, placement, stretch=LEAST_STRETCH))
-    points, pitch, _ = face_points(prepared.scans[placement])
-    face = points, model.correct(placement, points, pitch)[1], prepared.scans[placement].sigma_range
+    sides, scan = list(named_sides(prepared, placement, stretch=LEAST_STRETCH)), prepared.scans[placement]
+    points, pitch, _ = face_points(scan)
+    face = points, model.correct(placement, points, pitch)[1], scan.sigma_range
     cells = cells_of(prepared, placement)
     on_board = polar_to_points(cells.range_m, cells.bearing)
     cells = replace(cells, pitch=model.correct(placement, on_board, cells.pitch)[1])
@@ -236,15 +227,15 @@ def measure_outline(cells, face, names, edges, model):
     covariance[::2, ::2] += model.log_odds_sigma**2 * np.outer(slope, slope) + np.diag((model.spread * slope) ** 2)
 
     def measured(lines):
-        by_name = dict(zip(found.values(), lines, strict=True))
-        return by_name, *corners_and_lengths(by_name, edges)
+        """Sides by name, corners and lengths."""
+        sides = dict(zip(found.values(), lines, strict=True))
+        return sides, *corners_and_lengths(sides, edges)
 
-    by_name, corners, lengths = measured(lines)
-    size, steps = np.array(list(lengths.values())), 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    moved = [list(measured(moved_lines(lines, middle, step))[2].values()) for step in steps]
-    J = (np.array(moved) - size) / 1e-6  # (2 s, lengths)
+    outline = measured(lines)
+    size, steps = np.array(list(outline[2].values())), 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
+    J = np.array([(list(measured(moved_lines(lines, middle, step))[2].values()) - size) / 1e-6 for step in steps])
     variance = np.sum(J * (covariance @ J), axis=0) + _by_face(pose, face, size, model)
-    return MeasuredBoard(pose, by_name, corners, lengths, sigma=dict(zip(lengths, np.sqrt(variance), strict=True)))
+    return MeasuredBoard(pose, *outline, sigma=dict(zip(outline[2], np.sqrt(variance), strict=True)))
 
 
 def face_surface(face, model):
@@ -286,15 +277,13 @@ def rays_about(cells, sides, pose, bend, model):
 
 def start_lines(rays):
     """A line through the cells of each side (s, 3), and their middle (s, 2): as many lie on either side of the edge."""
-    lines, middles = [], []
+    found = []
     for at, hit, used in zip(rays["at"], rays["hit"], rays["used"], strict=True):
-        middle, direction = _flat_line(at[used])
-        normal = np.array([direction[1], -direction[0]])
+        line, middle = _flat_line(at[used])
         if hit[used].any() and not hit[used].all():
-            normal *= np.sign(normal @ (at[used & ~hit].mean(axis=0) - at[used & hit].mean(axis=0)))
-        lines.append(np.r_[normal, -normal @ middle])
-        middles.append(middle)
-    return np.array(lines), np.array(middles)
+            line = line * np.sign(line[:2] @ (at[used & ~hit].mean(axis=0) - at[used & hit].mean(axis=0)))
+        found.append((line, middle))
+    return tuple(map(np.array, zip(*found, strict=True)))
 
 
 def side_block(rays, lines, middle, model):

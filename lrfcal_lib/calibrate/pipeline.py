@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
 from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded, platform_of
-from lrfcal_lib.fit.residuals import chart_parameters, edge_residuals_px, plane_residuals_m
+from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
@@ -115,15 +117,11 @@ class JointCalibration:
         solution = self.without.get(placement, self.solution)
         sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
         return EdgeModel(
-            log_odds=solution.sensor["edge_log_odds"],
-            log_odds_sigma=sigma.get("edge_log_odds", 0.0),
+            solution.sensor["edge_log_odds"], sigma.get("edge_log_odds", 0.0),
             spread=solution.noise["side_sigma"] if self.settings["sides"] else 0.0,
-            softness=float(np.exp(solution.sensor["edge_log_softness"])),
-            range_offset=solution.sensor["range_offset"],
-            range_offset_sigma=sigma.get("range_offset", 0.0),
-            T_head_lrf=solution.T_head_lrf,
-            correct=solution.correct,
-        )
+            softness=float(np.exp(solution.sensor["edge_log_softness"])), range_offset=solution.sensor["range_offset"],
+            range_offset_sigma=sigma.get("range_offset", 0.0), T_head_lrf=solution.T_head_lrf, correct=solution.correct,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -211,10 +209,8 @@ def find_pitch_errors(prepared):
     direction = {placement: session.sweep_direction(placement) for placement in scans}
     middle = {placement: float(np.mean(scan.sweep.pitch)) for placement, scan in scans.items()}
     sweeps = SweepPoints(points, pitch, number, platform_of(prepared), direction, middle)
-    try:
+    with suppress(DegenerateGeometry):
         return estimate_pitch_errors(sweeps, {c: observe(prepared, c) for c in fixed})
-    except DegenerateGeometry:
-        return None
 
 
 def pitch_noise(errors):
@@ -248,13 +244,13 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     stated = None if T0 is None else (T0, stated_covariance(sigma))
     solutions, problems = {}, {}
     methods = {
-        "projected_printed": lambda: solve_projected(platform_observations(prepared, "last_beam"), T0, printed=True),
-        "projected_last_beam": lambda: solve_projected(platform_observations(prepared, "last_beam"), T0),
-        "line_3d": lambda: solve_platform(platform_observations(prepared), T0, sigma_pitch=sigma_pitch),
+        "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
+        "projected_last_beam": ("last_beam", solve_projected),
+        "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
     }
-    for name, solve in methods.items():
+    for name, (variant, solve) in methods.items():
         try:
-            solutions[name] = solve()
+            solutions[name] = solve(platform_observations(prepared, variant), T0)
         except DegenerateGeometry as error:
             problems[name] = str(error)
     axes = {name: (found.T_head_lrf, found.solution.trusted) for name, found in solutions.items()}
@@ -371,22 +367,10 @@ def leave_out(joint, groups=8):
     numbers, found = np.array(list(joint.solution.boards)), {}
     for group in range(min(groups, len(numbers))):
         out = numbers[group::groups]
-        try:
+        with suppress(DegenerateGeometry):
             solution = solve_again(joint.observations.select(np.setdiff1d(numbers, out)), joint.solution)
-        except DegenerateGeometry:
-            continue
-        found |= {int(placement): solution for placement in out}
+            found |= dict.fromkeys(out.tolist(), solution)
     return replace(joint, without=found)
-
-
-def left_out_residuals(joint, camera):
-    """Residuals of every placement under the estimate from all the others: crossings (pixels), face points (metres)."""
-    edges, planes = [np.zeros(0)], [np.zeros(0)]
-    for placement, solution in joint.without.items():
-        held = joint.seen_by(camera, solution).along().select([placement])
-        edges.append(edge_residuals_px(held, solution.transforms[camera]))
-        planes.append(plane_residuals_m(held, solution.transforms[camera]))
-    return np.concatenate(edges), np.concatenate(planes)
 
 
 def stereo_reference(prepared):
@@ -431,24 +415,21 @@ def color_cloud(calibration, method="line", every=1, scene=False):
         masks = {p: np.isfinite(session.sweep(p).ranges) for p in session.scene_placements}
     if not masks:
         raise ValueError(f"{session.name}: no sweep of {'a scene' if scene else 'the board'} to colour")
-    return reconstruct.join([_color_sweep(calibration, method, p, mask, every) for p, mask in masks.items()])
-
-
-def _color_sweep(calibration, method, placement, mask, every):
-    session, axis = calibration.prepared.session, calibration.platform.axis_with(method)
+    clouds, axis, poses = [], calibration.platform.axis_with(method), calibration.solutions
     T_head_lrf = calibration.platform.transform(axis)
     correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
-    sweep = session.sweep(placement)
-    line, beam = (index[::every] for index in np.nonzero(mask))
-    points = geometry.polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam])
-    p_lrf, pitch = correct(placement, points, sweep.pitch[line])
-    layers = [np.full(p_lrf.shape, np.nan)]
-    for record in session.images(placement=placement):
-        mount = session.cameras[record.camera].mount
-        if (record.camera, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
-            at = 0.0 if mount == "platform" else float(correct(placement, np.zeros(3), record.pitch)[1])
-            points = geometry.lrf_to_source(p_lrf, pitch, T_head_lrf, mount, at)
-            pose, model = calibration.solutions[record.camera, method].transform, calibration.prepared.models
-            layers.append(reconstruct.color_points(points, session.read_image(record), pose, model[record.camera])[0])
-    placed = geometry.lrf_to_platform(p_lrf, pitch, T_head_lrf)
-    return reconstruct.Cloud(placed, *reconstruct.blend(layers), np.full(len(pitch), placement))
+    for placement, mask in masks.items():
+        sweep, (line, beam) = session.sweep(placement), (index[::every] for index in np.nonzero(mask))
+        points = geometry.polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam])
+        p_lrf, pitch = correct(placement, points, sweep.pitch[line])
+        layers = [np.full(p_lrf.shape, np.nan)]
+        for record in session.images(placement=placement):
+            camera, mount = record.camera, session.cameras[record.camera].mount
+            if (camera, method) in poses and (mount == "platform" or np.isfinite(record.pitch)):
+                at = 0.0 if mount == "platform" else float(correct(placement, np.zeros(3), record.pitch)[1])
+                points = geometry.lrf_to_source(p_lrf, pitch, T_head_lrf, mount, at)
+                seen = session.read_image(record), poses[camera, method].transform, calibration.prepared.models[camera]
+                layers.append(reconstruct.color_points(points, *seen)[0])
+        placed = geometry.lrf_to_platform(p_lrf, pitch, T_head_lrf), *reconstruct.blend(layers)
+        clouds.append(reconstruct.Cloud(*placed, np.full(len(pitch), placement)))
+    return reconstruct.join(clouds)

@@ -1,6 +1,5 @@
 """The pitch axis of a Pelco-D head: settings, moves, sweeps and readings, with whatever the head answers."""
 
-import contextlib
 import itertools
 import logging
 import math
@@ -11,7 +10,7 @@ from pydantic import BeforeValidator, StrictBool
 
 from lrfcal_lib.drivers import pelco_d, port
 from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.pelco_d import FASTEST, HeadLine
+from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, SET_TILT, UP, HeadLine, encode_extended, encode_frame
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
 from lrfcal_lib.drivers.stated import Angle, Stated, number, several, whole
 from lrfcal_lib.session.stated import refused
@@ -45,11 +44,11 @@ class HeadSettings(Stated):
     invert: StrictBool = False  # it hangs upside down or counts the other way: its "up" lowers the view
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
     # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed heads, until it was
-    # calibrated or learnt, and the log says so.
+    # learnt, and the log says so.
     degrees_per_second: Annotated[
         several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
     ] = None
-    # From the motion frame to the movement, less what it runs on after the stop; calibrated together with the speed.
+    # From the motion frame to the movement, less what it runs on after the stop.
     start_delay_s: number(-10, 10, "s") = 0.0
     start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
     tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
@@ -83,6 +82,9 @@ SHORT_OF = 0.9  # part of the way that a burst is meant to make, so that the las
 LEAST_S = 1e-4  # of a wait worth its while
 MISSES = 3  # queries without a reply, after which a head that is swept is not asked any more
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
+STOPPED = "the head was stopped before it arrived"
+INTERRUPTED = ("the head's line was lost, and the head stopped when it came back: move or sweep again; where it tells "
+               "nothing look where it stands, and call set_pitch")  # fmt: skip
 
 
 class Stopped(DeviceError):
@@ -107,14 +109,15 @@ class Motion:
     def __init__(self, line, settings, log, clock):
         self.line, self.settings, self._log, self._clock, self._now = line, settings, log, clock, line.host.now
         self.abort, self.feedback, self.rows, self._misses = line.host.event(), False, [], 0
-        self.calibrated, self._delay = settings.degrees_per_second is not None, settings.start_delay_s
-        up, down = settings.degrees_per_second or ASSUMED
-        self._speeds = {settings.tilt_speed: {1: math.radians(up), -1: math.radians(down)}}
+        self.calibrated = settings.degrees_per_second is not None
+        up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
+        self._speeds = {settings.tilt_speed: {1: up, -1: down}}
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
         self._obeys = False if settings.absolute is False else None  # set-tilt; None until it was tried
         self._dead, self._going, self._frame, self._repeated = set(), None, b"", 0.0
         self._pitch, self._seen = None, 0.0
         self._tolerance, self._arrival = math.radians(settings.tolerance_deg), math.radians(settings.arrival_deg)
+        self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
     # ------------------------------------------------------------------------------------------- what is known
 
@@ -139,7 +142,7 @@ class Motion:
         if self._going is None:
             return self._pitch
         way, step, begun = self._going
-        seconds = (self._now() if instant is None else instant) - max(self._seen, begun + self._delay)
+        seconds = (self._now() if instant is None else instant) - max(self._seen, begun + self.settings.start_delay_s)
         return self._pitch + way * self.speed(way, step) * max(0.0, seconds)
 
     def read(self, retries=0):
@@ -150,20 +153,20 @@ class Motion:
         told = self.line.pitch(retries)
         if told is None:
             return None
+        if self._pitch is not None and abs(told[1] - self.estimate(told[0])) > SURPRISE:
+            told = [told, self.line.pitch(retries), self.line.pitch(retries)]
+            if None in told:
+                return None
+            told = sorted(told, key=lambda one: one[1])[1]
         reckoned = told[1] if self._pitch is None else self.estimate(told[0])
-        if abs(told[1] - reckoned) > SURPRISE:
-            more = [one for one in (told, self.line.pitch(0), self.line.pitch(0)) if one]
-            near = sorted(more, key=lambda one: one[1] if len(more) == 3 else abs(one[1] - self.estimate()))
-            told = near[1 if len(more) == 3 else 0]
-            reckoned = self.estimate(told[0])
         self.know(told[1], told[0])
         return *told, reckoned
 
     def note(self, brief=False):
         """Append where the head is now to the rows."""
-        asked = self.feedback and not (brief and self._misses >= MISSES)
-        reading = self.read(0 if brief else self.settings.retries) if asked else None
-        if asked:
+        reading = None
+        if self.feedback and not (brief and self._misses >= MISSES):
+            reading = self.read(0 if brief else self.settings.retries)
             self._misses = 0 if reading else self._misses + 1
         now = self._now()
         instant, pitch, reckoned = reading or (now, self.estimate(now), self.estimate(now))
@@ -175,7 +178,7 @@ class Motion:
         """Send what moves the head, but never after the last stop; its instant."""
         with self.line.lock:
             if self.abort.is_set():
-                raise Stopped("the head was stopped before it arrived")
+                raise Stopped(STOPPED)
             return self.line.command(frame)
 
     def stop(self):
@@ -190,14 +193,12 @@ class Motion:
         """Wait, repeating the motion for heads that want it; raises Stopped if it was ended meanwhile."""
         end, every = self._now() + seconds, self.settings.repeat_s
         while True:
-            now = self._now()
-            repeat = every is not None and self._going is not None
-            if repeat and now >= self._repeated + every:
+            due = math.inf if every is None or self._going is None else self._repeated + every
+            if self._now() >= due:
                 self._repeated = self._send(self._frame)
-                continue
-            if self.abort.wait(max(0.0, min(end, self._repeated + every if repeat else end) - now)):
-                raise Stopped("the head was stopped before it arrived")
-            if self._now() >= end:
+            elif self.abort.wait(max(0.0, min(end, due) - self._now())):
+                raise Stopped(STOPPED)
+            elif self._now() >= end:
                 return
 
     def run(self, goal, step, longest_s=math.inf, look=None):
@@ -205,10 +206,9 @@ class Motion:
 
         ``look()`` is called again and again; by default the head is asked where it is if there is time for that.
         """
-        way = 1 if goal > self.estimate() else -1
-        self._frame = pelco_d.encode_motion(self.settings.address, -way if self.settings.invert else way, step)
-        begun = self._repeated = self._send(self._frame)
-        self._going = (way, step, begun)
+        way, reconnects = 1 if goal > self.estimate() else -1, self.line.counts["reconnects"]
+        bit = UP if (way > 0) != self.settings.invert else DOWN
+        self._frame = encode_frame(self.settings.address, command2=bit, data2=step)
 
         def left():
             """Seconds; after a reading the stop has to be on its way in time."""
@@ -217,14 +217,22 @@ class Motion:
             return min(there, begun + longest_s - self._now())
 
         try:
-            while left() > LEAST_S:
-                if look is not None:
-                    look()
-                elif self.feedback and left() > self.line.round_trip_s:
-                    self.read()
-                self.pause(min(left(), self.settings.poll_s))
-        finally:
-            ended = self.stop()
+            begun = self._repeated = self._send(self._frame)
+            self._going = (way, step, begun)
+            try:
+                while left() > LEAST_S and self.line.counts["reconnects"] == reconnects:
+                    if look is not None:
+                        look()
+                    elif self.feedback and left() > self._shortest_s + self.settings.reply_s + pelco_d.READ_S:
+                        self.read()
+                    self.pause(min(left(), self.settings.poll_s))
+            finally:
+                ended = self.stop()
+            if self.line.counts["reconnects"] != reconnects:
+                raise LineLost(INTERRUPTED)
+        except LineLost:
+            self._pitch = self._pitch if self.feedback else None
+            raise
         return ended - begun
 
     def settle(self, deadline, target=None):
@@ -262,15 +270,14 @@ class Motion:
         Raises Refused if it obeys, but does not get there.
         """
         value = pelco_d.encode_tilt(self.settings.elevation(target))
-        frame = pelco_d.encode_extended(self.settings.address, pelco_d.SET_TILT, value)
         for _ in range(2 if self._obeys is not False else 0):  # the first may be lost, or come while it was still busy
-            self._send(frame)
+            self._send(encode_extended(self.settings.address, SET_TILT, value))
             pitch = self.settle(deadline, target)
             if abs(pitch - target) <= self._arrival:
                 self._obeys = True
                 return pitch
         if self._obeys:
-            raise Refused(_short_of(pitch, target))
+            raise self._short_of(pitch, target)
         if self._obeys is None:
             self._obeys = False
             if self.settings.absolute is True:
@@ -278,17 +285,21 @@ class Motion:
             self._log.warning("the head does not obey set-tilt (4D): it is moved by up and down")
         return self.steer(target, deadline)
 
+    @staticmethod
+    def _short_of(pitch, target):
+        return Refused(f"the head stays at {math.degrees(pitch):.2f} deg on its way to {math.degrees(target):.2f}: "
+                       "look for an end stop, or narrow pitch_limits_deg")  # fmt: skip
+
     def steer(self, target, deadline):
         """Reach a pitch by up and down, each time as long as the way that is left takes.
 
         Raises Refused if the head does not move, moves the other way, or gets no nearer.
         """
         pitch, full = self.settle(deadline), self.settings.tilt_speed
-        shortest_s = 2 * self.line.wire_s() + self.settings.gap_s
         for _ in range(BURSTS):
             error = target - pitch
-            steps = [step for step in sorted({full, full // 4, full // 16}, reverse=True) if step not in self._dead]
-            ways = {step: shortest_s * self.speed(error, step) for step in steps}  # of the shortest bursts
+            steps = sorted({full, full // 4, full // 16} - self._dead, reverse=True)
+            ways = {step: self._shortest_s * self.speed(error, step) for step in steps}  # of the shortest bursts
             if abs(error) <= max(self._arrival, ways[steps[-1]]):
                 return pitch
             step = next((step for step in steps if abs(error) >= 2 * ways[step]), steps[-1])
@@ -307,26 +318,21 @@ class Motion:
                                   "suffices")  # fmt: skip
                 continue
             self._longest = max(self._longest, took)
-        raise Refused(_short_of(pitch, target))
+        raise self._short_of(pitch, target)
 
     def timed(self, target, deadline):
         """Move by time; the pitch that results is dead reckoning.
 
         Raises LineLost if the port vanished: the pitch is unknown then; Refused if there is not enough time.
         """
-        start, step, reconnects = self.estimate(), self.settings.tilt_speed, self.line.counts["reconnects"]
+        start, step = self.estimate(), self.settings.tilt_speed
         seconds = abs(target - start) / self.speed(target - start, step)
-        if seconds < (2 * self.line.wire_s() + self.settings.gap_s) / 2:
+        if seconds < self._shortest_s / 2:
             return start  # the shortest motion would lead further away
-        if self._now() + seconds + self._delay > deadline:
-            raise Refused(f"the move takes {seconds + self._delay:.1f} s: give it a longer timeout")
-        try:
-            self.run(target, step)
-            if self.line.counts["reconnects"] != reconnects:
-                raise LineLost("the line was lost in a timed move: look where the head stands, and call set_pitch")
-        except LineLost:
-            self.know(None)
-            raise
+        needed_s = seconds + self.settings.start_delay_s
+        if self._now() + needed_s > deadline:
+            raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
+        self.run(target, step)
         self.pause(self.settings.settle_s)
         return self.estimate()
 
@@ -334,78 +340,30 @@ class Motion:
         """Move to a pitch at a speed byte and note where the head is on the way, and where it rests."""
         self._misses = 0
         self.note()
-        first, reconnects = self.estimate(), self.line.counts["reconnects"]
+        first = self.estimate()
         way = math.copysign(1, goal - first)
         deadline = self._now() + 3 * abs(goal - first) / self.speed(way, step) + 10
 
         def look():
             """Note where the head is; what goes wrong in a sweep ends it."""
             self.note(brief=True)
-            if self.line.counts["reconnects"] != reconnects:
-                raise LineLost("the line was lost in the sweep, and the head stopped when it came back: sweep again")
             if self._now() > deadline:
-                raise Refused("the sweep does not get to its end: look for an end stop, or calibrate the speed")
+                raise Refused("the sweep does not get to its end: look for an end stop, or state degrees_per_second")
             if (self.rows[-1][1] - first) * way < -math.radians(2):
                 raise Refused(OTHER_WAY)
             if self.feedback and self._misses >= MISSES and not self.calibrated:
-                raise NoReply("the head is silent while it moves and its speed is unknown: call calibrate_speed first")
+                raise NoReply("the head is silent while it moves and its speed is unknown: state degrees_per_second")
             told = [row for row in self.rows[1:] if row[2]]
             if told and abs(told[-1][1] - told[0][1]) >= 10 * self._tolerance:
                 self.learn(way, step, abs(told[-1][1] - told[0][1]) / (told[-1][0] - told[0][0]))
 
         try:
-            try:
-                self.run(goal, step, look=look)
-            finally:
+            self.run(goal, step, look=look)
+        finally:
+            if self._pitch is not None:
                 self.note()
-            self.settle(self._now() + 5) if self.feedback else self.pause(0)
-            self.note()
-        except LineLost:
-            if not self.feedback:
-                self.know(None)
-            raise
-
-    # ----------------------------------------------------------------------------------------------- calibration
-
-    def calibrate(self, reading, travel):
-        """Speeds up and down, deg/s, and the delay, s, from a long and a short move each way.
-
-        ``reading()`` gives the pitch of the resting head, None asks the head; `travel` is the length of the long moves
-        if the limits allow it. Raises Refused if the head does not move, or the other way.
-        """
-        pitch, step = self._at_rest(reading), self.settings.tilt_speed
-        above, below = (abs(math.radians(limit) - pitch) for limit in self.settings.pitch_limits_deg[::-1])
-        first, travel = 1 if above > below else -1, min(travel, 0.4 * max(above, below))
-        seconds, moved = FIRST_BURST_S, 0.0
-        while (moved := self._test_move(first, seconds, reading)[1]) < travel / 5:
-            seconds *= 2
-            if seconds > (4 if abs(moved) > self._tolerance else 1):
-                raise Refused("the head does not move the way it was told: look for an end stop, its power, invert")
-        long, delays = seconds * travel / moved, []
-        for way in (-first, first):
-            (t_long, far), (t_short, near) = (self._test_move(way, t, reading) for t in (long, long / 3))
-            self.learn(way, step, max(far - near, self._tolerance) / (t_long - t_short))
-            delays.append(t_long - far / self.speed(way, step))
-        self._delay, self._longest = sum(delays) / 2, math.inf
-        return math.degrees(self.speed(1, step)), math.degrees(self.speed(-1, step)), self._delay
-
-    def _test_move(self, way, seconds, reading):
-        """Seconds and rad of a move by time, between two rests."""
-        before = self._at_rest(reading)
-        took = self.run(way * math.inf, self.settings.tilt_speed, seconds)
-        return took, (self._at_rest(reading) - before) * way
-
-    def _at_rest(self, reading):
-        if reading is None:
-            return self.settle(self._now() + 10)
-        self.pause(self.settings.settle_s)
-        self.know(float(reading()))
-        return self.estimate()
-
-
-def _short_of(pitch, target):
-    return (f"the head stays at {math.degrees(pitch):.2f} deg on its way to {math.degrees(target):.2f}: "
-            "look for an end stop, or narrow pitch_limits_deg")  # fmt: skip
+        self.settle(self._now() + 5) if self.feedback else self.pause(0)
+        self.note()
 
 
 def drawn_to_readings(rows):
@@ -484,7 +442,7 @@ class PanTilt(port.Closed):
         self.has_feedback = self.motion.feedback = reading is not None
         if not self.has_feedback:
             self.motion.know(start)
-            how = "stated" if self.motion.calibrated else "assumed, calibrate it"
+            how = "stated" if self.motion.calibrated else "assumed, state degrees_per_second"
             self._log.warning("the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
                               "its pitch is not measured", *(settings.degrees_per_second or ASSUMED),
                               how, settings.start_pitch_deg)  # fmt: skip
@@ -559,7 +517,7 @@ class PanTilt(port.Closed):
         if self._thread is not None:
             self._thread.join()
 
-    def _begin(self, pitch=0.0):
+    def _begin(self, pitch):
         """Begin a motion to a pitch, one at a time."""
         self._need_open()
         low, high = self.settings.pitch_limits_deg
@@ -569,17 +527,6 @@ class PanTilt(port.Closed):
         if not self._lock.acquire(blocking=False):
             raise DeviceError("the head is moving already: stop it, or wait for it")
         self.motion.abort.clear()
-
-    @contextlib.contextmanager
-    def _stopped_on_error(self):
-        """Whatever goes wrong with a motion that has begun, the head is stopped."""
-        try:
-            yield
-        except BaseException:
-            self.emergency_stop()
-            raise
-        finally:
-            self._lock.release()
 
     def move_to(self, pitch, timeout=None):
         """Move and wait until the head rests.
@@ -605,21 +552,26 @@ class PanTilt(port.Closed):
             If it was stopped meanwhile.
         """
         self._begin(pitch)
-        with self._stopped_on_error():
-            if self.has_feedback and self.motion.read(self.settings.retries) is None:
+        motion, now = self.motion, self._line.host.now
+        try:
+            if self.has_feedback and motion.read(self.settings.retries) is None:
                 raise NoReply(self._silence())
-            start = self.motion.estimate()
-            seconds = abs(pitch - start) / self.motion.speed(pitch - start, self.settings.tilt_speed)
-            deadline = self._line.host.now() + (2 * seconds + 10 if timeout is None else timeout)
-            if not self.has_feedback:
-                return self.motion.timed(pitch, deadline)
-            while True:
+            way = pitch - motion.estimate()
+            seconds = abs(way) / motion.speed(way, self.settings.tilt_speed)
+            deadline = now() + (2 * seconds + 10 if timeout is None else timeout)
+            while self.has_feedback:
                 try:
-                    return self.motion.move(pitch, deadline)
+                    return motion.move(pitch, deadline)
                 except LineLost:
-                    if self._line.host.now() >= deadline:
+                    if now() >= deadline:
                         raise
-                    self._line.reopen()
+                    self._line.opened()
+            return motion.timed(pitch, deadline)
+        except BaseException:
+            self.emergency_stop()
+            raise
+        finally:
+            self._lock.release()
 
     def start_sweep(self, stop_at, speed=None):
         """Start a thread that moves the head to a pitch, rad, notes where it is, and stops it there.
@@ -660,11 +612,7 @@ class PanTilt(port.Closed):
         """
         if self._thread is None:
             raise DeviceError("there was no sweep: start one")
-        try:
-            self._thread.join(timeout)
-        except BaseException:
-            self.emergency_stop()
-            raise
+        self._thread.join(timeout)
         if self._thread.is_alive():
             self.stop()
             raise NoReply(f"the sweep was not over after {timeout:g} s: the head was stopped")
@@ -680,26 +628,3 @@ class PanTilt(port.Closed):
             Between readings the pitch is dead reckoning, which is drawn to the readings.
         """
         return drawn_to_readings(list(self.motion.rows))
-
-    # -------------------------------------------------------------------------------------------------- calibrate
-
-    def calibrate_speed(self, reading=None, *, travel_deg=10.0):
-        """Measure the speed at ``settings.tilt_speed`` both ways, and the delay, for timed moves and sweeps.
-
-        ``reading()`` gives the pitch of the resting head, rad, measured otherwise (inclinometer, scan of the floor);
-        heads without feedback need it. The longer ones of the test moves are `travel_deg` long. DeviceError if nothing
-        tells the pitch, or the head does not move.
-
-        Returns
-        -------
-        up, down, delay_s : float
-            To be stated as ``degrees_per_second`` (deg/s) and ``start_delay_s``.
-        """
-        if reading is None and not self.has_feedback:
-            remedy = "pass reading, which measures it otherwise, or state degrees_per_second"
-            raise DeviceError(f"the head does not tell its tilt: {remedy}")
-        self._begin()
-        with self._stopped_on_error():
-            speeds = self.motion.calibrate(reading, math.radians(travel_deg))
-        self._log.info("speed of the head: %.2f deg/s up, %.2f down, %.3f s delay", *speeds)
-        return speeds

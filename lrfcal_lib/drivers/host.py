@@ -7,6 +7,7 @@ while they wait, one thread runs at a time, and every run is the same.
 import math
 import threading
 import time
+from functools import partial
 
 from lrfcal_lib.drivers.port import PortError, open_port, set_rate
 
@@ -40,9 +41,9 @@ REAL = Host()
 
 
 class VirtualHost:
-    """A machine whose time passes only while all of its threads wait.
+    """A machine whose time passes only while all of its threads wait; what it has is named as in :class:`Host`.
 
-    The thread that makes it is one of them; further ones come from :meth:`thread`.
+    The thread that makes it is one of them; further ones come from ``thread(target, name)``.
 
     Attributes
     ----------
@@ -54,6 +55,7 @@ class VirtualHost:
 
     def __init__(self):
         self.devices, self.ports, self._now, self._waiting = [], {}, 0.0, []
+        self.event, self.lock, self.thread = partial(_Event, self), partial(_Lock, self), partial(_Thread, self)
 
     def now(self):
         """Seconds since the host was made."""
@@ -73,18 +75,6 @@ class VirtualHost:
             return found
         end = math.inf if seconds is None else self._now + max(seconds, LEAST_S)
         return self._pass_on(_Waiting(holds, end))
-
-    def event(self):
-        """As threading.Event."""
-        return _Event(self)
-
-    def lock(self):
-        """As threading.RLock."""
-        return _Lock(self)
-
-    def thread(self, target, name):
-        """As :meth:`Host.thread`."""
-        return _Thread(self, target, name)
 
     def port(self, path, baudrate, *, timeout):
         """As :func:`port.open_port`."""
@@ -129,18 +119,10 @@ class _Waiting:
         return self.found or now >= self.end
 
 
-class _Event:
+class _Event(threading.Event):
     def __init__(self, host):
-        self._host, self._set = host, False
-
-    def is_set(self):
-        return self._set
-
-    def set(self):
-        self._set = True
-
-    def clear(self):
-        self._set = False
+        super().__init__()
+        self._host = host
 
     def wait(self, timeout=None):
         return self._host.wait(self.is_set, timeout)

@@ -7,15 +7,8 @@ from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx_link import POINTS, RATES, Assembler, Link, ScanClock, ScanReader
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
-from lrfcal_lib.session.lms2xx_codec import (
-    MODES,
-    SCAN,
-    UNITS,
-    TelegramError,
-    parse_configuration,
-    parse_status,
-    parse_type,
-)
+from lrfcal_lib.session import lms2xx_codec as codec
+from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
 
 LOG = logging.getLogger(__name__)
 INSTALLATION, STREAM, INTERLACED = b"\x00", b"\x24", b"\x2a"  # data of MODE
@@ -23,7 +16,6 @@ ALL_VALUES = b"\x01"  # data of VALUES
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
 REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
-CONFIGURED = ("unit", "measuring_mode", "realtime_indices")
 COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
 
 
@@ -42,6 +34,8 @@ class LMS2xx(Closed):
         Of the device; 0 reaches any.
     password : bytes
         Eight characters, of the installation mode; the factory's by default.
+    variant : tuple of float, optional
+        To be set, see :meth:`set_variant`.
     find_s : float
         Longest time to find the rate.
     clock : callable, optional
@@ -72,8 +66,8 @@ class LMS2xx(Closed):
         For a rate or an address that no LMS2xx has, or a password of another length.
     """
 
-    def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", find_s=FIND_S, clock=None, log=LOG,
-                 host=REAL, **configuration):  # fmt: skip
+    def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", variant=None, find_s=FIND_S,
+                 clock=None, log=LOG, host=REAL, **configuration):  # fmt: skip
         if baudrate not in (None, *RATES):
             raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
         if not 0 <= address < 0x80 or len(password) != 8:
@@ -88,6 +82,8 @@ class LMS2xx(Closed):
             if baudrate is not None and baudrate != self.baudrate:
                 self._set_rate(baudrate)
             self.configure(**configuration) if configuration else self._prepare()
+            if variant is not None:
+                self.set_variant(*variant)
         except BaseException:
             self._release()
             raise
@@ -107,10 +103,7 @@ class LMS2xx(Closed):
             self._link.close()
             self._link = None
 
-    @property
-    def baudrate(self):
-        """Of both ends of the line."""
-        return self._opened().baudrate
+    baudrate = property(lambda self: self._opened().baudrate, doc="Of both ends of the line.")
 
     @property
     def counts(self):
@@ -132,7 +125,7 @@ class LMS2xx(Closed):
         self._link.hush()
         self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
-        model, *rest = self._told(wire.TYPE, parse_type)
+        model, *rest = self._told(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
             raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx")
         self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
@@ -160,7 +153,7 @@ class LMS2xx(Closed):
         raw = self._opened().ask(code).raw
         try:
             return parse(raw)
-        except TelegramError as error:
+        except codec.TelegramError as error:
             text = f"{self.port}: the reply to command {code:02X} is not that of an LMS2xx: {error}"
             raise WrongDevice(text) from error
 
@@ -206,14 +199,13 @@ class LMS2xx(Closed):
     # ------------------------------------------------------------------------------------------------- settings
 
     def _read_status(self):
-        self.status = self._told(wire.STATUS, parse_status)
+        self.status = self._told(wire.STATUS, codec.parse_status)
         self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
 
     def _read_configuration(self):
         def parse(raw):
-            found = parse_configuration(raw)
-            _ = found.unit  # a unit that no manual lists is seen here
-            return found
+            found = codec.parse_configuration(raw)
+            return found.unit and found  # a unit that no manual lists is seen here
 
         self.configuration = self._told(wire.CONFIGURATION, parse)
 

@@ -4,19 +4,13 @@ import itertools
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
-from lrfcal_lib.session.lms2xx_codec import (
-    OVERHEAD,
-    TelegramError,
-    decode_scan,
-    encode_telegram,
-    scan_quarters,
-    split_stream,
-)
+from lrfcal_lib.session import lms2xx_codec as codec
 
 ACK, NAK = 0x06, 0x15
 MODE, VALUES, STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURE = 0x20, 0x30, 0x31, 0x32, 0x3A, 0x3B, 0x74, 0x77
@@ -38,17 +32,12 @@ USUAL = (0.6, 2.5)
 WINDOWS_S = (0.25, 0.25, 0.6)  # to listen at a rate, in turn
 
 
-@dataclass(frozen=True)
-class Arrival:
+class Arrival(NamedTuple):
     """A telegram and when its last byte came in, by the clock of the link."""
 
     raw: bytes
     time_s: float
-
-    @property
-    def code(self):
-        """Of the reply."""
-        return self.raw[4]
+    code = property(lambda self: self.raw[4], doc="Of the reply.")
 
 
 def transfer_s(size, baudrate):
@@ -87,10 +76,14 @@ class Link:
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
 
+    baudrate = property(lambda self: self._port.baudrate, doc="Of this end of the line.")
+    silent_s = property(lambda self: self.host.now() - self._last, doc="Seconds since the last byte, or request.")
+    acknowledged = property(lambda self: self._stray == ACK, doc="Whether the last stray byte is ACK.")
+
     @property
-    def baudrate(self):
-        """Of this end of the line."""
-        return self._port.baudrate
+    def declined(self):
+        """Whether the last byte is NAK and nothing followed; amid other bytes 0x15 means nothing."""
+        return self._stray == NAK and not self._rest and self.silent_s > SILENCE_S
 
     def set_rate(self, baudrate):
         """Change this end's rate; raises PortError where the line cannot."""
@@ -106,16 +99,14 @@ class Link:
 
     def send(self, code, data=b""):
         """Send a request; what arrived before it is thrown away."""
-        raw = encode_telegram(code, data, address=self.address)
+        raw = codec.encode_telegram(code, data, address=self.address)
+        step, pause = (1, PACE_S) if self.baudrate == 500000 else (len(raw), 0)
         with line_lost(self.path):
             self._port.reset_input_buffer()
             self._forget()
-            if self.baudrate < 500000:
-                self._port.write(raw)
-                return
-            for at in range(len(raw)):
-                self._port.write(raw[at : at + 1])
-                self.host.sleep(PACE_S)
+            for at in range(0, len(raw), step):
+                self._port.write(raw[at : at + step])
+                self.host.sleep(pause)
 
     def receive(self):
         """The device's telegrams, often none; waits 20 ms at most, longer only while more bytes keep coming.
@@ -128,7 +119,7 @@ class Link:
         if self._kept:
             kept, self._kept = self._kept, []
             return kept
-        whole = int.from_bytes(self._rest[2:4], "little") + OVERHEAD if len(self._rest) >= 4 else 0
+        whole = int.from_bytes(self._rest[2:4], "little") + codec.OVERHEAD if len(self._rest) >= 4 else 0
         with line_lost(self.path):
             data = self._port.read(max(1, whole - len(self._rest)))
             data += self._port.read(self._port.in_waiting)
@@ -137,7 +128,7 @@ class Link:
         now, self._last = self.clock(), self.host.now()
         self.heard += len(data)
         data = self._rest + data
-        stream = split_stream(data)
+        stream = codec.split_stream(data)
         ends = (stream.offset + stream.length).tolist()
         stray = data[ends[-1] if ends else 0 : stream.pending]
         self._stray = stray[-1] if stray else None if ends else self._stray
@@ -148,21 +139,6 @@ class Link:
         spans = zip(stream.offset.tolist(), ends, strict=True)
         found = [Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate) for begin, end in spans]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]
-
-    @property
-    def silent_s(self):
-        """Seconds since the last byte, or since the last request."""
-        return self.host.now() - self._last
-
-    @property
-    def acknowledged(self):
-        """Whether the last stray byte is ACK."""
-        return self._stray == ACK
-
-    @property
-    def declined(self):
-        """Whether the last byte is NAK and nothing followed; amid other bytes 0x15 means nothing."""
-        return self._stray == NAK and not self._rest and self.silent_s > SILENCE_S
 
     # ---------------------------------------------------------------------------------------------- requests
 
@@ -177,9 +153,8 @@ class Link:
         said, self.asked_s = None, self.clock()
         for _ in range(TRIES):
             self.send(code, data)
-            reply, said = self._await({code | 0x80, sign}, again_s, end)
+            reply, said = self._await(code | 0x80, sign, again_s, end)
             if reply is not None:
-                self._kept = [reply, *self._kept] if reply.code == sign else self._kept
                 return reply
             if self.host.now() > end - NAK_PAUSE_S:
                 break
@@ -189,14 +164,14 @@ class Link:
             raise Refused(f"{self.path}: the device refuses command {code:02X}: {said}")
         raise NoReply(f"{self.path}: no reply to command {code:02X} at {self.baudrate} Bd; is the device on?")
 
-    def _await(self, codes, again_s, end):
+    def _await(self, code, sign, again_s, end):
         """The reply, or None and why the device declined (None if it said nothing until it is time to ask again)."""
         begin, acknowledged = self.host.now(), False
         while (now := self.host.now()) < end:
             found = self.receive()
             for at, one in enumerate(found):
-                if one.code in codes:
-                    self._kept = found[at + 1 :]
+                if one.code in (code, sign):
+                    self._kept = found[at + (one.code == code) :]
                     return one, None
                 if one.code == NOT_UNDERSTOOD:
                     return None, "not allowed in its present mode, or unknown (92)"
@@ -370,8 +345,8 @@ class Assembler:
         """
         own = self.configuration
         try:
-            scan = decode_scan(raw, own.measuring_mode)
-        except TelegramError:
+            scan = codec.decode_scan(raw, own.measuring_mode)
+        except codec.TelegramError:
             return None
         count, index, partial = scan.words.shape[1], int(scan.scan_index[0]), int(scan.partial[0])
         wanted = 181 - (partial > 0) if self.interlaced else POINTS[self.variant]
@@ -384,7 +359,7 @@ class Assembler:
             return None
         self.counts["dropped"] += 0 if self._first else max(0, step // self.turns - 1)
         self._first = False
-        quarters = scan_quarters(count, partial)
+        quarters = codec.scan_quarters(count, partial)
         times = start_s + (np.arange(count) % self.turns + quarters / 1440) * TURN_S  # the first turn begins at 0 deg
         ranges = np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan)
         indices = [None if i < 0 else int(i) for i in (index, scan.telegram_index[0])]
@@ -404,11 +379,9 @@ class Assembler:
         if len(self._parts) < 4:
             return None
         parts, self._parts = self._parts, []
-        columns = {}
-        for name in ("ranges", "reasons", "bearings", "beam_times_s"):
-            columns[name] = np.empty(721, getattr(part, name).dtype)
-            for first, one in enumerate(parts):
-                columns[name][first::4] = getattr(one, name)
+        order = np.argsort(np.concatenate([one.bearings for one in parts]))
+        columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
+                   for name in ("ranges", "reasons", "bearings", "beam_times_s")}  # fmt: skip
         return replace(parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns)
 
 

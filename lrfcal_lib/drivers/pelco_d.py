@@ -9,18 +9,13 @@ from lrfcal_lib.drivers.port import LineLost, PortError, line_lost
 
 SYNC = 0xFF
 FRAME, GENERAL, SHORT = 7, 4, 5  # bytes of a frame and of the kinds of reply
-RIGHT, LEFT, UP, DOWN = 0x02, 0x04, 0x08, 0x10  # bits of command 2
+UP, DOWN = 0x08, 0x10  # bits of command 2; without them, and those of the pan, it is a stop
 FASTEST = 0x3F  # speed byte; 0 is very slow, not stop
-SET_PRESET, GO_PRESET = 0x03, 0x07
-PART_NUMBER, SET_PAN, SET_TILT = 0x45, 0x4B, 0x4D
+SET_TILT = 0x4D
 QUERY_PAN, QUERY_TILT, QUERY_ZOOM, QUERY_MAGNIFICATION = 0x51, 0x53, 0x55, 0x61
 PAN, TILT, ZOOM, MAGNIFICATION = 0x59, 0x5B, 0x5D, 0x63  # replies
 ANSWER = {QUERY_PAN: PAN, QUERY_TILT: TILT, QUERY_ZOOM: ZOOM, QUERY_MAGNIFICATION: MAGNIFICATION}
 TURN = 36000  # hundredths of a degree
-
-
-class FrameError(ValueError):
-    """Bytes that are no frame, or a number that no frame can carry."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +28,7 @@ class Frame:
     data1: int = 0
     data2: int = 0
 
-    @property
-    def value(self):
-        """Number of both data bytes."""
-        return self.data1 << 8 | self.data2
+    value = property(lambda self: self.data1 << 8 | self.data2, doc="Number of both data bytes.")
 
 
 @dataclass(frozen=True)
@@ -72,33 +64,16 @@ class Received:
 
 
 def encode_frame(address, command1=0, command2=0, data1=0, data2=0):
-    """The 7 bytes of a frame; FrameError for numbers that are no bytes."""
-    fields = vars(Frame(address, command1, command2, data1, data2))
-    for name, number in fields.items():
-        if not 0 <= number <= 0xFF:
-            raise FrameError(f"{name} must be a byte, 0 to 255, got {number}")
-    body = bytes(fields.values())
+    """The 7 bytes of a frame, all 0 that of a stop; a motion is obeyed until the next one, a stop, or the head's limit.
+
+    ValueError for numbers that are no bytes.
+    """
+    body = bytes([address, command1, command2, data1, data2])
     return bytes([SYNC, *body, sum(body) & 0xFF])
 
 
-def encode_motion(address, way, speed):
-    """Bytes of a motion up (`way` > 0) or down, obeyed until the next one, a stop, or the head's limit."""
-    if not 0 <= speed <= FASTEST:
-        raise FrameError(f"tilt_speed must be 0 to {FASTEST}, got {speed}")
-    return encode_frame(address, command2=UP if way > 0 else DOWN, data2=speed)
-
-
-def encode_stop(address):
-    """Bytes of the frame that stops all motion."""
-    return encode_frame(address)
-
-
 def encode_extended(address, opcode, value=0):
-    """Bytes of an extended command: a preset, a position, a query; FrameError for an even opcode or a large value."""
-    if not opcode & 1:
-        raise FrameError(f"extended commands have odd opcodes, got {opcode:#04x}")
-    if not 0 <= value <= 0xFFFF:
-        raise FrameError(f"the value of an extended command is 0 to 65535, got {value}")
+    """Bytes of an extended command, whose opcode is odd: a preset, a position, a query."""
     return encode_frame(address, 0, opcode, *value.to_bytes(2, "big"))
 
 
@@ -122,19 +97,15 @@ def split_frames(data):
 
 
 def encode_tilt(elevation):
-    """Number of the set-tilt command for radians, up positive; FrameError if they are not finite.
+    """Number of the set-tilt command for finite radians, up positive.
 
     Hundredths of a degree, 0 to 35999: 0 level, 9000 straight down, 33000 30 deg up.
     """
-    if not math.isfinite(elevation):
-        raise FrameError(f"the elevation must be a finite angle, got {elevation}")
     return round(-math.degrees(elevation) * 100) % TURN
 
 
 def decode_tilt(value):
     """Elevation of a head's tilt reply, radians in [-pi, pi): the inverse of :func:`encode_tilt`."""
-    if not 0 <= value < TURN:
-        raise FrameError(f"a tilt is 0 to {TURN - 1} hundredths of a degree, got {value}")
     return -math.radians((value if value <= TURN // 2 else value - TURN) / 100)
 
 
@@ -224,19 +195,16 @@ class HeadLine:
     def __init__(self, path, settings, log, host=REAL):
         self.path, self.settings, self.log, self.host = path, settings, log, host
         self.counts = dict.fromkeys(("frames", "echoed", "skipped", "reconnects"), 0)
-        self.lock, self._stop = host.lock(), encode_stop(settings.address)
-        self._acknowledges = False  # until a stop was acknowledged
-        self._free, self._sent, self._late = 0.0, 0.0, False
-        self._port = host.port(path, settings.baudrate, timeout=READ_S)
+        self.lock, self._stop, self._port = host.lock(), encode_frame(settings.address), None
+        self._free, self._sent, self._late, self._acknowledges = 0.0, 0.0, False, False
+        self._open()
+
+    def _open(self):
+        self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
 
     def wire_s(self, count=FRAME):
         """Seconds that bytes take on the line."""
         return count * 10 / self.settings.baudrate
-
-    @property
-    def round_trip_s(self):
-        """Longest time of a query that is answered or not."""
-        return 2 * self.wire_s() + self.settings.reply_s + self.settings.gap_s + READ_S
 
     # -------------------------------------------------------------------------------------------------- frames
 
@@ -246,23 +214,20 @@ class HeadLine:
         After a time-out the next reply may be the late one, so it is thrown away and the head asked again. The head
         looks at its encoder about half-way between the beginning of the query and the end of the reply.
         """
-        frame = encode_extended(self.settings.address, QUERY_TILT)
-        for _ in range(1 + retries):
-            with self.lock:
-                for _ in range(1 + self._late):
-                    begun = self.host.now()
-                    told = self._tilts(self._exchange(frame, self._tilts, self.settings.reply_s, again=True))
-                    self._late = not told
-                    if not told:
-                        break
-                if told:
-                    return (begun + self.host.now()) / 2, self.settings.pitch(decode_tilt(told[-1]))
-        return None
+        frame, mine = encode_extended(self.settings.address, QUERY_TILT), (None, self.settings.address)
 
-    def _tilts(self, received):
-        """Numbers of the tilt replies among others; 5-byte replies carry no address."""
-        mine = (None, self.settings.address)
-        return [one.value for one in received.replies if one.opcode == TILT and one.address in mine]
+        def tilts(received):
+            """Numbers of the tilt replies among others; 5-byte replies carry no address."""
+            return [one.value for one in received.replies if one.opcode == TILT and one.address in mine]
+
+        for _ in range(1 + retries + self._late):
+            with self.lock:
+                suspect, begun = self._late, self.host.now()
+                told = tilts(self._exchange(frame, tilts, self.settings.reply_s, again=True))
+                self._late = not told
+            if told and not suspect:
+                return (begun + self.host.now()) / 2, self.settings.pitch(decode_tilt(told[-1]))
+        return None
 
     def command(self, frame):
         """Send a frame that a head may acknowledge; the host's instant at which it was sent.
@@ -270,20 +235,20 @@ class HeadLine:
         If the port vanished it is not sent again, because its time has passed.
         """
         with self.lock:
-            self._exchange(frame * self.settings.sends, lambda found: found.replies, self.settings.gap_s)
+            self._exchange(frame * self.settings.sends)
             return self._sent
 
     def stop(self):
         """Send the stop until it is acknowledged, at least twice by heads that acknowledge nothing; its instant."""
-        first = None
+        instants = []
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
-                received = self._exchange(self._stop, lambda found: found.replies, self.settings.gap_s, again=True)
-                first = first or self._sent
-            if received.replies:
+                acknowledged = self._exchange(self._stop, again=True).replies
+                instants.append(self._sent)
+            if acknowledged:
                 self._acknowledges = True
                 break
-        return first
+        return instants[0]
 
     def blurt_stop(self):
         """Send the stop at once, whatever another thread is doing on the line; errors are logged, not raised."""
@@ -291,7 +256,7 @@ class HeadLine:
         try:
             with line_lost(self.path):
                 for _ in range(2):
-                    self._opened().write(self._stop)
+                    self.opened().write(self._stop)
                     self.host.sleep(self.wire_s() + self.settings.gap_s)
         except Exception as error:  # on the way out nothing else can be done
             self.log.error("the head could not be stopped (%s): cut its power if it moves", error)
@@ -299,77 +264,60 @@ class HeadLine:
             if held:
                 self.lock.release()
 
-    def _exchange(self, frame, found, wait_s, *, again=False):
-        """Send a frame, again where the port was lost and came back, and collect what is Received.
+    def _exchange(self, frame, found=lambda received: received.replies, wait_s=None, *, again=False):
+        """Send a frame, `again` where the port was lost and came back, and collect what is Received.
 
-        The wait counts from the end of the transmission of the frame, and of the reply; `found(received)` ends it.
+        The wait (by default that of an acknowledgement) counts from the end of the transmission of the frame, and of
+        the reply; ``found(received)`` ends it.
         """
         with self.lock:
+            self.host.sleep(max(0.0, self._free - self.host.now()))
+            data, over, received = b"", False, Received((), 0, 0)
             try:
-                return self._exchange_once(frame, found, wait_s)
+                with line_lost(self.path):
+                    port = self.opened()
+                    port.reset_input_buffer()
+                    port.write(frame)
+                    self._sent = self.host.now()
+                    end = self._sent + self.wire_s(len(frame) + FRAME) + (wait_s or self.settings.gap_s)
+                    while not over and not found(received):
+                        data += port.read(max(1, min(port.in_waiting, MOST)))
+                        over = self.host.now() >= end or len(data) >= MOST
+                        received = split_replies(data, frame[:FRAME], complete=over)
             except LineLost:
-                self._drop()
-                if not again:
+                self.log.warning("the line %s to the head is lost", self.path)
+                there = self._port is not None  # else it did not come back
+                self.close()
+                if not (again and there):
                     raise
-                self.reopen()
-                return self._exchange_once(frame, found, wait_s)
-
-    def _exchange_once(self, frame, found, wait_s):
-        self.host.sleep(max(0.0, self._free - self.host.now()))
-        data, over, received = b"", False, Received((), 0, 0)
-        with line_lost(self.path):
-            port = self._opened()
-            port.reset_input_buffer()
-            port.write(frame)
-            self._sent = self.host.now()
-            deadline = self._sent + self.wire_s(len(frame) + FRAME) + wait_s
-            while not over and not found(received):
-                data += port.read(max(1, min(port.in_waiting, MOST)))
-                over = self.host.now() >= deadline or len(data) >= MOST
-                received = split_replies(data, frame[:FRAME], complete=over)
-        self._free = max(self.host.now(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
-        self.counts["frames"] += 1
-        self.counts["echoed"] += received.echoed
-        self.counts["skipped"] += received.skipped
-        return received
+                return self._exchange(frame, found, wait_s)
+            self._free = max(self.host.now(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
+            for name, count in (("frames", 1), ("echoed", received.echoed), ("skipped", received.skipped)):
+                self.counts[name] += count
+            return received
 
     # ---------------------------------------------------------------------------------------------------- port
 
-    def _opened(self):
-        if self._port is None:
-            self.reopen()
-        return self._port
-
-    def _drop(self):
-        """Close the port after its line was lost."""
-        if self._port is not None:
-            self.log.warning("the line %s to the head is lost", self.path)
-            with contextlib.suppress(Exception):
-                self._port.close()
-        self._port = None
-
-    def reopen(self):
-        """Wait for the port to come back, and stop the head, which went on with what it was told last."""
-        with self.lock:
-            self._drop()
+    def opened(self):
+        """The port; after it was lost it is waited for, and the head, which went on with what it was told, stopped."""
+        with self.lock, line_lost(self.path):
             deadline = self.host.now() + self.settings.reconnect_s
             while self._port is None:
                 try:
-                    self._port = self.host.port(self.path, self.settings.baudrate, timeout=READ_S)
+                    self._open()
                 except PortError as error:
                     if self.host.now() >= deadline:
                         raise LineLost(f"the head's line is lost: {error}") from error
                     self.host.sleep(0.05)
-            self.counts["reconnects"] += 1
-            self.log.warning("the line %s to the head is back", self.path)
-            with line_lost(self.path):
+                    continue
+                self.counts["reconnects"] += 1
+                self.log.warning("the line %s to the head is back", self.path)
                 self._port.write(self._stop * 2)
-            self._free = self.host.now() + self.wire_s(2 * FRAME) + self.settings.gap_s
+                self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
+            return self._port
 
     def close(self):
         """Close the port; nothing is sent."""
-        with self.lock:
+        with self.lock, contextlib.suppress(Exception):
             port, self._port = self._port, None
-            if port is not None:
-                with contextlib.suppress(Exception):
-                    port.close()
+            port.close()

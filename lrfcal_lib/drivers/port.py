@@ -9,7 +9,7 @@ import socket
 import termios
 import threading
 import weakref
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import serial
@@ -44,11 +44,8 @@ class OutOfRange(DeviceError, ValueError):
     """A device was asked for more than it can do, such as a pitch beyond the limits of its head."""
 
 
-class Closed:
+class Closed(AbstractContextManager):
     """Something that is closed at the end of a with statement."""
-
-    def __enter__(self):
-        return self
 
     def __exit__(self, *_):
         self.close()
@@ -148,12 +145,12 @@ def set_rate(port, baudrate):
             port.baudrate = baudrate
             if set(termios.tcgetattr(port.fd)[4:6]) == {getattr(termios, f"B{baudrate}", None)}:
                 return
+        reason = (f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 interface "
+                  "whose clock divides to it, else use 38400")  # fmt: skip
     except ValueError as error:
-        port.baudrate = old
-        raise PortError(f"{port.port} cannot do {baudrate} Bd: {error}") from error
+        reason = f"cannot do {baudrate} Bd: {error}"
     port.baudrate = old
-    raise PortError(f"{port.port} does not take {baudrate} Bd: its driver set another rate; "
-                    "500000 Bd needs an RS-422 interface whose clock divides to it, else use 38400")  # fmt: skip
+    raise PortError(f"{port.port} {reason}")
 
 
 @contextmanager

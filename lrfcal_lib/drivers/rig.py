@@ -5,12 +5,13 @@ import logging
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.lms2xx import CONFIGURED, LMS2xx
+from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, ask
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.drivers.video import Camera
@@ -113,24 +114,29 @@ class Rig(Closed):
         DeviceError
             With the device in the message; those opened before are closed again.
         """
-        common = {"log": log, "clock": clock or host_clock()}
+        common, devices = {"log": log, "clock": clock or host_clock()}, stated.devices
+        lrf = devices.lrf.model_dump(exclude_none=True, exclude={"port", "interlaced"})
+        if devices.lrf.interlaced:  # such a stream chooses its own
+            lrf.pop("variant", None)
+        openers = {
+            "head": partial(PanTilt, devices.head.port, devices.head, host=host, **common),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **lrf, **common),
+        }
+        camera = camera or partial(_camera, stated, common)
+        openers |= {f"camera '{name}'": partial(camera, name) for name in stated.cameras}
         with contextlib.ExitStack() as stack:
-            with _named(stated, "head"):
-                head = stack.enter_context(PanTilt(stated.head_device, stated.head_settings, host=host, **common))
-            with _named(stated, "lrf"):
-                asked = stated.lrf_device
-                options = {key: asked[key] for key in ("baudrate", "address", *CONFIGURED) if key in asked}
-                if "password" in asked:
-                    options["password"] = asked["password"].encode()
-                lrf = stack.enter_context(LMS2xx(asked["port"], host=host, **options, **common))
-                if asked.get("variant") and not asked.get("interlaced"):  # such a stream chooses its own
-                    lrf.set_variant(*asked["variant"])
-            cameras = {}
-            for name, info in stated.cameras.items():
-                with _named(stated, f"camera '{name}'"):
-                    cameras[name] = _camera(stated, info, common) if camera is None else camera(name)
-                    stack.callback(cameras[name].close)
-            rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
+            opened = []
+            for name, opener in openers.items():
+                try:
+                    opened.append(opener())
+                except DeviceError as error:
+                    error.args = (f"{name}: {error}", *error.args[1:])
+                    raise
+                except ValueError as error:
+                    raise RigFileError(f"{stated.path}: {name}: {error}") from error
+                stack.callback(opened[-1].close)
+            cameras = dict(zip(stated.cameras, opened[2:], strict=True))
+            rig = cls(stated, opened[1], opened[0], cameras, clock=common["clock"], host=host)
             rig._closing = stack.pop_all()
         return rig
 
@@ -141,16 +147,12 @@ class Rig(Closed):
     @property
     def lrf_info(self):
         """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
-        view, step = (180, 0.25) if self.stated.lrf_device.get("interlaced") else self.lrf.variant
-        unit = METRES[self.lrf.configuration.unit]
-        return replace(
-            self.stated.lrf,
-            model=self.stated.lrf.model or self.lrf.type,
-            field_of_view=(math.radians(90 - view / 2), math.radians(90 + view / 2)),
-            bearing_step=math.radians(step),
-            range_resolution=unit,
-            max_range=mode_of(self.lrf.configuration.measuring_mode).largest * unit,
-        )
+        stated, lrf = self.stated.lrf, self.lrf
+        view, step = (180, 0.25) if self.stated.devices.lrf.interlaced else lrf.variant
+        unit, largest = METRES[lrf.configuration.unit], mode_of(lrf.configuration.measuring_mode).largest
+        seen = {"field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
+                "bearing_step": math.radians(step), "range_resolution": unit, "max_range": largest * unit}  # fmt: skip
+        return replace(stated, model=stated.model or lrf.type, **seen)
 
     def begin_telegrams(self):
         """Telegrams with which a recording begins: the configuration, which states the measuring mode."""
@@ -167,13 +169,13 @@ class Rig(Closed):
         return self._control("close", camera, view)
 
     def _control(self, command, *arguments):
-        if self.stated.control is None:
+        if (control := self.stated.devices.control) is None:
             return False
         try:
-            ask(self.stated.control, {"command": command, "arguments": list(arguments)})
+            ask(control, {"command": command, "arguments": list(arguments)})
         except (OSError, ValueError) as error:
             raise DeviceError(
-                f"control socket {self.stated.control}: {error}; is 'python -m lrfcal_lib emulate' still running? "
+                f"control socket {control}: {error}; is 'python -m lrfcal_lib emulate' still running? "
                 "Remove devices.control from the rig file to move a real board by hand"
             ) from error
         return True
@@ -205,10 +207,10 @@ class Rig(Closed):
                     seen += [one.ranges for one in event.readings]
                 yield event
             if len(seen) >= FEWEST_SCANS and np.ptp(placement.pitch) >= LEAST_SWEEP and unchanged(seen):
-                head = self.stated.head_settings
+                head = self.stated.devices.head
                 raise NoReply(
                     f"the head did not move: all {len(seen)} scans of the sweep show the same; check its power, the "
-                    f"wires A and B, address {head.address} and {head.baudrate} Bd at {self.stated.head_device}"
+                    f"wires A and B, address {head.address} and {head.baudrate} Bd at {head.port}"
                 )
         except BaseException:
             self.halt()
@@ -231,7 +233,7 @@ class Rig(Closed):
                 LOG.error("the %s could not be stopped (%s): cut its power if it moves", name, error)
 
     def _stop_and_go(self, placement):
-        interlaced, scans, images = self.stated.lrf_device.get("interlaced"), placement.pitch, placement.image_pitch
+        interlaced, scans, images = self.stated.devices.lrf.interlaced, placement.pitch, placement.image_pitch
         alone = [image for image in images if np.abs(scans - image).min() >= SAME_STOP]
         stops = sorted([*scans.tolist(), *alone], reverse=placement.direction < 0)
         if interlaced:
@@ -363,26 +365,14 @@ def _later(instant, moved, what):
         raise DeviceError(f"the {what} is {moved.time_s - instant:.3f} s older than the stop it belongs to")
 
 
-@contextlib.contextmanager
-def _named(stated, device):
-    """The name of a device stands before the message of whatever goes wrong with it, for wrong values the file's."""
-    try:
-        yield
-    except DeviceError as error:
-        error.args = (f"{device}: {error}", *error.args[1:])
-        raise
-    except ValueError as error:
-        raise RigFileError(f"{stated.path}: {device}: {error}") from error
-
-
-def _camera(stated, info, common):
+def _camera(stated, common, name):
     """A camera that gives images of the size stated."""
-    asked, size = stated.camera_devices[info.name], (info.width, info.height)
-    options = {key: asked[key] for key in ("exposure", "fps", "silence_s") if key in asked}
-    camera = Camera(asked["source"], name=info.name, size=size, **options, **common)
+    asked, info = stated.devices.cameras[name], stated.cameras[name]
+    size, options = (info.width, info.height), asked.model_dump(exclude_none=True, exclude={"source", "size"})
+    camera = Camera(asked.source, name=name, size=size, **options, **common)
     got = camera.settings["size"]["got"]
     if got is not None and tuple(got) != size:
         camera.close()
-        raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{info.name} states {size[0]} x {size[1]}: "
+        raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x {size[1]}: "
                          "state a size that it can do")  # fmt: skip
     return camera

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, StrictBool, model_validator
+from pydantic import AfterValidator, Field, StrictBool, model_validator
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.drivers.head import HeadSettings
@@ -30,7 +30,9 @@ class LrfDevice(Stated):
     port: Text
     baudrate: Literal[9600, 19200, 38400, 500000] = None
     address: whole(0, 127) = None
-    password: Annotated[Text, refused(lambda text: len(text.encode()) != 8, "8 ASCII characters are needed")] = None
+    password: Annotated[
+        Text, AfterValidator(str.encode), refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed")
+    ] = None
     variant: several(number(0.25, 180, "deg"), 2) = None
     unit: Literal["mm", "cm"] = None
     measuring_mode: whole(0, 6) = None
@@ -160,7 +162,7 @@ class Plan(Stated):
 
 @dataclass(frozen=True)
 class RigFile:
-    """A rig file.
+    """A rig file; RigFileError if its head or its laser range finder cannot do the plan.
 
     Attributes
     ----------
@@ -168,14 +170,6 @@ class RigFile:
         licence, source, simulated.
     platform_sigma : (float, float)
         How well the platform is known: direction (radians) and offset (metres).
-    lrf_device : dict
-        What is stated of an LrfDevice.
-    head_device : str
-        Its port.
-    camera_devices : dict of str to dict
-        What is stated of each CameraDevice.
-    control : str or None
-        Control socket of an emulated rig.
     """
 
     path: Path
@@ -185,16 +179,27 @@ class RigFile:
     T_head_lrf: RigidTransform | None
     platform_sigma: tuple[float, float]
     cameras: dict[str, CameraInfo]
-    lrf_device: dict
-    head_device: str
-    head_settings: HeadSettings
-    camera_devices: dict[str, dict]
-    control: str | None
+    devices: Devices
     plan: Plan
+
+    def __post_init__(self):
+        low, high = self.devices.head.pitch_limits_deg
+        for placement in self.plan.to_do():
+            asked = np.degrees([*placement.pitch, *placement.image_pitch])
+            if asked.min() < low - 1e-6 or asked.max() > high + 1e-6:
+                raise RigFileError(
+                    f"{self.path}: plan: placement {placement.number} asks for a pitch of {asked.min():g} to "
+                    f"{asked.max():g} deg, devices.head.pitch_limits_deg are {low:g} to {high:g}: ask for less"
+                )
+        if self.plan.mode == "continuous" and self.devices.lrf.interlaced:
+            raise RigFileError(
+                f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the head at rest, "
+                "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
+            )
 
     def with_mode(self, mode):
         """The same with another mode of the plan (None: its own)."""
-        return self if mode is None else checked(replace(self, plan=self.plan.model_copy(update={"mode": mode})))
+        return self if mode is None else replace(self, plan=self.plan.model_copy(update={"mode": mode}))
 
 
 def read_rig_file(path):
@@ -219,10 +224,7 @@ def read_rig_file(path):
         raise RigFileError(f"{path}: {error.strerror}; {hint}") from error
     except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: not JSON ({error})") from error
-    try:
-        return checked(rig_of(data, path))
-    except (ValueError, RecursionError) as error:
-        raise RigFileError(f"{path}: {error}") from error
+    return rig_of(data, path)
 
 
 class Asked(Stated):
@@ -233,47 +235,23 @@ class Asked(Stated):
 
 
 def rig_of(data, path=Path("rig.json")):
-    """A RigFile of parsed JSON, with a path for messages; ValueError for a wrong one."""
-    if not isinstance(data, dict):
-        raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
-    about = {"name": "rig", "licence": "", "source": "", "simulated": False}
-    stated = parse_session(about | data | {"placements": ()})
-    asked = from_json(Asked, {key: data.get(key) for key in Asked.model_fields})
-    devices, cameras = asked.devices, stated["cameras"]
-    if set(devices.cameras) != set(cameras):
-        raise ValueError(f"devices.cameras are {', '.join(devices.cameras) or 'none'}, rig.cameras "
-                         f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip
-    for name, info in cameras.items():
-        size, known = devices.cameras[name].size, (info.width, info.height)
-        if size not in (None, known):
-            raise ValueError(f"devices.cameras.{name}.size is {list(size)}, rig.cameras.{name} states {list(known)}: "
-                             "leave it out")  # fmt: skip
-    return RigFile(
-        path=Path(path),
-        about={key: stated[key] for key in ("licence", "source", "simulated")},
-        **{key: stated[key] for key in ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras")},
-        lrf_device=devices.lrf.model_dump(exclude_none=True),
-        head_device=devices.head.port,
-        head_settings=devices.head,
-        camera_devices={name: one.model_dump(exclude_none=True) for name, one in devices.cameras.items()},
-        control=devices.control,
-        plan=asked.plan,
-    )
-
-
-def checked(rig):
-    """A RigFile whose plan its head and its laser range finder can do; RigFileError otherwise."""
-    low, high = rig.head_settings.pitch_limits_deg
-    for placement in rig.plan.to_do():
-        asked = np.degrees([*placement.pitch, *placement.image_pitch])
-        if asked.min() < low - 1e-6 or asked.max() > high + 1e-6:
-            raise RigFileError(
-                f"{rig.path}: plan: placement {placement.number} asks for a pitch of {asked.min():g} to "
-                f"{asked.max():g} deg, devices.head.pitch_limits_deg are {low:g} to {high:g}: ask for less"
-            )
-    if rig.plan.mode == "continuous" and rig.lrf_device.get("interlaced"):
-        raise RigFileError(
-            f"{rig.path}: devices.lrf.interlaced is true: the four scans of a set need the head at rest, "
-            "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
-        )
-    return rig
+    """A RigFile of parsed JSON, with a path for messages; RigFileError for a wrong one."""
+    try:
+        if not isinstance(data, dict):
+            raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
+        given = {"name": "rig", "licence": "", "source": "", "simulated": False} | data
+        stated = parse_session(given | {"placements": ()})
+        asked = from_json(Asked, {key: data.get(key) for key in Asked.model_fields})
+        devices, cameras = asked.devices.cameras, stated["cameras"]
+        if set(devices) != set(cameras):
+            raise ValueError(f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
+                             f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip
+        for name, info in cameras.items():
+            if devices[name].size not in (None, (info.width, info.height)):
+                raise ValueError(f"devices.cameras.{name}.size is {list(devices[name].size)}, rig.cameras.{name} "
+                                 f"states {[info.width, info.height]}: leave it out")  # fmt: skip
+    except (ValueError, RecursionError) as error:
+        raise RigFileError(f"{path}: {error}") from error
+    about = {key: stated[key] for key in ("licence", "source", "simulated")}
+    shared = {key: stated[key] for key in ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras")}
+    return RigFile(Path(path), about, **shared, devices=asked.devices, plan=asked.plan)

@@ -1,9 +1,7 @@
 """Colour cameras: devices, streams and files; the newest frame with the time at which it was grabbed."""
 
-import base64
 import contextlib
 import glob
-import http.client
 import logging
 import os
 import re
@@ -13,10 +11,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import unquote, urlsplit
 
 import cv2
 import numpy as np
+import requests
+from urllib3.exceptions import HTTPError
 
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError
 
@@ -50,25 +49,14 @@ class MjpegStream:
 
     def __init__(self, url, timeout):
         self._buffer, self._image, self._held, self.waited = b"", None, False, False
+        session = requests.Session()
+        session.trust_env = False  # no proxy: cameras are near
         try:
-            parts, headers = urlsplit(url), {}
-            kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-            self._connection = kind(parts.hostname or "", parts.port, timeout=timeout)
-            if parts.username is not None:
-                words = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
-                headers["Authorization"] = "Basic " + base64.b64encode(words.encode()).decode()
-        except (ValueError, http.client.HTTPException) as error:
+            self._answer = session.get(url, stream=True, timeout=timeout).raw
+        except ValueError as error:  # names that no host can have
             raise OSError(f"no address of a stream: {error}") from error
-        try:
-            self._connection.connect()
-            self._socket = self._connection.sock
-            target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-            self._connection.request("GET", target, headers=headers)
-            self._answer = self._connection.getresponse()
-        except (OSError, ValueError, http.client.HTTPException) as error:  # ValueError: names that no host can have
-            self._connection.close()
-            raise OSError(f"no answer: {error}") from error
-        self.multipart = self._answer.status == 200 and self._answer.headers.get_content_maintype() == "multipart"
+        kind = self._answer.headers.get("Content-Type", "")
+        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
 
     def grab(self):
         """Read one whole image; False at the end of the stream, or after a silence."""
@@ -82,7 +70,7 @@ class MjpegStream:
                 fields = self._upto(b"\r\n\r\n").strip(b"\r\n")
             stated = LENGTH.search(fields)
             self._image = self._count(int(stated[1])) if stated else self._upto(END)
-        except (OSError, EOFError, ValueError, http.client.HTTPException):  # ValueError: the answer was closed
+        except (OSError, EOFError, ValueError, HTTPError):  # ValueError: the answer was closed
             return False
         return True
 
@@ -99,14 +87,12 @@ class MjpegStream:
 
     def release(self):
         """Close the connection."""
-        with contextlib.suppress(OSError):
-            self._socket.close()
-        self._connection.close()
+        self._answer.close()
 
     def _fill(self):
-        if self._socket.fileno() < 0:  # the answer closed it, at its end or after a silence
+        if self._answer.closed:  # at its end or after a silence
             raise EOFError
-        self.waited |= not select.select([self._socket], [], [], 0)[0]
+        self.waited |= not select.select([self._answer], [], [], 0)[0]
         if not (some := self._answer.read1(CHUNK)) or len(self._buffer) > LONGEST:
             raise EOFError
         self._buffer += some
@@ -388,17 +374,14 @@ class Camera(Closed):
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
         self._before, capture, ticks = self._clock(), self._capture, 0
-        asked = {key: self.settings[key]["asked"] for key in ("size", "exposure", "fps")}
+        asked = {key: one["asked"] for key, one in self.settings.items() if key != "warnings"}
         if self._source.open is _open_device:
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-            for key, value in zip((WIDTH, HEIGHT, FPS), (*(asked["size"] or (None, None)), asked["fps"]), strict=True):
-                if value is not None:
-                    capture.set(key, value)
-            done = True
-            if asked["exposure"] is not None:
-                capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
-                done = capture.set(cv2.CAP_PROP_EXPOSURE, round(asked["exposure"] / EXPOSURE_UNIT_S))
-            ticks = capture.get(cv2.CAP_PROP_EXPOSURE) if done else 0
+            exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
+            wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
+                      FPS: asked["fps"], cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,
+                      cv2.CAP_PROP_EXPOSURE: exposure}  # fmt: skip
+            done = {key: capture.set(key, value) for key, value in wanted.items() if value is not None}
+            ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
         size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
         found = {"size": size if all(size) else None, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
                  "fps": capture.get(FPS) or None}  # fmt: skip

@@ -85,14 +85,13 @@ def pitch_words(errors):
     """Sentences about the recorded pitch (PitchErrors or None); none without errors that the data ask for."""
     if errors is None or errors.wanted == "none":
         return []
-    offset, sigma = np.rad2deg(errors.direction_offset), np.rad2deg(errors.direction_sigma)
-    out = []
+    each, out = errors.models[errors.wanted], []
+    offset, sigma = np.rad2deg([errors.direction_offset, errors.direction_sigma])
     if np.isfinite(offset) and abs(offset) > SIGNIFICANT * sigma:
         out.append(
             f"the pitch depends on the direction of the sweep: upward and downward sweeps differ by "
             f"{2 * abs(offset):.2f} +- {2 * sigma:.2f} deg"
         )
-    each = errors.models[errors.wanted]
     if errors.wanted.startswith("sweep"):
         out.append(f"every sweep has a pitch offset of its own: {np.rad2deg(np.std(each.offset)):.2f} deg (sd)")
     if errors.wanted == "sweep_stretch":
@@ -130,18 +129,17 @@ def motion_words(steadiness):
 
 def bend_words(bends):
     """Sentences about boards that bend and materials that read farther (BoardBends)."""
-    out = []
+    out, bent = [], {p: b for p, b in bends.placements.items() if b.bends}
     if bends.level_applied:
-        further = "farther" if bends.level > 0 else "nearer"
         level, sigma = 1000 * abs(bends.level), 1000 * bends.level_sigma
+        further = "farther" if bends.level > 0 else "nearer"
         out.append(f"the board around the pattern reads {level:.1f} +- {sigma:.1f} mm {further} than the pattern")
-    bent = {p: b for p, b in bends.placements.items() if b.bends}
     if bent:
         who = f"placements {_listed(bent)} bend" if len(bent) > 1 else f"placement {_listed(bent)} bends"
         words = f"{who} by {_span(b.size for b in bent.values())} mm in the scan"
-        sheets, flat = [b.sheet for b in bent.values() if np.isfinite(b.sheet)], []
+        sheets = [b.sheet for b in bent.values() if np.isfinite(b.sheet)]
+        flat = [p for p, b in bent.items() if b.sheet < SHEET_SHARE * b.size]
         if sheets:
-            flat = [p for p, b in bent.items() if b.sheet < SHEET_SHARE * b.size]
             words += f"; in the images the printed sheet departs from its usual shape there by {_span(sheets)} mm"
         if flat:
             words += f" (at {_listed(flat)} by less than half: a pitch that is stretched looks like a bent board)"

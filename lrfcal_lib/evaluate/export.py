@@ -12,8 +12,7 @@ import numpy as np
 from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.pipeline import calibrate, color_cloud
 from lrfcal_lib.calibrate.reconstruct import write_ply
-from lrfcal_lib.evaluate.jointly import edge_misses_px, joint_fit
-from lrfcal_lib.evaluate.tables import handed_over, plane_residuals_of, rms
+from lrfcal_lib.evaluate.tables import edge_misses_px, handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.session.read import open_session

@@ -82,17 +82,11 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
     pitch_scale : float
         The head turns ``1 + pitch_scale`` times as far as recorded.
     """
-    count, edges = len(boards), len(obs.edges)
-    state = JointState(
-        head=pose_array(T_head_lrf),
-        cameras=np.array([pose_array(cameras[name]) for name in obs.cameras]).reshape(-1, 3, 4),
-        sensor=np.array([range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0]),
-        size=np.zeros(edges),
-        boards=np.stack([pose_array(T) for T in boards]),
-        sweeps=np.zeros((count, 2)),
-        sides=np.zeros((count, edges)),
-    )
-    return in_stated_gauge(state, obs)
+    poses = np.array([pose_array(cameras[name]) for name in obs.cameras]).reshape(-1, 3, 4)
+    sensor = np.array([range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0])
+    count, edges, boards = len(boards), len(obs.edges), np.stack([pose_array(T) for T in boards])
+    own = boards, np.zeros((count, 2)), np.zeros((count, edges))
+    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, np.zeros(edges), *own), obs)
 
 
 def monte_carlo(draw, solve, seeds):
@@ -251,54 +245,41 @@ def observations(shots, setup, last_beam=False):
     -------
     CameraObservations
     """
-    bearings, (t, p, _) = setup.bearings(), shots["ranges"].shape
-    flat = shots["ranges"].reshape(t * p, -1)
+    ranges, bearings, (t, p, _) = shots["ranges"], setup.bearings(), shots["ranges"].shape
+    flat, half = ranges.reshape(t * p, -1), np.array([-0.5, 0.5]) * setup.step
     lines, information = fit_lines(flat, bearings)
-    _, first, last = row_ends(np.isfinite(flat))
-    half = np.array([-0.5, 0.5]) * setup.step
-    bearing = bearings[np.stack([first, last], axis=1)] + (0.0 if last_beam else half)
-    ray = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-    across = np.stack([-ray[..., 1], ray[..., 0]], axis=-1)
-    r = 1 / np.sum(lines[:, None] * ray, axis=-1)  # to the fitted line
-    by_bearing = -(r**2) * np.sum(lines[:, None] * across, axis=-1)
-    turned = by_bearing[..., None] * ray + r[..., None] * across
-    turned = np.concatenate([turned, np.zeros(r.shape + (1,))], axis=-1)
-    variance = r**4 * np.einsum("nei,nij,nej->ne", ray, np.linalg.inv(information) * setup.sigma_range**2, ray)
-    points = polar_to_points(r, bearing)
-    noise = variance[..., None, None] * _outer(points / np.linalg.norm(points, axis=-1, keepdims=True))
-    radius = setup.radius(np.linalg.norm(points, axis=-1))
+    ends = bearings[np.stack(row_ends(np.isfinite(flat))[1:], axis=1)]
+    ray = polar_to_points(1.0, ends if last_beam else ends + half)
+    across, u = np.cross([0.0, 0.0, 1.0], ray), np.pad(lines, ((0, 0), (0, 1)))[:, None]
+    r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line
+    turned = r[..., None] * across - (r**2 * np.sum(u * across, axis=-1))[..., None] * ray  # by the bearing
+    spread = np.linalg.inv(information) * setup.sigma_range**2
+    variance = r**4 * np.einsum("nei,nij,nej->ne", ray[..., :2], spread, ray[..., :2])
+    noise = variance[..., None, None] * _outer(ray)
     found = {
-        "points": points, "half_step": turned * half[:, None], "noise": noise,
-        "covariance": noise + _outer(turned * setup.step * UNIFORM), "radius": radius, "background": 0 * radius,
-        "line_sigma": np.full(radius.shape, setup.sigma_px),
+        "points": r[..., None] * ray, "half_step": turned * half[:, None], "noise": noise,
+        "covariance": noise + _outer(turned * setup.step * UNIFORM), "radius": setup.radius(r), "background": 0 * r,
+        "line_sigma": np.full(r.shape, setup.sigma_px),
     }  # fmt: skip
     crossings = {f"crossing_{k}": v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
+    # face points for the plane method
+    hit = np.isfinite(ranges)
+    count, on_board = hit.sum(axis=-1), np.argsort(~hit, axis=-1, kind="stable")
+    pick = (np.linspace(0, 1, FACE) * (count[..., None] - 1)).round().astype(int)
+    beam = np.take_along_axis(on_board, pick, axis=-1)
+    ray, repeats = polar_to_points(1.0, bearings[beam]), np.maximum(FACE / count, 1.0)  # short lines give some twice
+    points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
+    covariance = _outer(ray) * (setup.sigma_range**2 * repeats)[..., None, None, None] + 1e-10 * np.eye(3)
     return CameraObservations(
-        setup.model, crossing_lines=shots["lines"].reshape(t, 2 * p, 3), crossing_placement=np.repeat(np.arange(p), 2),
-        **crossings, **_faces(shots, setup),
+        setup.model, **crossings, crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
+        crossing_placement=np.repeat(np.arange(p), 2), plane_points=points.reshape(t, -1, 3),
+        plane_covariance=covariance.reshape(t, -1, 3, 3), plane_placement=np.repeat(np.arange(p), FACE),
+        board_poses=shots["boards"], board_covariance=shots["board_covariance"],
     )  # fmt: skip
 
 
 def _outer(v):
     return v[..., :, None] * v[..., None, :]
-
-
-def _faces(shots, setup):
-    """Face points of drawn shots for the plane method."""
-    hit, bearings = np.isfinite(shots["ranges"]), setup.bearings()
-    count, order = hit.sum(axis=-1), np.argsort(~hit, axis=-1, kind="stable")
-    pick = np.minimum((np.linspace(0, 1, FACE) * (count[..., None] - 1)).round().astype(int), count[..., None] - 1)
-    beam = np.take_along_axis(order, pick, axis=-1)
-    points = polar_to_points(np.take_along_axis(shots["ranges"], beam, axis=-1), bearings[beam])
-    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    repeats = np.maximum(FACE / count, 1.0)  # a short line gives some of its points twice
-    covariance = _outer(rays) * (setup.sigma_range**2 * repeats)[..., None, None, None] + 1e-10 * np.eye(3)
-    (t, p), count = hit.shape[:2], hit.shape[1] * FACE
-    return {
-        "plane_points": points.reshape(t, count, 3), "plane_covariance": covariance.reshape(t, count, 3, 3),
-        "plane_placement": np.repeat(np.arange(p), FACE), "board_poses": shots["boards"],
-        "board_covariance": shots["board_covariance"],
-    }  # fmt: skip
 
 
 def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):

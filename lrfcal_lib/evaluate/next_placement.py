@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -44,10 +45,10 @@ OTHERS = {
 
 
 def outline(solution):
-    """Corners of the board, shape (e, 2), metres; with the sizes that were estimated."""
-    lines = solution.data.lines.copy()
+    """Corners of the board, shape (e, 3), metres; with the sizes that were estimated."""
+    lines = solution.observations.lines()
     lines[:, 2] -= solution.state.size
-    return corners_of_lines(lines)
+    return np.column_stack([corners_of_lines(lines), np.zeros(len(lines))])
 
 
 def board_grid(solution, distances, bearings, elevations, turns, leans):
@@ -71,22 +72,21 @@ def board_grid(solution, distances, bearings, elevations, turns, leans):
     face, head = gaze * FACING * Rotation.from_rotvec(tip) * spin, solution.T_head_lrf
     rotation = (head.rotation * face).as_matrix()
     centre = head.apply(places[["distance"]].to_numpy() * gaze.apply([0.0, 1.0, 0.0]))
-    middle = np.append(outline(solution).mean(axis=0), 0.0)
-    return places, np.concatenate([rotation, (centre - rotation @ middle)[..., None]], axis=-1)
+    origin = centre - rotation @ outline(solution).mean(axis=0)
+    return places, np.concatenate([rotation, origin[..., None]], axis=-1)
 
 
 def visible(boards, solution, models, field_of_view):
     """Which boards lie wholly in the view of LRF and cameras, (m,), and the pitch angles of their images, (m, k)."""
-    corners = np.column_stack([outline(solution), np.zeros(len(solution.data.lines))])
-    points, normals = geometry.apply_pose(boards, corners), boards[:, :, 2]
+    points, normals = geometry.apply_pose(boards, outline(solution)), boards[:, :, 2]
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
     inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
     inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
     inside &= _facing(points - solution.T_head_lrf.translation, normals)
     rows = np.flatnonzero(inside.all(axis=1))
     seen = np.ones((len(LATTICE), len(rows)), bool)
-    for number, name in enumerate(solution.transforms):
-        pose, model = camera_poses(solution, number, LATTICE), models[name]
+    for name in solution.transforms:
+        pose, model = camera_poses(solution, name, LATTICE), models[name]
         p, size = geometry.apply_pose(pose[:, None], points[rows]), np.array([model.width, model.height])
         uv, border = project(p, model), MARGIN * size
         # far outside the image the lens model folds back: only rays near the image count
@@ -95,7 +95,7 @@ def visible(boards, solution, models, field_of_view):
         seen &= np.all(inside.all(axis=-1) & _facing(p, geometry.rotate_points(pose, normals[rows])), axis=2)
     rows, seen = rows[seen.any(axis=0)], seen[:, seen.any(axis=0)]
     low, high = LATTICE[np.argmax(seen, axis=0)], LATTICE[len(LATTICE) - 1 - np.argmax(seen[::-1], axis=0)]
-    share = np.linspace(0, 1, IMAGES) if any(solution.data.on_head) else np.array([0.5])
+    share = np.linspace(0, 1, IMAGES) if "head" in solution.observations.mounts else np.array([0.5])
     return rows, low[:, None] + (high - low)[:, None] * share
 
 
@@ -104,96 +104,59 @@ def _facing(sight, normals):
     return -np.sum(sight * normals[..., None, :], axis=-1) > np.cos(STEEPEST) * np.linalg.norm(sight, axis=-1)
 
 
-def camera_poses(solution, number, pitch):
+def camera_poses(solution, name, pitch):
     """``T_camera_platform`` of a camera at pitch angles (n,), shape (n, 3, 4)."""
-    pose = solution.state.cameras[number]
-    if not solution.data.on_head[number]:
-        return np.broadcast_to(pose, (len(pitch), 3, 4))
-    back = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(-pitch, [1.0, 0.0, 0.0])))
-    return geometry.pose_array(geometry.pose_transform(pose) * solution.T_head_lrf.inv() * back)
-
-
-@dataclass(frozen=True)
-class Yield:
-    """What a placement of this recording brings: steps of the scans and how many of the beams get used.
-
-    Attributes
-    ----------
-    bearing_step, pitch_step : float
-        Radians.
-    spot : ndarray, shape (2,)
-        Growth with distance and constant of the spot's radius.
-    background : float
-        See :mod:`lrfcal_lib.fit.residuals`.
-    faces, cells : int
-        Most ranges a placement, and most beams an edge.
-    features : ndarray, shape (k, 3)
-        What the cameras see of the board.
-    face_share, edge_share : float
-        Of the beams that hit a board, and of the information about its edges, that really arrive.
-    pixels : ndarray, shape (6,)
-        Standard deviations of the board's pose in an image, relative to that from features at 1 px each.
-    """
-
-    bearing_step: float
-    pitch_step: float
-    spot: np.ndarray
-    background: float
-    faces: int
-    cells: int
-    features: np.ndarray
-    face_share: float = 1.0
-    edge_share: float = 1.0
-    pixels: np.ndarray | None = None
+    return np.broadcast_to(geometry.pose_array(solution.camera_at(name, pitch)), (len(pitch), 3, 4))
 
 
 def measure_yield(solution, models, features=None):
-    """Compare the placements of a solution with what is predicted for the same poses: a :class:`Yield`.
+    """What a placement of this recording brings, by comparing its placements with what is predicted for the same poses.
 
     `features`, shape (k, 3), is what the cameras see of the board (its pattern), metres; all over it when left out.
+    Returned are, by name, `bearing_step` and `pitch_step` of the scans (radians), `spot` (how the radius of a spot
+    grows with distance, and its constant), `background` (see :mod:`lrfcal_lib.fit.residuals`), `faces` and `cells`
+    (most ranges of a placement, and most beams about an edge), `features`, `face_share` and `edge_share` (of the beams
+    that hit a board, and of the information about its edges, that really arrive), and `pixels` (6,): standard
+    deviations of the board's pose in an image, relative to that from features at 1 px each.
     """
-    face, beam, boards = solution.data.face, solution.data.beam, solution.state.boards
-    used, distance = beam["used"], np.linalg.norm(boards[:, :, 3], axis=1)
-    spot, rows = np.array([0.0, 0.005]), used.any(axis=1)
-    if rows.any():
-        radius = np.nanmedian(np.where(used, beam["radius"], np.nan)[rows], axis=1)
-        grows = np.ptp(distance[rows]) >= 0.1 and np.ptp(radius) >= 1e-6
-        spot = np.polyfit(distance[rows], radius, 1) if grows else np.array([0.0, np.median(radius)])
-    cells = [(used & (beam["edge"] == e)).sum(axis=1).max(initial=0) for e in range(len(solution.data.lines))]
+    obs, boards = solution.observations, solution.state.boards
+    radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
+    distance, spot = np.linalg.norm(boards[radius.index, :, 3], axis=1), np.array([0.0, 0.005])
+    if len(radius):
+        grows = np.ptp(distance) >= 0.1 and np.ptp(radius) >= 1e-6
+        spot = np.polyfit(distance, radius, 1) if grows else np.array([0.0, np.median(radius)])
+    cells = np.bincount(obs.beam_placement * len(obs.edges) + obs.beam_edge).max(initial=0)
     features = _inner(solution, 8) if features is None else np.asarray(features, float)
-    background, faces = np.median(beam["background"][used]) if used.any() else 0.0, face["used"].sum(axis=1)
-    steps = _step(solution, "bearing"), _step(solution, "pitch")
-    first = Yield(*steps, spot, background, faces.max(initial=0), max(cells), features)
+    background = np.median(obs.beam_background) if len(radius) else 0.0
+    faces, ratios = np.bincount(obs.face_placement, minlength=len(boards)), []
+    rate = SimpleNamespace(
+        bearing_step=_step(obs, "bearing"), pitch_step=_step(obs, "pitch"), spot=spot, background=background,
+        faces=faces.max(), cells=cells, features=features, face_share=1.0, edge_share=1.0,
+    )  # fmt: skip
     bare = replace(solution.state, sweeps=0 * solution.state.sweeps, sides=0 * solution.state.sides)
-    expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, first)), solution.unknowns)
+    expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, rate)), solution.unknowns)
     found = _edge_information(solution.state, solution.data, solution.unknowns)
-    face_share = _share(faces, np.sum(_faces(boards, solution, first)["used"] ** 2, axis=1))
-    pixels = _pixels(solution, models, first.features)
-    return replace(first, face_share=face_share, edge_share=_share(found, expected), pixels=pixels)
+    hits = np.sum(_faces(boards, solution, rate)["used"] ** 2, axis=1)
+    for number, name in enumerate(solution.transforms):
+        mine = obs.view_camera == number
+        both = obs.view_covariance[mine], _view_covariance(obs.view_pose[mine], features, models[name])
+        ratios.append(np.sqrt(np.divide(*(np.diagonal(C, axis1=1, axis2=2) for C in both))))
+    rate.pixels = np.median(np.concatenate(ratios), axis=0) if len(obs.view_camera) else np.ones(6)
+    rate.face_share, rate.edge_share = _share(faces, hits), _share(found, expected)
+    return rate
 
 
-def _step(solution, name):
+def _step(obs, name):
     """Median step between neighbouring beams ('bearing') or scan lines ('pitch'), radians."""
-    group = solution.data.beam if solution.data.beam["used"].any() else solution.data.face
-    pairs = zip(group[name], group["used"], strict=True)
-    steps = np.concatenate([np.diff(np.unique(values[used].round(7))) for values, used in pairs])
-    steps = steps[steps > 1e-5]
-    return float(np.median(steps)) if len(steps) else np.radians(0.5)
+    group = obs.group("beam" if len(obs.beam_hit) else "face")
+    order = np.lexsort((group[name], group["placement"]))
+    steps = np.diff(group[name][order].round(7))[np.diff(group["placement"][order]) == 0]
+    return float(np.median(steps[steps > 1e-5])) if np.any(steps > 1e-5) else np.radians(0.5)
 
 
 def _share(found, expected):
     good = (expected > 0) & (found > 0)
     return float(np.clip(np.median(found[good] / expected[good]), 0.05, 1.5)) if good.any() else 1.0
-
-
-def _pixels(solution, models, features):
-    """Standard deviations of poses in the images, relative to those from features at 1 px each, shape (6,)."""
-    view, ratios = solution.data.view, []
-    for number, name in enumerate(solution.transforms):
-        mine = view["used"] & (view["camera"] == number)
-        both = view["covariance"][mine], _view_covariance(view["pose"][mine], features, models[name])
-        ratios.append(np.sqrt(np.divide(*(np.diagonal(C, axis1=1, axis2=2) for C in both))))
-    return np.median(np.concatenate(ratios), axis=0) if view["used"].any() else np.ones(6)
 
 
 def _view_covariance(pose, features, model):
@@ -206,7 +169,7 @@ def _view_covariance(pose, features, model):
 
 def _inner(solution, number):
     """Points spread over the board, shape (n, 3)."""
-    corners = outline(solution)
+    corners = outline(solution)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     middle = (np.arange(number) + 0.5) / number
     x = np.stack(np.meshgrid(*(low[i] + middle * (high - low)[i] for i in (0, 1))), -1).reshape(-1, 2)
@@ -227,25 +190,23 @@ def _sampled(boards, local, solution, rate):
 
 def _faces(boards, solution, rate):
     """Weighted samples of the boards' faces: `used` is the root of how many beams there are (a whitener)."""
-    corners, local = outline(solution), _inner(solution, 5)
+    corners, local, stated = outline(solution), _inner(solution, 5), solution.observations.face_sigma
     bearing, pitch, distance, ray, density = _sampled(boards, local, solution, rate)
-    area = np.abs(np.linalg.det(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)).sum()) / 2
+    area = np.linalg.norm(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)) / 2
     number = density * np.abs(ray[..., 2]) * area / len(local)
     used = np.sqrt(number * np.minimum(rate.face_share, rate.faces / number.sum(axis=1, keepdims=True)))
-    sigma = solution.data.face["sigma"][solution.data.face["used"]]
-    sigma = np.full(bearing.shape, np.median(sigma) if len(sigma) else 1.0)
+    sigma = np.full(bearing.shape, np.median(stated) if len(stated) else 1.0)
     rays = geometry.polar_to_points(1.0, bearing)
     return {"range": distance, "bearing": bearing, "pitch": pitch, "sigma": sigma, "ray": rays, "used": used}
 
 
 def _beams(boards, solution, rate):
     """Weighted samples of beams about the edges, as hits and as misses; `used`: how many of them read so."""
-    corners, lines, n = outline(solution), solution.data.lines, len(boards)
+    corners, n, edges = outline(solution), len(boards), len(solution.observations.edges)
     along = np.roll(corners, -1, axis=0) - corners
-    length, edge = np.linalg.norm(along, axis=1), np.repeat(np.arange(len(lines)), len(ALONG))
-    local = (corners[:, None] + ALONG[:, None] * along[:, None]).reshape(-1, 2)
-    flat = local, (along / length[:, None])[edge], lines[edge, :2]
-    local, direction, normal = (np.column_stack([v, np.zeros(len(edge))]) for v in flat)
+    length, edge = np.linalg.norm(along, axis=1), np.repeat(np.arange(edges), len(ALONG))
+    local = (corners[:, None] + ALONG[:, None] * along[:, None]).reshape(-1, 3)
+    direction, normal = (along / length[:, None])[edge], solution.observations.lines()[edge] * [1, 1, 0]
     bearing, _, distance, ray, density = _sampled(boards, local, solution, rate)
     across = np.linalg.norm(np.cross(ray, direction), axis=-1)
     radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
@@ -254,7 +215,7 @@ def _beams(boards, solution, rate):
     shift = edge_shift(solution.state.sensor[1], radius, rate.background)[0]
     # beams per metre off the edge; those near a corner are not used
     number = density * np.maximum(length[edge] - 4 * radius, 0.0) * across / len(ALONG)
-    rows = np.sum((number * 4 * step).reshape(n, len(lines), -1), axis=2)
+    rows = np.sum((number * 4 * step).reshape(n, edges, -1), axis=2)
     kept = np.minimum(1.0, rate.cells / np.maximum(rows, 1e-9))[:, edge] * rate.edge_share
     number = number * sigma * (Z_NODES[1] - Z_NODES[0]) * kept
     outside = (shift[..., None] - Z_NODES * sigma[..., None]) * (across / np.abs(ray[..., 2]))[..., None]
@@ -273,9 +234,9 @@ def _beams(boards, solution, rate):
 def _views(boards, pitches, solution, models, rate):
     """Poses of the boards in all images."""
     parts = []
-    for number, name in enumerate(solution.transforms):
-        for pitch in (pitches if solution.data.on_head[number] else pitches[:, :1]).T:
-            pose = geometry.pose_transform(camera_poses(solution, number, pitch)) * geometry.pose_transform(boards)
+    for number, (name, mount) in enumerate(zip(solution.transforms, solution.observations.mounts, strict=True)):
+        for pitch in (pitches if mount == "head" else pitches[:, :1]).T:
+            pose = geometry.pose_transform(camera_poses(solution, name, pitch)) * geometry.pose_transform(boards)
             covariance = _view_covariance(pose.as_matrix(), rate.features, models[name])
             covariance = covariance * np.outer(rate.pixels, rate.pixels)
             camera = np.full(len(pitch), number)
@@ -299,8 +260,8 @@ def _edge_information(state, data, unknowns):
 def candidate_information(boards, pitches, solution, models, rate):
     """Information that each candidate would add about the shared unknowns, shape (n, c, c).
 
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images; `rate` is a :class:`Yield`.
-    The candidate's own pose and sweep are eliminated; at the noise levels of the solution.
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images; `rate` is that of
+    :func:`measure_yield`. The candidate's own pose and sweep are eliminated; at the noise levels of the solution.
     """
     c, found = solution.unknowns.shared, []
     for first in range(0, len(boards), CHUNK):
@@ -308,7 +269,7 @@ def candidate_information(boards, pitches, solution, models, rate):
         view = _views(some, pitches[first : first + CHUNK], solution, models, rate)
         groups = {"face": _faces(some, solution, rate), "beam": _beams(some, solution, rate), "view": view}
         for name, group in groups.items():
-            group["used"] = group["used"] * getattr(solution.data, name)["used"].any()
+            group["used"] = group["used"] * (len(getattr(solution.observations, f"{name}_placement")) > 0)
         middle, direction = np.nanmean(groups["face"]["pitch"], axis=1), np.ones(len(some), int)
         data = replace(solution.data, **groups, middle=middle, direction=direction)
         sides = np.zeros((len(some), solution.state.sides.shape[1]))
@@ -332,8 +293,8 @@ class Direction:
 
 def scales_of(solution, names):
     """How much of each unknown makes a metre at 2 m."""
-    used = solution.data.beam["used"]
-    radius = np.median(solution.data.beam["radius"][used]) if used.any() else 0.01
+    radii = solution.observations.beam_radius
+    radius = np.median(radii) if len(radii) else 0.01
     turns = (*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction")
     plain = {name: 1 / RADIUS if name in turns or name[-3:] in ("_rx", "_ry", "_rz") else 1.0 for name in names}
     return np.array([(plain | {"edge_log_odds": 2.0 / radius})[name] for name in names])
@@ -470,7 +431,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     total, totals = (np.sqrt(sum(sigma**2 for sigma in groups.values())) for groups in (before, after))
     best, gains = int(np.argmin(totals)), 1 - totals / total
     T_platform_board, place = geometry.pose_transform(boards[rows[best]]), grid.iloc[rows[best]]
-    pitches = pitches[best] if any(solution.data.on_head) else None
+    pitches = pitches[best] if "head" in solution.observations.mounts else None
     after = {name: sigma[best] for name, sigma in after.items()}
     return Suggestion(T_platform_board, place, pitches, before, after, gains[best], np.median(gains))
 

@@ -1,11 +1,12 @@
-"""Tables that judge a calibration, and the truth of simulated sessions."""
+"""Tables that judge calibrations, the joint estimate among them, and the truth of simulated sessions."""
 
 from __future__ import annotations
 
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -13,23 +14,35 @@ import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
-from lrfcal_lib.calibrate.pipeline import left_out_residuals as jointly_left_out
-from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
+from lrfcal_lib.evaluate.next_placement import outline
+from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
 from lrfcal_lib.solvers import METHODS, solve_camera
+from lrfcal_lib.solvers.joint import solve_again
+from lrfcal_lib.solvers.joint_noise import on_board
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
+ALL = 10**9  # crossings
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
     r"offset_.*|size_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
+}  # fmt: skip
+NOISE_WORDS = {
+    "face_scale": "scatter of ranges, in stated standard deviations",
+    "view_scale": "scatter of board poses in images, in stated standard deviations",
+    "face_share": "independent errors per range", "beam_share": "independent errors per beam at an edge",
+    "sigma_pitch": "error of the pitch of single images [deg]",
+    "side_sigma": "spread of the edge bias from side to side [log odds]",
 }  # fmt: skip
 
 
@@ -75,11 +88,10 @@ def read_truth(session):
         return None
     data = read_json(file, session.path)
     with naming(f"{file} (simulate the session again)"):
-        cameras = data["cameras"].items()
-        cameras = {c: e["T_camera_lrf"] if "T_camera_lrf" in e else e["T_camera_platform"] for c, e in cameras}
+        mounts, cameras = ("T_camera_lrf", "T_camera_platform"), data["cameras"].items()
         return Truth(
             transform_from_json(data["T_head_lrf"]),
-            {name: transform_from_json(pose) for name, pose in cameras.items()},
+            {c: transform_from_json(next(e[mount] for mount in mounts if mount in e)) for c, e in cameras},
             board_from_json(data["board"]),
             {int(n): transform_from_json(entry["T_platform_board"]) for n, entry in data["boards"].items()},
             {int(n): np.asarray(entry["pitch_rad"], float) for n, entry in data["sweeps"].items()},
@@ -167,25 +179,35 @@ def plane_residuals_of(obs, solution):
     return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
 
 
-def left_out_residuals(obs, judge, method, full):
-    """Residuals of every placement under a calibration from all the others: edge_px (n,), plane_m (m,).
+def left_out(obs, judge, method, full):
+    """Calibrations from all placements but one, and what that one shows: (CameraObservations, Solution) each.
 
     The `method` of METHODS works on `obs` and is judged on `judge`, CameraObservations of the same placements; `full`
-    is the calibration from all of them, the start of each solve. NaN where the remaining placements do not determine
-    the camera.
+    is the calibration from all of them, the start of each solve. Placements whose absence leaves the camera open are
+    missing.
     """
-    edge_px = np.full(len(judge.crossing_points), np.nan)
-    plane_m = np.full(len(judge.plane_points), np.nan)
     for placement in judge.all_placements:
-        try:
+        with suppress(DegenerateGeometry):
             rest = obs.select(obs.all_placements[obs.all_placements != placement])
-            solution = solve_camera(rest, method, full.transform)
-        except geometry.DegenerateGeometry:
-            continue
-        held = judge.select([placement])
-        edge_px[judge.crossing_placement == placement] = edge_residuals_px(held, solution.transform, solution.model)
-        plane_m[judge.plane_placement == placement] = plane_residuals_of(held, solution)
-    return edge_px, plane_m
+            yield judge.select([placement]), solve_camera(rest, method, full.transform)
+
+
+def jointly_left_out(joint, camera):
+    """The same of the joint estimate (JointCalibration), which is judged with its own platform and range offset."""
+    for placement, solution in joint.without.items():
+        yield joint.seen_by(camera, solution).along().select([placement]), solution.camera(camera)
+
+
+def left_out_residuals(pairs):
+    """Residuals of every placement under a calibration from all the others: crossings (pixels), face points (metres).
+
+    `pairs` are those of :func:`left_out` or :func:`jointly_left_out`.
+    """
+    edges, planes = [np.zeros(0)], [np.zeros(0)]
+    for held, solution in pairs:
+        edges.append(edge_residuals_px(held, solution.transform, solution.model))
+        planes.append(plane_residuals_of(held, solution))
+    return np.concatenate(edges), np.concatenate(planes)
 
 
 def method_comparison(observations, solutions, truth=None, joint=None):
@@ -215,17 +237,16 @@ def method_comparison(observations, solutions, truth=None, joint=None):
         if name == "joint":
             own = observations[camera, "joint"]
             judge, used = own.along(), own.placements
-            held_edge, held_plane = ([], []) if joint is None else jointly_left_out(joint, camera)
+            held = () if joint is None else jointly_left_out(joint, camera)
         else:
             own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
-            used = getattr(own, USED[METHODS[name].uses])
-            held_edge, held_plane = left_out_residuals(own, judge, name, solution)
-        edge = edge_residuals_px(judge, solution.transform, solution.model)
+            used, held = getattr(own, USED[METHODS[name].uses]), left_out(own, judge, name, solution)
+        edge, held = edge_residuals_px(judge, solution.transform, solution.model), left_out_residuals(held)
         row = {
             "camera": camera, "method": name, "n_placements": len(np.unique(used)),
             "edge_median_px": float(np.median(np.abs(edge))) if len(edge) else np.nan, "edge_rms_px": rms(edge),
-            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)), "left_out_edge_rms_px": rms(held_edge),
-            "left_out_plane_rms_mm": 1000 * rms(held_plane),
+            "plane_rms_mm": 1000 * rms(plane_residuals_of(judge, solution)), "left_out_edge_rms_px": rms(held[0]),
+            "left_out_plane_rms_mm": 1000 * rms(held[1]),
         }  # fmt: skip
         rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
@@ -393,13 +414,12 @@ def stereo_check(solutions, cameras, T_second_first):
     Columns method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both calibrations use the
     same LRF points, so the check cannot see an error of the cloud.
     """
-    (first, second), rows = cameras, []
-    baseline = np.linalg.norm(T_second_first.translation)
+    rows, baseline = [], np.linalg.norm(T_second_first.translation)
     for method in (*METHODS, "joint"):
-        if (first, method) in solutions and (second, method) in solutions:
-            found = solutions[second, method].transform * solutions[first, method].transform.inv()
-            angle, distance = geometry.transform_difference(found, T_second_first)
-            length = np.linalg.norm(found.translation)
+        if all((camera, method) in solutions for camera in cameras):
+            first, second = (solutions[camera, method].transform for camera in cameras)
+            angle, distance = geometry.transform_difference(second * first.inv(), T_second_first)
+            length = np.linalg.norm((second * first.inv()).translation)
             rows.append((method, 1000 * length, 1000 * (length - baseline), 1000 * distance, np.rad2deg(angle)))
     columns = ["method", "baseline_mm", "baseline_error_mm", "translation_error_mm", "rotation_error_deg"]
     return pd.DataFrame(rows, columns=columns)
@@ -426,27 +446,23 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         where images show them ('fused').
     """
 
-    def measure(placement, variant):
-        if variant == "fused":
-            return fused_outline_of(joint, placement)
-        if variant == "likelihood":
-            return likely_outline_of(prepared, placement, joint.edge_model(placement))
-        return outline_of(prepared, placement, variant, T_head_lrf)
-
+    measure = {v: lambda p, v=v: outline_of(prepared, p, v, T_head_lrf) for v in VARIANTS}
+    if joint is not None:
+        measure["fused"] = lambda placement: fused_outline_of(joint, placement)
+        measure["likelihood"] = lambda placement: likely_outline_of(prepared, placement, joint.edge_model(placement))
     known, edges, rows = {} if prepared.board.corners is None else prepared.board.lengths(), prepared.board.edges, []
-    for variant in (*VARIANTS, *(() if joint is None else ("fused", "likelihood"))):
-        for placement in prepared.session.board_placements:
-            lengths, across = {}, frozenset()
+    for variant, placement in product(measure, prepared.session.board_placements):
+        lengths, across = {}, frozenset()
+        with suppress(DegenerateGeometry):
             if placement in prepared.names:
-                with suppress(geometry.DegenerateGeometry):
-                    measured, across = measure(placement, variant)
-                    lengths = measured.lengths
-            views = [views[placement] for views in prepared.views.values() if placement in views]
-            for name in (name for name in known if any(view.edge(name) is not None for view in views)):
-                length = lengths.get(name, np.nan)
-                ends = ends_of(edges, name, across) if np.isfinite(length) else "not measured"
-                row = prepared.session.name, placement, name, ends, variant
-                rows.append((*row, 1000 * known[name], 1000 * length))
+                measured, across = measure[variant](placement)
+                lengths = measured.lengths
+        views = [views[placement] for views in prepared.views.values() if placement in views]
+        for name in (name for name in known if any(view.edge(name) is not None for view in views)):
+            length = lengths.get(name, np.nan)
+            ends = ends_of(edges, name, across) if np.isfinite(length) else "not measured"
+            row = prepared.session.name, placement, name, ends, variant
+            rows.append((*row, 1000 * known[name], 1000 * length))
     rows += [("paper", np.nan, name, "scan", "last_beam", *lengths) for name, lengths in PAPER_EDGES_MM.items()]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
@@ -469,8 +485,158 @@ def edge_summary(table):
     table = table[table.measured_mm.notna()]
     groups = table.assign(size=table.error_mm.abs()).groupby(["source", "ends", "variant"], sort=False)
     return groups.agg(
-        n=("size", "size"),
-        mean_abs_error_mm=("size", "mean"),
-        median_abs_error_mm=("size", "median"),
+        n=("size", "size"), mean_abs_error_mm=("size", "mean"), median_abs_error_mm=("size", "median"),
         mean_error_mm=("error_mm", "mean"),
-    ).reset_index()
+    ).reset_index()  # fmt: skip
+
+
+def range_residuals(solution):
+    """Ranges on the boards' faces as measured, and predicted minus measured; metres, shapes (n,)."""
+    return solution.observations.face_range, solution.residuals("face")[:, 0]
+
+
+def view_residuals(solution, camera, model):
+    """Where the boards' middles were seen in the images of a camera, and predicted minus seen; pixels, shapes (n, 2).
+
+    A ValueError if there is no such camera.
+    """
+    if camera not in solution.transforms:
+        raise ValueError(f"cameras are {', '.join(solution.transforms) or 'none'}; got '{camera}'")
+    mine = solution.observations.view_camera == list(solution.transforms).index(camera)
+    pose, change = solution.observations.view_pose[mine], solution.residuals("view")[mine]
+    turned, at = pose[:, :3, :3] @ outline(solution).mean(axis=0), pose[:, :3, 3]
+    seen = project(turned + at, model)
+    moved = (geometry.exp_rotation(change[:, :3]) @ turned[..., None])[..., 0]
+    return seen, project(moved + at + change[:, 3:], model) - seen
+
+
+def joint_table(joint):
+    """Every shared unknown of the joint estimate (JointCalibration).
+
+    Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the placements, model
+    errors included; NaN where unknown), sigma (the larger one).
+    """
+    solution = joint.solution.solution
+    units, factors = zip(*map(unit_of, solution.names), strict=True)
+    spread = np.full(len(factors), np.nan) if solution.sigma_placements is None else solution.sigma_placements
+    return pd.DataFrame({
+        "parameter": solution.names, "unit": units, "value": factors * solution.parameters,
+        "sigma_noise": factors * solution.sigma, "sigma_placements": factors * spread,
+        "sigma": factors * solution.trusted_sigma,
+    })  # fmt: skip
+
+
+def noise_table(joint):
+    """Noise levels that the estimate took from the data, in words."""
+    found = joint.solution.noise.items()
+    rows = [(NOISE_WORDS[name], np.rad2deg(value) if name == "sigma_pitch" else value) for name, value in found]
+    return pd.DataFrame(rows, columns=["what", "value"])
+
+
+def edge_bias_mm(joint):
+    """By how much boards look larger at each side: mean over the beams of every edge, millimetres.
+
+    Columns placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
+    """
+    solution, obs = joint.solution, joint.observations
+    sensor, distance = solution.sensor["edge_log_odds"], np.linalg.norm(solution.state.boards[:, :, 3], axis=1)
+    odds = obs.beam_background + solution.state.sides[obs.beam_placement, obs.beam_edge]
+    beams = pd.DataFrame({
+        "placement": obs.placements[obs.beam_placement], "edge": np.array(obs.edges)[obs.beam_edge],
+        "distance_m": distance[obs.beam_placement], "bias_mm": 1000 * edge_shift(sensor, obs.beam_radius, odds)[0],
+        "bias_radii": disc_edge(sensor + odds)[0],
+    }).iloc[np.lexsort((obs.beam_edge, obs.beam_placement))]  # fmt: skip
+    return beams.groupby(["placement", "edge", "distance_m"], sort=False).mean().reset_index()
+
+
+def joint_fit(joint):
+    """How well ranges and edges fit the joint estimate: ``plane_rms_mm`` and ``edge_rms_px``.
+
+    Of face points from their boards, and of all half-step crossings of scan lines from the image edges, the estimated
+    edge bias taken off, over all cameras.
+    """
+    solution = joint.solution
+    plane = on_board(solution.state, solution.data)[..., 2][solution.data.face["used"]]
+    edges = [edge_misses_px(joint, camera) for camera in joint.observations.cameras]
+    return {"plane_rms_mm": 1000 * rms(plane), "edge_rms_px": rms(np.concatenate(edges))}
+
+
+def edge_misses_px(joint, camera):
+    """Distances of crossings of scan lines from one camera's edges without the edge bias, undistorted pixels, (n,)."""
+    solution, edges, placements = joint.solution, list(joint.observations.edges), list(joint.solution.boards)
+    obs, pose = joint.seen_by(camera, crossings=ALL).along().select(placements), solution.transforms[camera]
+    if len(obs.crossing_points) == 0:
+        return np.zeros(0)
+    rows = [placements.index(p) for p in obs.crossing_placement], [edges.index(e) for e in obs.crossing_edge]
+    odds = obs.crossing_background + solution.state.sides[rows]
+    shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
+    return edge_residuals_px(obs, pose) - shift * obs.model.fx / pose.apply(obs.crossing_points)[:, 2]
+
+
+def size_error(joint):
+    """How much larger the board is in the cloud than stated, ranges as recorded, and the standard deviation of that.
+
+    An offset of all ranges would stretch the cloud until it fits a board whose size is stated wrong, so it is left out;
+    the offset that the maker admits is a part of the expected error, beside the scatter over placements and the edge
+    bias. The error is the mean relative one of the lengths whose ends beams decide; NaN with fewer than three
+    placements, or where nobody knows the outline.
+    """
+    prepared, model = joint.prepared, replace(joint.edge_model(), range_offset=0.0)
+    if prepared.board.corners is None:
+        return np.nan, np.nan
+    true, edges, found = prepared.board.lengths(), prepared.board.edges, []
+    for placement in joint.solution.boards:
+        with suppress(DegenerateGeometry):
+            measured, across = likely_outline_of(prepared, placement, model)
+            own = [v / true[k] - 1 for k, v in measured.lengths.items() if ends_of(edges, k, across) == "scan"]
+            found += [np.mean(own)] if own else []
+    if len(found) < 3:
+        return np.nan, np.nan
+    slope = edge_shift(model.log_odds, np.median(joint.observations.beam_radius))[1]
+    bias = 2 * slope * model.log_odds_sigma / np.mean(list(true.values()))
+    offset = prepared.session.lrf.admitted_offset / np.median(joint.observations.face_range)
+    return float(np.mean(found)), float(np.linalg.norm([np.std(found, ddof=1) / np.sqrt(len(found)), offset, bias]))
+
+
+def random_halves(joint, pairs=8):
+    """How far estimates from two random halves of the placements differ, beside what their sigmas predict.
+
+    Columns pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg, predicted_translation_mm
+    (root mean square difference that the sigma of the whole estimate, model error included, predicts: twice that sigma,
+    without the part of the intrinsics, which the halves share). Splits of which a half leaves something open are
+    missing.
+    """
+    rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
+    for pair in range(pairs):
+        parts = np.array_split(rng.permutation(numbers), 2)
+        try:
+            halves = [solve_again(joint.observations.select(np.sort(part)), joint.solution) for part in parts]
+        except DegenerateGeometry:
+            continue
+        for camera in joint.observations.cameras:
+            turn, shift = geometry.transform_difference(*(half.transforms[camera] for half in halves))
+            lens = np.diag(joint.solution.lens)[joint.solution.columns(f"{camera}_")]
+            sigma = 2 * np.sqrt(np.maximum(joint.solution.camera(camera).trusted_sigma ** 2 - lens, 0.0))
+            expected = np.rad2deg(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:])
+            rows.append((pair, camera, np.rad2deg(turn), 1000 * shift, *expected))
+    columns = ["pair", "camera", "rotation_deg", "translation_mm", "predicted_rotation_deg", "predicted_translation_mm"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def joint_errors(joint, truth):
+    """Errors of axis and cameras against the :class:`~lrfcal_lib.evaluate.tables.Truth`, beside their predicted sigmas.
+
+    Columns what, rotation_error_deg, rotation_sigma_deg, translation_error_mm, translation_sigma_mm; no axis where it
+    was not estimated.
+    """
+    solution, rows, found = joint.solution, [], {}
+    if joint.settings["axis"]:
+        found["tilt axis"] = *axis_errors(solution.T_head_lrf, truth), solution.covariance("axis_", "offset_")
+    for camera in solution.transforms:
+        errors = camera_errors(solution.camera(camera), truth, camera).values()
+        found[f"camera {camera}"] = *errors, solution.covariance(f"{camera}_")
+    for what, (turn, shift, covariance) in found.items():
+        turn_sigma, shift_sigma = np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
+        rows.append((what, turn, np.rad2deg(turn_sigma), shift, 1000 * shift_sigma))
+    columns = ["rotation_error_deg", "rotation_sigma_deg", "translation_error_mm", "translation_sigma_mm"]
+    return pd.DataFrame(rows, columns=["what", *columns])

@@ -16,7 +16,7 @@ from lrfcal_lib.model.geometry import POSE_NAMES, hat, polar_to_points, pose_arr
 from lrfcal_lib.solvers.joint import SCALES, UNSEEN
 
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
-PARTS = {"axis": slice(0, 4), "camera": slice(4, 10), "range offset": slice(10, 11), "pitch": slice(11, 13)}
+PARTS = {"axis": range(4), "camera": range(4, 10), "range offset": range(10, 11), "pitch": range(11, 13)}
 SEEN = 1e-3  # a motion that moves a point less than this, relative to all others, does not matter to it
 ROUNDS = 12  # of the search for the beam that ends in a pixel
 
@@ -95,40 +95,28 @@ def marginal(hessian, index):
     return reduced_hessian(hessian[np.ix_(order, order)][None], len(index))[0]
 
 
-def unseen_motions(solution, index):
-    """Directions of some unknowns that the data do not determine, shape (m, k).
-
-    What stays open beside those leaves no trace: cameras that planes fix are known, whatever the edge bias.
-    """
-    scales = np.array([SCALES.get(name, 1.0) for name in solution.solution.names])
-    own = marginal(information(solution).sum(axis=0) * scales[:, None] * scales, index)
-    return null_space(own, np.ones(len(index)), UNSEEN)[0] * scales[index]
-
-
 def chain_of(solution, camera=None):
     """The chain of a joint solution to a camera, or to points of the cloud; a ValueError if there is no such camera."""
     if camera is not None and camera not in solution.transforms:
         raise ValueError(f"cameras are {', '.join(solution.transforms) or 'none'}; got '{camera}'")
     found, unknowns, sweep = solution.solution, solution.unknowns, solution.data.sweep_sigma
-    prefix, number = ("", 0) if camera is None else (f"{camera}_", list(solution.transforms).index(camera))
-    wanted = [*AXIS_NAMES, *(prefix + name for name in POSE_NAMES), *COLUMNS[10:]]
+    wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
     index = np.array([found.names.index(name) if name in found.names else -1 for name in wanted])
-    covariances = []
-    for covariance in (found.covariance, found.trusted):
-        wide = np.zeros((len(found.names) + 1,) * 2)  # zero for what is known; what has no bound is among `unseen`
-        wide[:-1, :-1] = np.where(np.isfinite(covariance), covariance, 0.0)
-        covariances.append(wide[np.ix_(index, index)])
-    motions = unseen_motions(solution, index[index >= 0])
-    unseen = np.zeros((len(motions), len(wanted)))
-    unseen[:, index >= 0] = motions
-    return Chain(
-        head=pose_array(solution.T_head_lrf),
-        camera=None if camera is None else pose_array(solution.transforms[camera]),
-        on_head=camera is None or bool(solution.data.on_head[number]),
-        covariances=tuple(covariances),
-        unseen=unseen,
-        sweep_sigma=(sweep[0] * (unknowns.sweep != "none"), sweep[1] * (unknowns.sweep == "offset_stretch")),
+    known, rows = index >= 0, np.ix_(index, index)
+    # zero for what is known; what has no bound is among `unseen`
+    covariances = tuple(
+        np.where(np.outer(known, known) & np.isfinite(C[rows]), C[rows], 0.0) for C in (found.covariance, found.trusted)
     )
+    # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever the edge bias.
+    scales = np.array([SCALES.get(name, 1.0) for name in found.names])
+    own = marginal(information(solution).sum(axis=0) * scales[:, None] * scales, index[known])
+    motions = null_space(own, np.ones(len(own)), UNSEEN)[0] * scales[index[known]]
+    unseen = np.zeros((len(motions), len(wanted)))
+    unseen[:, known] = motions
+    on_head = camera is None or solution.observations.mounts[list(solution.transforms).index(camera)] == "head"
+    pose = None if camera is None else pose_array(solution.transforms[camera])
+    sweep_sigma = sweep[0] * (unknowns.sweep != "none"), sweep[1] * (unknowns.sweep == "offset_stretch")
+    return Chain(pose_array(solution.T_head_lrf), pose, on_head, covariances, unseen, sweep_sigma)
 
 
 def carried(chain, bearing, pitch, distance, image_pitch=0.0):
@@ -217,11 +205,8 @@ def _sigma_map(chain, axes, jacobian, by_pitch, turn, offset):
 
     `offset` says whether the offset that the pitch of every sweep has of its own matters.
     """
-    parts = {}
-    for name, columns in PARTS.items():
-        only = np.zeros_like(jacobian)
-        only[..., columns] = jacobian[..., columns]
-        parts[name] = spread(chain, only)
+    links = {name: np.isin(range(len(COLUMNS)), columns) for name, columns in PARTS.items()}
+    parts = {name: spread(chain, jacobian * link) for name, link in links.items()}
     sweep = np.hypot(offset * chain.sweep_sigma[0], chain.sweep_sigma[1] * turn) * np.linalg.norm(by_pitch, axis=-1)
     return SigmaMap(*axes, np.hypot(spread(chain, jacobian), sweep), parts | {"sweep": sweep})
 
@@ -296,9 +281,8 @@ def point_sigma(solution, bearings, pitches, distances, *, reference=0.0):
 
 def range_noise(solution):
     """Standard deviation of one range as the solution found or took it, metres (0 for a Chain)."""
-    if isinstance(solution, Chain) or not solution.data.face["used"].any():
-        return 0.0
-    return float(np.median(solution.data.face["sigma"][solution.data.face["used"]]) * solution.data.face_scale)
+    sigma = () if isinstance(solution, Chain) else solution.observations.face_sigma
+    return float(np.median(sigma) * solution.noise["face_scale"]) if len(sigma) else 0.0
 
 
 def _asked(solution, camera, distances):

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from lrfcal_lib.evaluate.jointly import size_error
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
-from lrfcal_lib.evaluate.tables import handed_over, placements_table
+from lrfcal_lib.evaluate.tables import handed_over, placements_table, size_error
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
@@ -137,9 +136,9 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
-    groups, suggestion, problem = (solution.data.face, solution.data.beam), None, ""
+    suggestion, problem = None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
-    pitch = np.concatenate([group["pitch"][group["used"]] for group in groups])
+    pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
     found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
     if suggest:
         try:
@@ -290,9 +289,8 @@ def _left_out(calibration, method):
 
 def diagnose(solution):
     """Weaknesses of a JointSolution and of the recording behind it: list of Reason."""
-    iterations, view = solution.solution.iterations, solution.data.view
-    seen = [np.any(view["used"] & (view["camera"] == i), axis=1).sum() for i in range(len(solution.transforms))]
-    seen = list(zip(seen, solution.transforms, strict=True))
+    iterations, obs = solution.solution.iterations, solution.observations
+    seen = [(len(np.unique(obs.view_placement[obs.view_camera == i])), c) for i, c in enumerate(obs.cameras)]
     own = [words for words in solution.warnings if not words.startswith(SAID)]
     findings = [
         (not solution.converged, NO, "convergence", f"the estimate has not converged after {iterations} iterations"),
@@ -307,18 +305,19 @@ def diagnose(solution):
 
 def _of_placements(solution):
     """What is weak about the recorded poses: rows of whether, answer, kind and words."""
-    data, boards, n = solution.data, solution.state.boards, len(solution.boards)
-    on_head = data.view["used"] & (data.on_head[data.view["camera"]] if len(data.on_head) else False)
-    pitch = np.hstack([data.face["pitch"], data.beam["pitch"], data.view["pitch"]])
-    used = np.hstack([data.face["used"], data.beam["used"], on_head])
+    obs, boards, n = solution.observations, solution.state.boards, len(solution.boards)
+    head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
+    turned, shown = obs.view_pitch[head], obs.view_placement[head]
+    pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, turned])
+    place = np.concatenate([obs.face_placement, obs.beam_placement, shown])
     # the pitch shows the axis: of each placement, of the whole recording where a camera stands on the base
-    within = " within a placement" if np.all(data.on_head) else ""
-    span = (_ranges(pitch, used) if within else _ranges(pitch.reshape(1, -1), used.reshape(1, -1))).max()
+    within = "" if "platform" in obs.mounts else " within a placement"
+    span = _largest_range(pitch, place if within else 0 * place)
     axis = any(name in solution.solution.names for name in AXIS_NAMES)
-    flat = on_head.any() and _ranges(data.view["pitch"], on_head).max() < SMALL_IMAGE_PITCH
+    flat = len(turned) and _largest_range(turned, shown) < SMALL_IMAGE_PITCH
     mean = boards[:, :, 2].mean(axis=0)
     off = np.arccos(np.clip(boards[:, :, 2] @ mean / np.linalg.norm(mean), -1, 1)).max()
-    middles = boards[:, :, :3] @ np.append(outline(solution).mean(axis=0), 0.0) + boards[:, :, 3]
+    middles = boards[:, :, :3] @ outline(solution).mean(axis=0) + boards[:, :, 3]
     distance = np.linalg.norm(middles - solution.T_head_lrf.translation, axis=1)
     return [
         (n < FEW, NO if n < FEWEST else CARE, "placements",
@@ -335,10 +334,9 @@ def _of_placements(solution):
     ]  # fmt: skip
 
 
-def _ranges(values, used):
-    """Range of the used values in each row, 0 where there are none."""
-    high, low = np.max(values, axis=1, where=used, initial=-np.inf), np.min(values, axis=1, where=used, initial=np.inf)
-    return np.where(used.any(axis=1), high - low, 0.0)
+def _largest_range(values, groups):
+    """Largest range of the values of one group, 0 where there are none."""
+    return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
 
 
 def _of_residuals(solution):

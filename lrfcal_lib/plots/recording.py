@@ -31,9 +31,8 @@ def range_image(ax, sweep, mask=None):
     With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found to be the board; it
     is outlined.
     """
-    moves, bearing = np.ptp(sweep.pitch) > 0, np.degrees(sweep.bearings)
+    moves, bearing, order = np.ptp(sweep.pitch) > 0, np.degrees(sweep.bearings), np.argsort(sweep.pitch, kind="stable")
     height = np.degrees(sweep.pitch) if moves else np.arange(len(sweep.pitch))
-    order = np.argsort(height, kind="stable")
     drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], shading="nearest", rasterized=True)
     ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
     if mask is not None and mask.any() and len(mask) == 1:
@@ -179,10 +178,8 @@ def seen_points(ax, view, image, model, points, margin=60):
     for index, stretch in enumerate(lines):
         ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=None if index else "edge in the image")
     for index, (method, uv) in enumerate(points.items()):
-        marker = ("o", "x", "s", "+", "d", "^")[index % 6]
-        face = {"markerfacecolor": "none"} if marker not in "x+" else {}
-        color = SERIES[(index + 1) % len(SERIES)]
-        ax.plot(*uv.T, marker, color=color, markersize=4.5, label=method, **face)
+        marker, color = "oxs+d^"[index % 6], SERIES[(index + 1) % len(SERIES)]
+        ax.plot(*uv.T, marker, color=color, markersize=4.5, label=method, markerfacecolor="none")
     ax.legend(facecolor="#333333", labelcolor="white", frameon=True, framealpha=0.8, edgecolor="none")
     _cut(ax, [*points.values(), *lines], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
@@ -197,13 +194,11 @@ def stretch_in_image(edge, model, count=61):
 
 def _cut(ax, drawn, image, margin):
     """Limit the axes to what is drawn in them, and to the image."""
-    points, (height, width) = np.concatenate([*drawn, np.zeros((0, 2))]), image.shape[:2]
+    points, size = np.concatenate([*drawn, np.zeros((0, 2))]), np.array(image.shape[1::-1])
     points = points[np.isfinite(points).all(axis=1)]
-    low, high = np.full(2, -0.5), np.array([width, height]) - 0.5
-    if len(points):
-        low = np.maximum(points.min(axis=0) - margin, low)
-        high = np.minimum(points.max(axis=0) + margin, high)
-    ax.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]))
+    box = [points.min(axis=0) - margin, points.max(axis=0) + margin] if len(points) else [[-0.5, -0.5], size]
+    (left, top), (right, bottom) = np.clip(box, -0.5, size - 0.5)
+    ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def outline(ax, measured, exaggerate=20):

@@ -23,8 +23,8 @@ def by_placement(ax, names, label):
 def residual_strips(ax, residuals, placement, label, color):
     """Residuals (n,) by placement (n,), with their root mean square as a bar; `label` is the quantity with its unit."""
     names, column, count = np.unique(placement, return_inverse=True, return_counts=True)
-    spread = np.empty(len(column))
-    spread[np.argsort(column, kind="stable")] = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in count])
+    within = np.argsort(np.argsort(column, kind="stable")) - (np.cumsum(count) - count)[column]
+    spread = (within + 0.5) / count[column] - 0.5
     rms = np.sqrt(np.bincount(column, np.square(residuals)) / count)
     ax.bar(np.arange(len(names)), 2 * rms, bottom=-rms, width=0.8, color=color, alpha=0.2, linewidth=0, label="rms")
     ax.plot(column + 0.6 * spread, residuals, ".", color=color, markersize=2.5)
@@ -50,8 +50,8 @@ def parameter_comparison(ax, values, sigmas, label):
     for row, (method, value) in enumerate(values.items()):
         looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
         ax.errorbar(value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks)
-    ax.set(yticks=np.arange(len(values)), yticklabels=[m.replace("_", " ") for m in values], xlabel=label)
-    ax.set_ylim(len(values) - 0.5, -0.5)
+    names, bottom = [method.replace("_", " ") for method in values], len(values) - 0.5
+    ax.set(yticks=np.arange(len(values)), yticklabels=names, xlabel=label, ylim=(bottom, -0.5))
 
 
 def edge_errors(ax, errors):
@@ -82,36 +82,32 @@ def projection_map(ax, found, index=0, name=""):
 
     `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN stay white.
     """
-    _sigma_map(ax, found.columns, found.rows, found.sigma[index], "px")
+    _sigma_map(ax, found, index, "px", name)
     ax.invert_yaxis()
     ax.set(xlabel="u [px]", ylabel="v [px]")
-    ax.set_title(_title(f"{name} at {found.distances[index]:g} m", found.rms()[index], "px"))
 
 
 def point_map(ax, found, index=0):
     """Standard deviation of reconstructed points over the field of view, a SigmaMap of ``uncertainty.point_sigma``."""
-    _sigma_map(ax, np.degrees(found.columns), np.degrees(found.rows), 1000 * found.sigma[index], "mm")
+    _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
-    ax.set_title(_title(f"cloud at {found.distances[index]:g} m", 1000 * found.rms()[index], "mm"))
 
 
-def _title(what, rms, unit):
-    return f"{what}: {rms:.2g} {unit} rms" if np.isfinite(rms) else f"{what}: no bound"
-
-
-def _sigma_map(ax, columns, rows, sigma, unit):
-    """Colours and labelled lines of equal standard deviation."""
-    good = np.ma.masked_invalid(sigma)
+def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
+    """Colours and labelled lines of equal standard deviation; `angle` and `scale` are factors to the units shown."""
+    at, good = (angle * found.columns, angle * found.rows), np.ma.masked_invalid(scale * found.sigma[index])
     shading, top = "nearest" if good.count() < good.size else "gouraud", good.max() if good.count() else 1.0
-    mesh = ax.pcolormesh(columns, rows, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
+    mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
     ax.grid(False)
     if good.count() and good.max() > 1.05 * good.min():
-        lines = ax.contour(columns, rows, good, LEVELS, colors="white", linewidths=0.8)
-        ax.clabel(lines, fontsize="x-small", fmt="%.3g")
+        ax.clabel(ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize="x-small", fmt="%.3g")
     bar = ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8)
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.3g"))
     ax.set_aspect("equal")
+    rms = scale * found.rms()[index]
+    said = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"
+    ax.set_title(f"{name} at {found.distances[index]:g} m: {said}")
 
 
 def point_parts(ax, found):
@@ -128,20 +124,17 @@ def point_parts(ax, found):
 
 def observability_bars(ax, directions):
     """The six least known combinations of unknowns, in words (``next_placement.observability``)."""
-    shown = directions[:6]
-    sigma = 1000 * np.array([d.sigma for d in shown])
+    shown, sigma = directions[:6], 1000 * np.array([d.sigma for d in directions[:6]])
     known = np.isfinite(sigma)
-    longest = 1.15 * sigma[known].max(initial=0.0) or 1.0
-    colors = np.where(known, COLORS["fit"], COLORS["outlier"])
+    longest, colors = 1.15 * sigma[known].max(initial=0.0) or 1.0, np.where(known, COLORS["fit"], COLORS["outlier"])
     ax.barh(np.arange(len(shown)), np.where(known, sigma, longest), color=colors, height=0.6)
     for row, s in enumerate(sigma):
         text, at, color = (f" {s:.2g} mm", s, "black") if known[row] else (" not determined", 0.0, "white")
         ax.text(at, row, text, va="center", ha="left", color=color)
-    ax.set(yticks=np.arange(len(shown)), ylim=(len(shown) - 0.5, -0.5), xlim=(0, 1.12 * longest))
-    ax.set_yticklabels([textwrap.fill(d.words, 46) for d in shown], fontsize="small")
-    ax.set_xlabel("standard deviation at 2 m [mm]")
-    lost = int((~known).sum())
-    ax.set_title(f"{lost} motions are not determined" if lost else f"least known: {sigma[0]:.2g} mm at 2 m")
+    lost = f"{(~known).sum()} motions are not determined"
+    ax.set_title(f"least known: {sigma[0]:.2g} mm at 2 m" if known.all() else lost)
+    ax.set(ylim=(len(shown) - 0.5, -0.5), xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
+    ax.set_yticks(np.arange(len(shown)), [textwrap.fill(d.words, 46) for d in shown], fontsize="small")
     ax.grid(False, axis="y")
 
 
@@ -156,35 +149,34 @@ def misfit_bars(ax, misfit, limit=4.0):
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     ax.set_xticks(np.arange(len(values))[::every], list(misfit)[::every])
-    ax.set_ylim(0, 1.1 * max(values.max(), 1.2))
     many = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
-    ax.set_title(many if bad.any() else f"all placements fit alike, the worst {values.max():.1f}")
+    title = many if bad.any() else f"all placements fit alike, the worst {values.max():.1f}"
+    ax.set(ylim=(0, 1.1 * max(values.max(), 1.2)), title=title)
 
 
 def residuals_by_range(ax, distance, residual):
     """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in bins.
 
-    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.jointly.range_residuals`.
+    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.tables.range_residuals`.
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
     limits = np.unique(np.quantile(distance, np.linspace(0, 1, BINS + 1)))
     which = np.clip(np.searchsorted(limits, distance, side="right") - 1, 0, max(len(limits) - 2, 0))
     bins = [which == i for i in np.unique(which)]
-    x, y = (np.array([np.mean(v[b]) for b in bins]) for v in (distance, residual))
-    error = np.array([np.std(residual[b]) / np.sqrt(b.sum()) for b in bins])
+    means = [(distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins]
+    x, y, error = np.transpose(means)
     ax.errorbar(x, y, yerr=error, fmt="o-", color=COLORS["lrf"], capsize=2.5, label="mean and its standard error")
     ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
-    limit = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9)
-    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
-    ax.set_title(f"ranges: {np.sqrt(np.mean(residual**2)):.2g} mm rms")
+    limit, title = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9), f"{np.sqrt(np.mean(residual**2)):.2g} mm rms"
+    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit), title=f"ranges: {title}")
     ax.legend()
 
 
 def residuals_by_region(ax, uv, shift, model, name):
     """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the image's width.
 
-    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.jointly.view_residuals`. The camera's name is its
+    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.tables.view_residuals`. The camera's name is its
     colour.
     """
     length, title = np.linalg.norm(shift, axis=1), f"{name}: no board in any image"
@@ -226,9 +218,9 @@ def background_motion(ax, steadiness):
     for before, after in places:
         ax.axvline((names.index(before) + names.index(after)) / 2, color=COLORS["outlier"], linewidth=1.2)
     where = ", ".join(f"{before} and {after}" for before, after in places)
-    title = "the background stood still" + " in all cameras" * (len(judged) > 1)
+    still = "the background stood still" + " in all cameras" * (len(judged) > 1)
     turn = np.rad2deg(np.mean([step.angle for step in steps])) if steps else 0.0
-    ax.set_title(f"moved by {turn:.3f} deg between placements {where}" if steps else title)
+    ax.set_title(f"moved by {turn:.3f} deg between placements {where}" if steps else still)
     ax.legend(ncols=2, fontsize="small", loc="lower right")
 
 
@@ -243,10 +235,9 @@ def board_bend(ax, bends):
     values = 1000 * np.array([(b.size, b.sigma, b.sheet, b.sheet_sigma) for b in found])
     (size, sigma, sheet, sheet_sigma), at = values.T, np.arange(len(found))
     bent = np.array([b.bends for b in found])
-    labels = (bent, COLORS["lrf"], "scan: bends"), (~bent, COLORS["raw"], "scan: too little to matter")
-    for chosen, color, label in labels:
-        if chosen.any():
-            ax.bar(at[chosen], size[chosen], yerr=sigma[chosen], color=color, label=label, width=0.75, **SPREAD)
+    for some, color, label in ((bent, "lrf", "scan: bends"), (~bent, "raw", "scan: too little to matter")):
+        if some.any():
+            ax.bar(at[some], size[some], yerr=sigma[some], color=COLORS[color], label=label, width=0.75, **SPREAD)
     if np.isfinite(sheet).any():
         looks = {"fmt": "D", "color": COLORS["left"], "markersize": 4, "capsize": 2, "linewidth": 1}
         ax.errorbar(at, sheet, yerr=sheet_sigma, label="images: change of the printed sheet", **looks)

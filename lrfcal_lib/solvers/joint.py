@@ -120,6 +120,15 @@ class JointSolution:
         """Where readings flip with a background as far and bright as the board, spot radii outside the edge."""
         return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
 
+    def residuals(self, group):
+        """Residuals in the order of the observations: 'face' (n, 1), metres, or 'view' (n, 6), radians and metres."""
+        used, placement = getattr(self.data, group)["used"], getattr(self.observations, f"{group}_placement")
+        out = np.zeros((len(placement), {"face": 1, "view": 6}[group]))
+        blocks = residuals.named_blocks(self.state, self.data, self.unknowns)
+        if group in blocks:
+            out[np.argsort(placement, kind="stable")] = blocks[group].residuals.reshape(used.shape + (-1,))[used]
+        return out
+
     def columns(self, prefix):
         """Indices of the shared unknowns whose names begin so."""
         return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
@@ -147,11 +156,11 @@ class JointSolution:
         return points, corrected
 
     def camera_at(self, name, pitch):
-        """``T_camera_platform`` of a camera while the head stands at a pitch (radians)."""
+        """``T_camera_platform`` of a camera while the head stands at a pitch (radians), or at several."""
         pose = self.transforms[name]
         if self.observations.mounts[self.observations.cameras.index(name)] == "platform":
             return pose
-        turn = RigidTransform.from_rotation(Rotation.from_rotvec([-float(pitch), 0.0, 0.0]))
+        turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0])))
         return pose * self.T_head_lrf.inv() * turn
 
     def camera(self, name):
