@@ -3,16 +3,17 @@
 import os
 import shutil
 import signal
+import sys
 from contextlib import suppress
 from pathlib import Path
 from tempfile import mkdtemp
 
 import matplotlib
 import pytest
-from shared import FOLDER, shared_folder, stages
+from shared import FOLDER, ROOT, shared_folder, stages
 
 matplotlib.use("Agg")
-ROOT = Path(__file__).resolve().parents[1]
+sys.modules["rfc3987_syntax"] = None  # a grammar of internet addresses, which nbformat would load: 3 s a process
 
 
 def pytest_configure(config):

@@ -2,11 +2,11 @@
 
 import json
 import math
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 
+from lrfcal_lib.drivers.lms2xx_link import Reading
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import rig_of
@@ -18,17 +18,6 @@ BEAMS = 101  # 100 deg in steps of 1 deg
 BEARINGS = np.radians(scan_quarters(BEAMS) / 4)
 SCAN_S = 0.02
 LAZY_S = 0.013  # from the question to the first beam
-
-
-@dataclass(frozen=True)
-class Reading:
-    """As of the driver."""
-
-    telegrams: tuple
-    ranges: np.ndarray
-    bearings: np.ndarray
-    time_s: float
-    beam_times_s: np.ndarray
 
 
 class Clock:
@@ -53,17 +42,7 @@ def picture(pitch, camera="left"):
     return rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
 
 
-class Device:
-    """A context manager that is closed at the end."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.close()
-
-
-class Head(Device):
+class Head:
     """Moves at 20 deg/s; answers unless it is told not to."""
 
     def __init__(self, clock, feedback=True, silent_moving=False):
@@ -117,7 +96,7 @@ class Head(Device):
     close = stop
 
 
-class Lrf(Device):
+class Lrf:
     """Scans the wall at the head's pitch."""
 
     type, firmware, variant, port = "LMS221", "X01.27", (100.0, 1.0), "/dev/fake"
@@ -141,7 +120,8 @@ class Lrf(Device):
             pitch = self.head.true(instant)
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
-        self.readings.append(Reading((telegram(pitch),), np.full(BEAMS, 2.0 + pitch), BEARINGS, instant, times))
+        ranges = np.full(BEAMS, 2.0 + pitch)
+        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, None, None))
         return self.readings[-1]
 
     def newest(self, after=None, timeout=2.0):
@@ -176,7 +156,7 @@ class Lrf(Device):
         return out
 
 
-class Camera(Device):
+class Camera:
     """Sees noise that depends on the pitch."""
 
     def __init__(self, name, head, clock):
@@ -225,3 +205,12 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
 def opened(rig):
     """Stands in for the class Rig where a program opens one."""
     return SimpleNamespace(open=lambda stated, **options: rig)
+
+
+def raising(error):
+    """A call that fails."""
+
+    def call(*_, **__):
+        raise error
+
+    return call

@@ -1,17 +1,16 @@
 """Damaged and hostile sessions and rig files, one after the other: ``python tests/fuzz.py`` (or ``make fuzz``).
 
 A case is a number: it seeds what is damaged and what is done with it, so ``--case N`` repeats it. Cases run in
-processes that may take 500 MB and, for each case, 20 s. Whatever comes out has to be an error of ours; nothing outside
-of the session's folder is to be opened, which the kernel (inotify, for a folder that links and names lead to) and
-Python's audit events (for all absolute paths) tell.
+processes that may take 500 MB and, for each case, 20 s of a processor. Whatever comes out has to be an error of ours;
+nothing outside of the session's folder is to be opened, which the kernel (inotify, for a folder that links and names
+lead to) and Python's audit events (for all absolute paths) tell.
 """
 
 import argparse
-import collections
 import ctypes
 import io
 import json
-import mmap
+import multiprocessing.connection
 import os
 import resource
 import shutil
@@ -93,11 +92,9 @@ def make_sessions(folder):
     truth |= {"boards": {"1": {"T_platform_board": transform_to_json(HEAD)}}, "sweeps": {"1": {"pitch_rad": [0.1]}}}
     (folder / "scans" / "truth.json").write_text(json.dumps(truth))
     with recorder(folder / "telegrams") as writer:
-        for placement in (1, 2):
-            writer.begin_placement(placement)
-            record(writer, placement)
-            if placement == 1:
-                writer.finish_placement()
+        add(writer, 1)
+        writer.begin_placement(2)
+        record(writer, 2)
     (folder / "rig").mkdir()
     (folder / "rig" / "rig.json").write_text(json.dumps(rig_data()))
     (folder / "outside").mkdir()
@@ -110,11 +107,16 @@ def recorder(path):
     return SessionRecorder(path, triangle_board(), LRF, [CameraInfo("left", "head", 160, 120, MODEL)], resume=True)
 
 
+def add(writer, placement):
+    """Record a whole placement."""
+    writer.begin_placement(placement)
+    record(writer, placement)
+    writer.finish_placement()
+
+
 def record(writer, placement):
     """What a placement adds to it."""
-    ranges = np.full(181, 2.0)
-    telegrams = [encode_scan(ranges), encode_scan(ranges[:100], partial=0), encode_scan(ranges)]
-    writer.add_telegrams(placement, telegrams[::2], [0.0, 0.1], [placement, placement + 0.5])
+    writer.add_telegrams(placement, [encode_scan(np.full(181, 2.0))] * 2, [0.0, 0.1], [placement, placement + 0.5])
     writer.add_image("left", picture(placement), placement, pitch=0.1, time_s=placement)
     writer.add_platform([(placement, 0.1, np.nan)])
 
@@ -195,20 +197,34 @@ def rows(rng, file):
     file.write_bytes(("\n".join(lines) + "\n").encode("utf-8", "replace"))
 
 
+def header_of(shape, kind, turned=False):
+    """A header of an array that states what need not follow."""
+    return f"{{'descr': '{kind}', 'fortran_order': {turned}, 'shape': {shape}, }}\n".encode()
+
+
+def array_of(header, version=1):
+    """What comes before the values of an array."""
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H", len(header)) + header
+
+
+def pixels_of(png, size, kind=(8, 2, 0, 0, 0)):
+    """A PNG image that states another size."""
+    body = b"IHDR" + struct.pack(">II5B", *size, *kind)
+    return png[:12] + body + zipfile.crc32(body).to_bytes(4, "big") + png[33:]
+
+
 def arrays(rng, file):
     """Other arrays than a session's, headers that lie, and archives that unpack to much."""
     with zipfile.ZipFile(file) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    name = sorted(members)[rng.integers(len(members))]
-    how = rng.integers(4)
-    if how == 0:  # a header that states what does not follow
+    name, how = sorted(members)[rng.integers(len(members))], rng.integers(4)
+    if how == 0:
         shape = rng.choice("(100000, 100000);(-1, 61);();(6,);(2**40,);(6, 61;6;(6, 61, 1);(True, 61)".split(";"))
         kind = rng.choice("<f8 <f4 |O <U9 |b1 <c16 |V1000000 <i8 <f16 <M8[s] >f8 x |S0".split())
-        header = f"{{'descr': '{kind}', 'fortran_order': {rng.random() < 0.2}, 'shape': {shape}, }}\n".encode()
+        header = header_of(shape, kind, rng.random() < 0.2)
         if rng.random() < 0.2:
             header = rng.choice([b"(" * 9000, b"{'descr':", b"\xff" * 50, b"1 +\n", header * 40])
-        version = bytes([rng.choice([1, 1, 1, 2, 3, 9]), 0])
-        members[name] = b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + bytes(1000)
+        members[name] = array_of(header, rng.choice([1, 1, 1, 2, 3, 9])) + bytes(1000)
     elif how == 1:
         values = rng.choice([0.0, np.nan, np.inf, -1.0, 1e300, 1e-300, 1000.0])
         shape = [(6, 61), (0, 61), (6, 0), (6,), (61,), (1, 1), (3, 3000), ()][rng.integers(8)]
@@ -247,9 +263,7 @@ def pixels(rng, file):
     image, suffix = np.zeros((120, 160, int(rng.choice([1, 3, 4]))), np.uint8), str(rng.choice([".png", ".jpg"]))
     data = cv2.imencode(suffix, image)[1].tobytes()
     if data[:4] == b"\x89PNG":
-        kind = bytes([rng.choice([8, 16]), rng.choice([0, 2, 3, 6]), 0, 0, rng.choice([0, 1])])
-        body = b"IHDR" + struct.pack(">II", *size) + kind
-        data = data[:12] + body + zipfile.crc32(body).to_bytes(4, "big") + data[33:]
+        data = pixels_of(data, size, (rng.choice([8, 16]), rng.choice([0, 2, 3, 6]), 0, 0, rng.choice([0, 1])))
     elif (at := data.find(b"\xff\xc0")) > 0:
         data = data[: at + 5] + struct.pack(">HH", size[1] % 65536, size[0] % 65536) + data[at + 9 :]
         if rng.random() < 0.3:
@@ -257,9 +271,15 @@ def pixels(rng, file):
     file.write_bytes(data)
     stated = file.parents[2] / "session.json"
     if rng.random() < 0.5 and stated.is_file() and not stated.is_symlink():  # no pipe by an earlier damage
-        session = json.loads(stated.read_text())
-        session["rig"]["cameras"][file.parent.name] |= {"width": size[0], "height": size[1]}
-        stated.write_text(json.dumps(session))
+        state_size(file, size)
+
+
+def state_size(file, size):
+    """Another size of the images of a camera in session.json."""
+    stated = file.parents[2] / "session.json"
+    session = json.loads(stated.read_text())
+    session["rig"]["cameras"][file.parent.name] |= {"width": size[0], "height": size[1]}
+    stated.write_text(json.dumps(session))
 
 
 def other(rng, file):
@@ -288,29 +308,29 @@ def other(rng, file):
 
 def use(rng, path):
     """Everything that reads a session, and some that writes; the errors that came out."""
-    if (path / "rig.json").exists() or path.name == "rig":
+    if (path / "rig.json").exists():
         return [_caught(read_rig_file, path / "rig.json")]  # what it names belongs to who wrote it
-    out = [_caught(_read, path, [None, rng.random() < SURVEYED][rng.integers(2)])]
-    if rng.random() < 0.3:
-        out.append(_caught(_go_on if rng.random() < 0.7 else finish, path))
-    return out
+    surveyed = rng.random() < SURVEYED
+    read = [validate, _survey if surveyed else read_all][rng.integers(2)]
+    writing = [_go_on if rng.random() < 0.7 else finish] * (rng.random() < 0.3)
+    return [_caught(work, path) for work in (read, *writing)]
 
 
-def _read(path, images):
-    if images is None:
-        return validate(path)
+def _survey(path):
+    views_of(read_all(path))
+
+
+def read_all(path):
+    """What `calibrate` reads of a session besides its images."""
     session = open_session(path)
     read_truth(session)
     file_hashes(session)
-    return views_of(session) if images else None
+    return session
 
 
 def _go_on(path):
     with recorder(path) as writer:
-        number = max(writer.finished, default=0) + 1
-        writer.begin_placement(number)
-        record(writer, number)
-        writer.finish_placement()
+        add(writer, max(writer.finished, default=0) + 1)
 
 
 def _caught(work, *arguments):
@@ -318,20 +338,16 @@ def _caught(work, *arguments):
     try:
         work(*arguments)
     except Exception as error:
-        causes = [error]
-        while causes[-1].__cause__ is not None:
-            causes.append(causes[-1].__cause__)
-        if any(isinstance(e, MemoryError) or "nsufficient memory" in str(e) for e in causes):
-            return "memory", repr(causes[-1])[:300], traceback.format_exc()
-        if isinstance(error, SessionError | RigFileError) or (isinstance(error, OSError) and work in (_go_on, finish)):
-            return None
-        frames = traceback.extract_tb(error.__traceback__)
-        ours = frames[-1].filename.startswith(LIBRARY)
-        if work is _read and isinstance(error, ValueError) and ours:
-            return None  # what the preprocessing raises itself is documented as ValueError
-        place = next(f for f in reversed(frames) if f.filename.startswith(LIBRARY) or f is frames[0])
-        where = f"{Path(place.filename).name}:{place.lineno}"
-        return "foreign", f"{type(error).__name__} at {where}: {str(error)[:200]}", traceback.format_exc()
+        trace, frames = traceback.format_exc(), traceback.extract_tb(error.__traceback__)
+        if "MemoryError" in trace or "nsufficient memory" in trace:
+            return "memory", repr(error)[:300], trace
+        ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
+        if work in (read_all, _survey) and frames[-1].filename.startswith(LIBRARY):
+            ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
+        if not isinstance(error, tuple(ours)):
+            place = next(f for f in reversed(frames) if f.filename.startswith(LIBRARY) or f is frames[0])
+            where = f"{Path(place.filename).name}:{place.lineno}"
+            return "foreign", f"{type(error).__name__} at {where}: {str(error)[:200]}", trace
     return None
 
 
@@ -342,20 +358,18 @@ class Watch:
     """Tells of files that are opened outside of a case's folder."""
 
     def __init__(self, folder):
-        self.libc, self.case, self.seen = ctypes.CDLL(None, use_errno=True), str(folder / "case"), []
+        self.libc, self.case, self.seen, self.on = ctypes.CDLL(None, use_errno=True), str(folder / "case"), [], False
         self.handle = self.libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         everything = 0x3EF & ~0x10  # access, modify, attrib, close-write, open, moves, create, delete
         for path in (folder / "outside", *(folder / "outside").iterdir()):
             assert self.libc.inotify_add_watch(self.handle, os.fsencode(path), everything) >= 0
-        self.on = False
         sys.addaudithook(self._heard)
 
     def _heard(self, event, arguments):
         if not self.on or event not in ("open", "os.listdir", "os.mkdir", "os.remove", "os.rename", "os.truncate"):
             return
-        path = arguments[0]
-        if isinstance(path, str | bytes | os.PathLike):
-            name = os.fsdecode(path)
+        if isinstance(arguments[0], str | bytes | os.PathLike):
+            name = os.fsdecode(arguments[0])
             inside = name == self.case or name.startswith((self.case + "/", *READ))
             if os.path.isabs(name) and (not inside or ".." in name.split("/")):
                 self.seen.append(f"{event} {name}")
@@ -373,122 +387,88 @@ class Watch:
             return found
 
 
-def run_case(number, seed, sound, folder, watch=None):
+def run_case(number, seed, sound, folder, watch):
     """One case; the findings as (number, kind, text, traceback)."""
-    rng = np.random.default_rng([seed, number])
-    case = folder / "case"
+    rng, case = np.random.default_rng([seed, number]), folder / "case"
     shutil.rmtree(case, ignore_errors=True)
     shutil.copytree(sound / ["scans", "telegrams", "telegrams", "scans", "rig"][number % 5], case, symlinks=True)
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         damage(rng, case)
-    if watch:
-        watch.outside()
-        watch.on = True
+    watch.outside()
+    watch.on = True
     found = [f for f in use(rng, case) if f]
-    if watch:
-        watch.on = False
-        found += [("outside", text, "") for text in watch.outside() if not (case / "rig.json").exists()]
+    watch.on = False
+    found += [("outside", text, "") for text in watch.outside() if not (case / "rig.json").exists()]
     return [(number, *f) for f in found]
 
 
-def _batch(numbers, seed, sound, progress, out):
-    """Runs in a process of its own; `progress` tells which case it is at."""
+def _batch(numbers, seed, base, at):
+    """Runs in a process of its own, which a case that takes too long ends; `at` tells which case it is at."""
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    folder = Path(tempfile.mkdtemp(dir=sound.parent))
-    shutil.copytree(sound / "outside", folder / "outside")
-    watch = Watch(folder)
-    for number in numbers:
-        progress[:16] = struct.pack("<qd", number, time.monotonic())
-        for finding in run_case(number, seed, sound, folder, watch):
-            out.write(json.dumps(finding) + "\n")
-            out.flush()
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        if peak > MEMORY:
-            out.write(json.dumps([number, "memory", f"{peak / 1e6:.0f} MB", ""]) + "\n")
-            break
-    progress[:16] = struct.pack("<qd", numbers[-1] + 1, time.monotonic())
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _child(numbers, seed, sound, progress, log):
-    """A batch in a forked process, which ends here."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say about damaged images
-    with log.open("a") as out:
-        try:
-            _batch(numbers, seed, sound, progress, out)
-        except BaseException:
-            failed = [numbers[0], "fuzzer", "it failed itself", traceback.format_exc()]
-            out.write(json.dumps(failed) + "\n")
-            out.flush()
-    os._exit(0)
+    folder = Path(tempfile.mkdtemp(dir=base))
+    shutil.copytree(base / "sound" / "outside", folder / "outside")
+    watch = Watch(folder)
+    with (base / "findings").open("a", buffering=1) as out:
+        for at.value in numbers:
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # of the processor: a busy machine is no hang
+            signal.setitimer(signal.ITIMER_REAL, 15 * LONGEST_S)
+            try:
+                found = run_case(at.value, seed, base / "sound", folder, watch)
+            except Exception:
+                found = [(at.value, "fuzzer", "it failed itself", traceback.format_exc())]
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+            found += [(at.value, "memory", f"{peak / 1e6:.0f} MB", "")] if peak > MEMORY else []
+            out.writelines(json.dumps(finding) + "\n" for finding in found)
+            if peak > MEMORY:
+                break
+    shutil.rmtree(folder)
 
 
-def run(cases, *, first=0, seed=SEED, workers=1, tell=lambda done: None):
+def run(cases, first, seed, workers, tell):
     """Run cases; the findings as lists [number, kind, text, traceback]."""
-    base = Path(tempfile.mkdtemp(prefix="lrfcal-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
-    sound, log, running = base / "sound", base / "findings", {}
-    findings = []
-    try:
-        sound.mkdir()
-        make_sessions(sound)
-        log.touch()
-        queue = [range(n, min(n + BATCH, first + cases)) for n in range(first, first + cases, BATCH)][::-1]
-        slow = set()  # cases to be tried once more: a busy machine is no hang
+    fork, memory = multiprocessing.get_context("fork"), "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    queue = [range(n, min(n + BATCH, first + cases)) for n in range(first, first + cases, BATCH)][::-1]
+    with tempfile.TemporaryDirectory(prefix="lrfcal-fuzz-", dir=memory) as base:
+        base, findings, running = Path(base), [], {}
+        (base / "sound").mkdir()
+        make_sessions(base / "sound")
         while queue or running:
             while queue and len(running) < workers:
-                numbers, progress = queue.pop(), mmap.mmap(-1, 16)
-                progress[:16] = struct.pack("<qd", numbers[0], time.monotonic())
-                child = os.fork()
-                if not child:
-                    _child(numbers, seed, sound, progress, log)
-                running[child] = numbers, progress
-            time.sleep(0.02)
-            for child, (numbers, progress) in list(running.items()):
-                at, since = struct.unpack("<qd", progress[:16])
-                ended, status = os.waitpid(child, os.WNOHANG)
-                if not ended and time.monotonic() - since > LONGEST_S:
-                    os.kill(child, signal.SIGKILL)
-                    ended, status = os.waitpid(child, 0)[0], "hang"
-                if ended:
-                    del running[child]
-                    if status == "hang" and at not in slow:
-                        slow.add(at)
-                        at -= 1
-                    elif status:
-                        findings.append([at, "hang" if status == "hang" else "crash", f"status {status}", ""])
-                    if at < numbers[-1]:
-                        queue.append(range(at + 1, numbers[-1] + 1))
-                    tell(at)
-        return findings + [json.loads(line) for line in log.read_text().splitlines()]
-    finally:
-        shutil.rmtree(base, ignore_errors=True)
+                at, numbers = fork.RawValue("q", queue[-1][0]), queue.pop()
+                child = fork.Process(target=_batch, args=(numbers, seed, base, at))
+                child.start()
+                running[child.sentinel] = child, numbers, at
+            for ended in multiprocessing.connection.wait(running):
+                child, numbers, at = running.pop(ended)
+                child.join()
+                if child.exitcode:
+                    kind = "hang" if -child.exitcode in (signal.SIGPROF, signal.SIGALRM) else "crash"
+                    findings.append([at.value, kind, f"exit code {child.exitcode}", ""])
+                tell(at.value)
+                queue += [range(at.value + 1, numbers.stop)] * (at.value + 1 < numbers.stop)
+        return findings + [json.loads(line) for line in (base / "findings").read_text().splitlines()]
 
 
 def main():
     """From the command line."""
     options = argparse.ArgumentParser(description=__doc__)
-    for name, value in (("cases", 200_000), ("first", 0), ("seed", SEED), ("workers", os.cpu_count())):
+    for name, value in (("cases", 200_000), ("first", 0), ("seed", SEED), ("workers", os.cpu_count()), ("case", None)):
         options.add_argument(f"--{name}", type=int, default=value)
-    options.add_argument("--case", type=int, help="repeat one case, with its traceback")
     options.add_argument("--out", default="reports/fuzz/findings.jsonl", help="file for the findings, one a line")
     asked = options.parse_args()
     if asked.case is not None:
-        asked.first, asked.cases, asked.workers = asked.case, 1, 1
+        asked.first, asked.cases = asked.case, 1
     began = time.monotonic()
     tell = partial(print, end=" cases\r", file=sys.stderr, flush=True)
-    found = run(asked.cases, first=asked.first, seed=asked.seed, workers=asked.workers, tell=tell)
+    found = run(asked.cases, asked.first, asked.seed, asked.workers, tell)
     Path(asked.out).parent.mkdir(parents=True, exist_ok=True)
     Path(asked.out).write_text("".join(json.dumps({"seed": asked.seed, "finding": f}) + "\n" for f in found))
-    groups = collections.defaultdict(list)
-    for number, kind, text, _ in found:
-        groups[kind, ":".join(text.split(":")[:2])[:100]].append(number)
-    for (kind, what), numbers in groups.items():
-        print(f"{len(numbers):6} {kind} {what}, for instance --seed {asked.seed} --case {numbers[0]}")
-    if asked.case is not None:
-        print("\n".join(f[3] for f in found))
+    for number, kind, text, trace in found:
+        print(f"{kind} {text}: --seed {asked.seed} --case {number}", trace * (asked.case is not None), sep="\n")
     print(f"{asked.cases} cases in {time.monotonic() - began:.0f} s, {len(found)} findings (in {asked.out})")
-    return 1 if found else 0
+    return bool(found)
 
 
 if __name__ == "__main__":

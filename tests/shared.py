@@ -1,8 +1,10 @@
-"""What the processes of a test run share."""
+"""What the processes of a test run share, and where things are."""
 
 import os
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[1]
+QUICK = ROOT / "data" / "sim_quick"
 FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
 STRINGS = int(os.environ.get("LRFCAL_FUZZ", 20_000))  # random byte strings for each parser; a million in make fuzz
 

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import QUICK
 
 from lrfcal_lib.preprocess.prepared import prepare_scans
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
-
-QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 
 
 @pytest.fixture
@@ -24,115 +23,102 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def session(tmp_path):
-    shutil.copytree(QUICK, tmp_path / "quick")
-    return open_session(tmp_path / "quick")
+    return open_session(shutil.copytree(QUICK, tmp_path / "quick"))
 
 
-@pytest.fixture
-def calls():
-    return []
+class Stage:
+    """A stage that knows how often it was worked out."""
+
+    def __init__(self):
+        self.calls = 0
+
+        def stage(session, *args, **options):
+            """Counts."""
+            self.calls += 1
+            if "fail" in options:
+                raise ValueError("no board")
+            return {"count": self.calls, "values": np.arange(3.0)}
+
+        self.run = cache.cached(stage)
 
 
-@pytest.fixture
-def stage(calls):
-    @cache.cached
-    def stage(session, *args, **options):
-        """Says so."""
-        calls.append((args, options))
-        return {"count": len(calls), "values": np.arange(3.0)}
-
-    return stage
-
-
-def test_the_same_is_worked_out_once(folder, session, stage, calls):
-    first, again = stage(session, 1, joint=True), stage(open_session(session.path), 1, joint=True)
-    assert len(calls) == 1 and again["count"] == 1 and np.array_equal(first["values"], again["values"])
+def test_the_same_is_worked_out_once(folder, session):
+    stage = Stage()
+    first, again = stage.run(session, 1, joint=True), stage.run(open_session(session.path), 1, joint=True)
+    assert stage.calls == again["count"] == 1 and np.array_equal(first["values"], again["values"])
     assert [file.suffix for file in folder.iterdir()] == [".pickle"]
 
 
-def test_nothing_is_kept_unless_a_folder_is_named(session, stage, calls, tmp_path, monkeypatch):
+def test_nothing_is_kept_unless_a_folder_is_named(session, tmp_path, monkeypatch):
     monkeypatch.delenv(cache.VARIABLE, raising=False)
-    stage(session), stage(session)
-    assert len(calls) == 2 and list(tmp_path.rglob("*.pickle")) == []
+    stage = Stage()
+    stage.run(session), stage.run(session)
+    assert stage.calls == 2 and list(tmp_path.rglob("*.pickle")) == []
 
 
-def other_scan(session, stage):
+def other_scan(session, patch):
     session.scans["ranges"][0, 0] += 0.001
-    stage(session, 1)
 
 
-def other_image(session, stage):
+def other_image(session, patch):
     file = Path(session.image_records[-1].file)
     file.write_bytes(file.read_bytes() + b"\0")
-    stage(session, 1)
 
 
-def missing_image(session, stage):
-    Path(session.image_records[0].file).unlink()
-    stage(session, 1)
-
-
-def other_library(session, stage):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "library", lambda: b"another version")
-        stage(session, 1)
-
-
-OTHERS = {
-    "argument": lambda session, stage: stage(session, 2),
-    "option": lambda session, stage: stage(session, 1, joint=True),
-    "statement": lambda session, stage: stage(replace(session, platform_sigma=(0.1, 0.1)), 1),
-    "scan": other_scan, "image": other_image, "missing image": missing_image, "library": other_library,
+OTHERS = {  # arguments of the second call, or what is changed before it
+    "argument": (2,), "option": (1, "joint"), "scan": other_scan, "image": other_image,
+    "missing image": lambda session, patch: Path(session.image_records[0].file).unlink(),
+    "statement": lambda session, patch: replace(session, platform_sigma=(0.1, 0.1)),
+    "library": lambda session, patch: patch.setattr(cache, "library", lambda: b"another version"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("other", OTHERS)
-def test_what_is_different_is_worked_out_again(folder, session, stage, calls, other):
-    session = replace(session, scans={key: values.copy() for key, values in session.scans.items()})
-    stage(session, 1)
-    OTHERS[other](session, stage)
-    assert len(calls) == 2
+@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
+def test_what_is_different_is_worked_out_again(folder, session, monkeypatch, other):
+    stage = Stage()
+    stage.run(session, 1)
+    if isinstance(other, tuple):
+        stage.run(session, other[0], **dict.fromkeys(other[1:], True))
+    else:
+        stage.run(other(session, monkeypatch) or session, 1)
+    assert stage.calls == 2
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o1777, 0o775, 0o702])
-def test_a_folder_that_others_may_write_to_is_refused(folder, session, stage, calls, mode):
+def test_a_folder_that_others_may_write_to_is_refused(folder, session, mode):
     folder.mkdir()
     folder.chmod(mode)
+    stage = Stage()
     with pytest.raises(ValueError, match=f"others may write to '{folder}' .*mode {mode:o}.*chmod go-w"):
-        stage(session)
+        stage.run(session)
     folder.chmod(0o755)
-    stage(session)
-    assert len(calls) == 1
+    stage.run(session)
+    assert stage.calls == 1
 
 
-def test_a_folder_of_somebody_else_is_refused(folder, session, stage, monkeypatch):
+def test_a_folder_of_somebody_else_is_refused(folder, session, monkeypatch):
     folder.mkdir()
     found = folder.stat()
-    monkeypatch.setattr(cache.os, "geteuid", lambda: found.st_uid + 1)
+    monkeypatch.setattr(cache.os, "geteuid", lambda: found.st_uid and found.st_uid + 1)
     if found.st_uid == 0:  # who may write anywhere
         os.chown(folder, 1, -1)
-        monkeypatch.setattr(cache.os, "geteuid", lambda: 0)
     with pytest.raises(ValueError, match="others may write"):
-        stage(session)
+        Stage().run(session)
 
 
-def test_the_folder_is_made_for_oneself(folder, session, stage):
+def test_the_folder_is_made_for_oneself(folder, session):
     before = os.umask(0)
     try:
-        stage(session)
+        Stage().run(session)
     finally:
         os.umask(before)
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
 def test_a_stage_that_fails_leaves_nothing(folder, session):
-    @cache.cached
-    def fails(session):
-        raise ValueError("no board")
-
     for _ in range(2):
         with pytest.raises(ValueError, match="no board"):
-            fails(session)
+            Stage().run(session, fail=True)
     assert not folder.exists()
 
 

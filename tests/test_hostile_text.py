@@ -1,13 +1,12 @@
 """Text of a session is text: it is refused, or nothing of it runs in a page and all of it can be read there."""
 
-import csv
 import json
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+from shared import QUICK, ROOT
 from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_report import write_notebook
 
@@ -17,8 +16,6 @@ from lrfcal_lib.report import notebook, report
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.read import validate
 
-ROOT = Path(__file__).resolve().parents[1]
-QUICK = ROOT / "data" / "sim_quick"
 IMAGE = '"><img src=x onerror="window.pwned=1">'
 HOSTILE = f"{IMAGE}</title></script></pre></textarea><script>window.pwned=1</script>&lt;b&gt;"
 # every text of session.json by its place; whether it is refused, or else what a report shows
@@ -59,12 +56,10 @@ def replace(folder, old, new):
 
 
 def rename_image(folder, name):
-    with (folder / "images.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    old, rows[1][2] = rows[1][2], f"images/left/{name}"
-    (folder / old).rename(folder / rows[1][2])
-    with (folder / "images.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+    table = pd.read_csv(folder / "images.csv", dtype=str)
+    old, table.loc[0, "file"] = table.file[0], f"images/left/{name}"
+    (folder / old).rename(folder / table.file[0])
+    table.to_csv(folder / "images.csv", index=False, lineterminator="\n")
 
 
 @pytest.fixture

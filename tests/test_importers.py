@@ -1,8 +1,5 @@
 """Other people's recordings become sessions without loss."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -77,24 +74,12 @@ def test_range_bearing_and_pitch_are_recovered():
         seen = np.isfinite(grid[line])
         np.testing.assert_allclose(np.degrees(bearings[seen]), 90 - b[::-1], atol=1e-9)  # ours ascend to the left
         np.testing.assert_allclose(grid[line, seen], r[::-1], atol=1e-12)
+    assert recover_polar(np.concatenate([points[: len(rows[0])]] * 2))[0].shape[0] == 2, "two lines at one pitch"
 
 
-def test_two_scan_lines_at_one_pitch_stay_apart():
-    points = np.concatenate([authors_points(np.full(5, 1.5), np.arange(5) / 10, 1.2) for _ in range(2)])
-    assert recover_polar(points)[0].shape[0] == 2
-
-
-def another_rig(folder):
-    recover_polar(authors_points(np.full(50, 1.5), np.arange(50) / 10, 1.2) + [0, 0, 0.0004], "cloud 7")
-
-
-def another_sensor(folder):
-    recover_polar(authors_points(np.full(5, 1.5), 39.6 + np.arange(5) / 10, 1.2))
-
-
-def no_values(folder):
-    (folder / "c.m").write_text("fc = [ 1 ; 2 ];\n")
-    read_bouguet(folder / "c.m")
+def written(file, text):
+    file.write_text(text)
+    return file
 
 
 def without(pattern):
@@ -111,19 +96,18 @@ def without(pattern):
 def cloud(change):
     """Read a cloud with another text."""
 
-    def work(folder):
-        file = folder / "plane_01.pcd"
-        file.write_text(change(file.read_text()))
-        read_pcd(file)
+    return lambda folder: read_pcd(written(folder / "a.pcd", change((folder / "plane_01.pcd").read_text())))
 
-    return work
+
+def line(first):
+    return authors_points(np.full(50, 1.5), first + np.arange(50) / 10, 1.2)
 
 
 REFUSED = [
-    (another_rig, r"cloud 7: rebuilding the points misses by 0\.\d+ mm, more than 0\.01 mm"),
-    (another_sensor, r"bearings reach 50\.0 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
-    (no_values, r"c\.m: no value of cc, kc"),
-    (lambda folder: read_pcd(folder / "a.pcd"), r"a\.pcd: No such file"),
+    (lambda _: recover_polar(line(0) + [0, 0, 4e-4], "c 7"), r"c 7: rebuilding the points misses by 0\.\d+ mm, more"),
+    (lambda _: recover_polar(line(39.6)), r"bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
+    (lambda folder: read_bouguet(written(folder / "c.m", "fc = [ 1 ; 2 ];\n")), r"c\.m: no value of cc, kc"),
+    (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),
     (lambda folder: import_lasersetero(folder, folder / "dst", intrinsics="best"), "'own' or 'published', got 'best'"),
     (without("plane_*"), "plane_.*"),
     (without("left_*"), "left_.*"),
@@ -173,12 +157,6 @@ def test_published_intrinsics(source, tmp_path):
     np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
 
 
-def test_an_existing_session_is_left_alone(source, tmp_path):
-    import_lasersetero(source, tmp_path / "dst")
-    with pytest.raises(SessionError, match="exists already"):
-        import_lasersetero(source, tmp_path / "dst")
-
-
 # ---------------------------------------------------------------------------------------------- command line
 
 
@@ -191,7 +169,7 @@ def test_command_line(source, tmp_path, capsys):
     assert main(["check", target]) == 1
     assert "0001.png" in capsys.readouterr().out
     assert main(["import", "lasersetero", str(source), target]) == 1
-    assert "error: " in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [[], ["fly"], ["check"], ["check", "a", "--fast"], ["import", "lasersetero", "a"]])
@@ -199,11 +177,6 @@ def test_wrong_commands(words, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert "usage:" in capsys.readouterr().err
-
-
-def test_help_needs_no_heavy_library():
-    code = "import sys; from lrfcal_lib.__main__ import parser; parser(); print('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
 
 
 # ---------------------------------------------------------------------------------------------- the real recording

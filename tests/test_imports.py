@@ -62,26 +62,27 @@ def test_no_circle_among_modules():
 def test_the_walk_sees_imports(tmp_path):
     source = tmp_path / "x.py"
     source.write_text("def f():\n    from lrfcal_lib.plots import rig\n    import lrfcal_lib.solvers.joint\n")
-    assert imported(source) == {"lrfcal_lib.plots.rig", "lrfcal_lib.solvers.joint"} and not imported(
-        source, lazily=False
-    )
+    assert imported(source) == {"lrfcal_lib.plots.rig", "lrfcal_lib.solvers.joint"}
+    assert not imported(source, lazily=False)
 
 
-def test_solvers_and_preprocessing_need_no_heavy_library():
-    code = """
-import importlib, pkgutil, sys
-import lrfcal_lib
+WALK = """
+import importlib, pkgutil, lrfcal_lib
 for name in ("model", "fit", "session", "preprocess", "solvers"):
     module = importlib.import_module("lrfcal_lib." + name)
     for found in pkgutil.walk_packages(getattr(module, "__path__", []), module.__name__ + "."):
         importlib.import_module(found.name)
-print(*sorted({"open3d", "pandas", "matplotlib", "serial", "IPython"} & set(sys.modules)))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == ""
+LIGHT = {  # code, what it must not load
+    "solvers and preprocessing": (WALK, {"open3d", "pandas", "matplotlib", "serial", "IPython"}),
+    "the package": ("import lrfcal_lib", {"numpy"}),
+    "help": ("from lrfcal_lib.__main__ import parser; parser()", {"numpy"}),
+}
 
 
-def test_importing_the_package_loads_nothing():
-    code = "import sys, lrfcal_lib; print('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+@pytest.mark.parametrize("what", LIGHT)
+def test_no_heavy_library_is_loaded_by(what):
+    code, heavy = LIGHT[what]
+    shown = f"{code}\nimport sys\nprint(*{heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr

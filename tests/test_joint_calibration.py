@@ -13,7 +13,6 @@ from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.evaluate.export import calibration_record
-from lrfcal_lib.model.geometry import transform_difference
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
@@ -37,31 +36,27 @@ def truth():
 
 
 def test_the_session_asks_for_its_unknowns(joint):
-    """Cameras on the head that see the board at several pitch angles show the scale of the pitch; no sweep is off."""
-    assert "pitch_scale" in joint.settings["sensor"]
-    assert "sweep" not in joint.settings
-    assert joint.settings["prior"].sigma_offset == joint.prepared.session.platform_sigma[1]
+    """The scale of the pitch is free with the axis: held at zero, a wrong one would go into the axis; no sweep is off.
 
-
-def test_the_scale_of_the_pitch_is_free_with_the_axis_whatever_the_images(joint):
-    """Held at zero, a wrong scale would go into the axis: also with cameras on the base, and one image a placement."""
-    views = {name: found[:1] for name, found in all_views(joint.prepared).items()}
-    seen = observe_joint(joint.prepared, views)
-    assert "pitch_scale" in pipeline.joint_settings(joint.prepared, seen)["sensor"]
+    Also with one image a placement, and with cameras on the base.
+    """
+    seen = observe_joint(joint.prepared, {name: found[:1] for name, found in all_views(joint.prepared).items()})
+    for settings in (joint.settings, pipeline.joint_settings(joint.prepared, seen)):
+        assert "pitch_scale" in settings["sensor"] and "sweep" not in settings
+        assert settings["prior"].sigma_offset == joint.prepared.session.platform_sigma[1]
 
 
 def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
     """Cameras on the base, boards up to 17 degrees above and below; chance alone exceeds 1.75 once in a thousand."""
 
     def high(rng, count):
-        turns = [Rotation.from_rotvec([angle, 0, 0]) for angle in rng.uniform(-0.3, 0.3, count)]
+        turns = Rotation.from_rotvec(np.outer(rng.uniform(-0.3, 0.3, count), [1, 0, 0]))
         return [RigidTransform.from_rotation(R) * T for R, T in zip(turns, board_poses(rng, count), strict=True)]
 
     fine, square = {"pitch_step": np.radians(0.5), "sigma_range": 0.003, "sigma_px": 0.1}, 0.0
     for seed in range(3):
         obs, truth, _ = draw(np.random.default_rng(seed), 20, mount="platform", stretch=0.002, lean=high, **fine)
-        sensor = pipeline.joint_settings(joint.prepared, obs)["sensor"]
-        found = solve_joint(obs, sensor=sensor)
+        found = solve_joint(obs, sensor=pipeline.joint_settings(joint.prepared, obs)["sensor"])
         square += square_per_number(found, truth) / 3
     assert square < 1.75
 
@@ -77,15 +72,6 @@ def test_errors_agree_with_their_sigma(joint, truth):
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
     assert (table.translation_error_mm < 3.5 * table.translation_sigma_mm).all()
     assert table.translation_error_mm.max() < 25
-
-
-def test_it_is_far_better_than_lines(found, joint, truth):
-    for camera in joint.observations.cameras:
-        errors = [
-            transform_difference(found.solutions[camera, name].transform, truth.cameras[camera])
-            for name in ("joint", "line")
-        ]
-        assert errors[0][1] < 0.5 * errors[1][1]
 
 
 def test_every_placement_is_left_out_once(joint):
@@ -114,8 +100,7 @@ def test_it_is_handed_over_with_its_platform_and_sensor(found):
     record = calibration_record(found, "joint")
     np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
     assert set(record["cameras"]) == set(found.joint.observations.cameras)
-    assert record["sensor"]["range_offset"]["sigma"] > 0
-    assert record["sensor"]["excluded"] == []
+    assert record["sensor"]["range_offset"]["sigma"] > 0 and record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
     assert min(edges) <= tables.joint_fit(found.joint)["edge_rms_px"] <= max(edges)

@@ -34,7 +34,7 @@ def scant(request, tmp_path_factory):
 @pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
 def test_runs_to_the_end_and_says_what_is_not_asked(path, scant):
     kind, session, stages = scant
-    told = run_plainly(path, session, stages)
+    told = run_plainly(path, session, stages, stages / "report")
     assert SAYS.get((kind, path.stem[:2]), "") in told
     assert " nan " not in told
 

@@ -15,50 +15,38 @@ from lrfcal_lib.preprocess.edges_in_scan import EdgeCells
 
 HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
 BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))
-MODEL = EdgeModel(log_odds=-0.8, softness=0.05, range_offset=0.004, T_head_lrf=HEAD)
+SENSOR = {"edge_log_odds": -0.8, "edge_log_softness": np.log(0.05), "range_offset": 0.004}
+MODEL = EdgeModel(SENSOR, T_head_lrf=HEAD)
 STEP = np.radians(0.25)
 
 
-def sweep(pose, rng, model=MODEL, sigma=0.003, deviation=0.0, board=BOARD, bend=0.0):
+def sweep(pose, rng, sigma=0.003, bend=0.0):
     """(cells, face, names) of a board drawn from the model of the edges itself."""
-    bearing, pitch = np.meshgrid(np.radians(np.arange(60, 120.1, 0.25)), np.radians(np.arange(-18, 18.1, 0.25)))
-    origin = lrf_to_platform(np.zeros(bearing.shape + (3,)), pitch, HEAD)
-    rays = lrf_to_platform(polar_to_points(np.ones(bearing.shape), bearing), pitch, HEAD) - origin
-    o, d = pose.inv().apply(origin.reshape(-1, 3)), pose.rotation.inv().apply(rays.reshape(-1, 3))
-    r = -o[:, 2] / d[:, 2]
-    for _ in range(4):
-        at = o + r[:, None] * d
-        r = (bend * (at[:, 0] - 0.25) ** 2 - o[:, 2]) / d[:, 2]
-    lines = board.lines()
-    inside = at[:, :2] @ lines[:, :2].T + lines[:, 2]
-    across = d[:, :2] @ lines[:, :2].T
+    bearing, pitch = (a.ravel() for a in np.meshgrid(np.radians(np.arange(60, 120.1, 0.25)),
+                                                     np.radians(np.arange(-18, 18.1, 0.25))))  # fmt: skip
+    origin = lrf_to_platform(np.zeros((len(bearing), 3)), pitch, HEAD)
+    rays = lrf_to_platform(polar_to_points(1.0, bearing), pitch, HEAD) - origin
+    o, d, r = pose.inv().apply(origin), pose.rotation.inv().apply(rays), 0.0
+    for _ in range(5):
+        at = o + r * d
+        r = ((bend * (at[:, 0] - 0.25) ** 2 - o[:, 2]) / d[:, 2])[:, None]
+    lines, r = BOARD.lines(), r[:, 0]
+    inside, across = at[:, :2] @ lines[:, :2].T + lines[:, 2], d[:, :2] @ lines[:, :2].T
     u = inside * np.abs(d[:, 2:]) / np.hypot(across, d[:, 2:])
     radius = 0.008 + 0.006 * r
-    own = edge_shift(model.log_odds + deviation * np.ones(len(lines)), radius[:, None])[0]
-    jitter = model.softness * radius * rng.standard_normal(len(r))
-    hit = ((u - own).max(axis=1) < jitter).reshape(bearing.shape)
-    line, beam = np.nonzero(np.abs(u.max(axis=1)).reshape(bearing.shape) < 0.02)
-    flat = line * bearing.shape[1] + beam
-    second = np.sort(inside[flat], axis=1)[:, -2]
-    keep = second < -0.025
-    line, beam, flat = line[keep], beam[keep], flat[keep]
-    zero = np.zeros(len(flat))
-    cells = EdgeCells(
-        1, line, beam, bearing[line, beam], pitch[line, beam], hit[line, beam], u[flat].argmax(axis=1), r[flat],
-        radius[flat], zero, zero > 0, zero + STEP,
-    )  # fmt: skip
+    hit = u.max(axis=1) - edge_shift(-0.8, radius)[0] < 0.05 * radius * rng.standard_normal(len(r))
+    some = np.flatnonzero((np.abs(u.max(axis=1)) < 0.02) & (np.sort(inside, axis=1)[:, -2] < -0.025))
+    zero, number = np.zeros(len(some)), np.arange(len(some))
+    cells = EdgeCells(1, number, number, bearing[some], pitch[some], hit[some], u[some].argmax(axis=1), r[some],
+                      radius[some], zero, zero > 0, zero + STEP)  # fmt: skip
     face = np.flatnonzero(inside.max(axis=1) < -0.03)
-    ranges = r[face] + model.range_offset + sigma * rng.standard_normal(len(face))
-    points = polar_to_points(ranges, bearing.ravel()[face])
-    return cells, (points, pitch.ravel()[face], sigma), dict(enumerate(board.edges))
+    ranges = r[face] + 0.004 + sigma * rng.standard_normal(len(face))
+    return cells, (polar_to_points(ranges, bearing[face]), pitch[face], sigma), dict(enumerate(BOARD.edges))
 
 
 def poses(count, seed=0):
-    rng = np.random.default_rng(seed)
-    centre = (0.25, 0.2)
-    return [
-        facing(rng.uniform(1.2, 2.0), rng.uniform(10, 80), rng.uniform(-25, 25), centre=centre) for _ in range(count)
-    ]
+    places = np.random.default_rng(seed).uniform([1.2, 10, -25], [2.0, 80, 25], (count, 3))
+    return [facing(*place, centre=(0.25, 0.2)) for place in places]
 
 
 def errors(measured):
@@ -80,7 +68,8 @@ def test_the_wrong_odds_make_the_board_larger_by_twice_the_shift():
     rng = np.random.default_rng(2)
     cells, face, names = sweep(poses(1)[0], rng)
     right = measure_outline(cells, face, names, BOARD.edges, MODEL)
-    wrong = measure_outline(cells, face, names, BOARD.edges, replace(MODEL, log_odds=0.4))
+    model = replace(MODEL, sensor=SENSOR | {"edge_log_odds": 0.4})
+    wrong = measure_outline(cells, face, names, BOARD.edges, model)
     shift = np.subtract(*(edge_shift(v, np.median(cells.radius))[0] for v in (-0.8, 0.4)))
     for name in BOARD.edges:
         assert wrong.lengths[name] - right.lengths[name] == pytest.approx(2 * shift, rel=0.15)
@@ -90,7 +79,7 @@ def test_uncertain_odds_show_in_the_lengths():
     cells, face, names = sweep(poses(1)[0], np.random.default_rng(3))
     sure, common, each = (
         measure_outline(cells, face, names, BOARD.edges, replace(MODEL, **given)).sigma["top"]
-        for given in ({}, {"log_odds_sigma": 0.3}, {"spread": 0.3})
+        for given in ({}, {"sigma": {"edge_log_odds": 0.3}}, {"spread": 0.3})
     )
     assert common > each > 2 * sure  # what is common to opposite sides adds up, what differs adds in squares
 

@@ -3,25 +3,17 @@
 import json
 import logging
 import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
-from fake_rig import SIZE, make_rig, opened, rig_data
+from fake_rig import SIZE, make_rig, opened, raising, rig_data
 
 from lrfcal_lib.acquire import collector
+from lrfcal_lib.acquire import panel as page
 from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
-from lrfcal_lib.acquire.panel import (
-    Panel,
-    error_html,
-    jpeg,
-    lights_html,
-    png,
-    result_html,
-    scan_picture,
-    sweep_picture,
-)
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
@@ -205,14 +197,11 @@ def test_nothing_works_without_a_rig():
     assert made.look().ranges is None and made.task() is None
 
 
-@pytest.mark.parametrize(
-    "rig, error, said",
-    [
-        ("practise", RigFileError, "emulated are practice, sim_quick, sim_lms221"),
-        ("missing.json", RigFileError, "No such file.*emulate"),
-        ("rig.json", PortError, "head: .*fake_head"),
-    ],
-)
+@pytest.mark.parametrize(("rig", "error", "said"), [
+    ("practise", RigFileError, "emulated are practice, sim_quick, sim_lms221"),
+    ("missing.json", RigFileError, "No such file.*emulate"),
+    ("rig.json", PortError, "head: .*fake_head"),
+])  # fmt: skip
 def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.json").write_text(json.dumps(rig_data(cameras=())))
@@ -240,7 +229,7 @@ def test_data_without_a_board_give_no_calibration(connected):
 
 def test_a_scan_from_above_is_drawn_where_it_is():
     bearings = np.radians([60.0, 90.0, 120.0])
-    empty, middle, right = (scan_picture(ranges, bearings, VIEW) for ranges in np.where(
+    empty, middle, right = (page.scan_picture(ranges, bearings, VIEW) for ranges in np.where(
         [[0, 0, 0], [0, 1, 0], [1, 0, 0]], 1.5, np.nan))  # fmt: skip
     painted = [np.argwhere((image != empty).any(axis=2)).mean(axis=0) for image in (middle, right)]
     assert painted[0][1] == pytest.approx(199.5, abs=1.5) and painted[1][1] > 240  # bearing 60 deg is to the right
@@ -250,9 +239,9 @@ def test_a_scan_from_above_is_drawn_where_it_is():
 @pytest.mark.parametrize("near, far, same", [(0.5, 1.9, True), (0.5, 3.5, False), (81.0, 300.0, True)])
 def test_the_view_reaches_as_far_as_the_points(near, far, same):
     bearing = np.full(20, np.pi / 2)
-    circles = [(scan_picture(np.full(20, r), bearing, VIEW)[:, 250:] for r in (near, far))]
+    circles = [(page.scan_picture(np.full(20, r), bearing, VIEW)[:, 250:] for r in (near, far))]
     assert all(np.array_equal(*pair) == same for pair in circles)
-    assert scan_picture(np.full(20, far), bearing, VIEW).shape == (300, 400, 3)
+    assert page.scan_picture(np.full(20, far), bearing, VIEW).shape == (300, 400, 3)
 
 
 def test_a_sweep_grows_line_by_line():
@@ -260,7 +249,7 @@ def test_a_sweep_grows_line_by_line():
     ranges[80:] = 1.0  # near at the large bearings, which are on the left
 
     def drawn(rows):
-        return sweep_picture(rows, bearings, VIEW, np.radians([-10.0, 10.0]), np.radians(1.0))
+        return page.sweep_picture(rows, bearings, VIEW, np.radians([-10.0, 10.0]), np.radians(1.0))
 
     empty, high, low = drawn({}), drawn({np.radians(9.0): ranges}), drawn({np.radians(-9.0): ranges})
     rows, columns = np.nonzero((high != empty).any(axis=2))
@@ -275,8 +264,8 @@ def test_a_sweep_grows_line_by_line():
 def test_images_become_files_no_wider_than_asked():
     image = np.zeros((30, 40, 3), np.uint8)
     for width, expected in ((20, (15, 20, 3)), (400, (30, 40, 3))):
-        assert cv2.imdecode(np.frombuffer(jpeg(image, width), np.uint8), 1).shape == expected
-    assert (cv2.imdecode(np.frombuffer(png(image + 7), np.uint8), 1) == 7).all()
+        assert cv2.imdecode(np.frombuffer(page.jpeg(image, width), np.uint8), 1).shape == expected
+    assert (cv2.imdecode(np.frombuffer(page.png(image + 7), np.uint8), 1) == 7).all()
 
 
 # ------------------------------------------------------------------------------------------------------- words
@@ -284,13 +273,13 @@ def test_images_become_files_no_wider_than_asked():
 
 def test_lights_and_errors_say_their_state_in_signs_and_words():
     found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
-    said = lights_html("Quality", found)
+    said = page.lights_html("Quality", found)
     for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
         assert sign in said
-    assert "→ next" in lights_html("", [Light("information", "warn", "put it there")])
-    assert "as soon as a placement is recorded" in lights_html("Quality", ())
-    assert error_html("failed", "") == ""
-    assert "check the plug" in error_html("connecting failed", "check the plug") and "✕" in error_html("a", "b")
+    assert "→ next" in page.lights_html("", [Light("information", "warn", "put it there")])
+    assert "as soon as a placement is recorded" in page.lights_html("Quality", ())
+    assert page.error_html("failed", "") == ""
+    assert "✕" in page.error_html("a", "b") and "check the plug" in page.error_html("a", "check the plug")
 
 
 @pytest.mark.parametrize("answer, said", [("yes", "✓ can be trusted"), ("with care", "! use"), ("no", "✕ cannot be")])
@@ -298,18 +287,15 @@ def test_a_result_says_whether_to_trust_it(answer, said):
     sigma = np.full(3, 0.5)
     poses = {"left": (np.array([90.0, 1.0, -2.0]), np.array([120.0, 30.0, -4.0]), sigma, sigma)}
     sentences = ("Use this calibration with care: few placements.", "Record next: there.")
-    shown = result_html(collector.Result(answer, sentences, "joint", poses, None, None))
+    shown = page.result_html(collector.Result(answer, sentences, "joint", poses, None, None))
     for text in (said, "Few placements.", "Record next", "90.00 ± 0.50", "-4.0 ± 0.5", "left"):
         assert text in shown
-    assert "<table" not in result_html(collector.Result("no", sentences, "", {}, None, None))
+    assert "<table" not in page.result_html(collector.Result("no", sentences, "", {}, None, None))
 
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):
-    def refuse(prepared):
-        raise collector.DegenerateGeometry("one placement only")
-
     monkeypatch.setattr(collector, "prepare", lambda session: session)
-    monkeypatch.setattr(collector, "calibrate_jointly", refuse)
+    monkeypatch.setattr(collector, "calibrate_jointly", raising(collector.DegenerateGeometry("one placement only")))
     assert collector.advise(None) == "not determined yet: one placement only"
 
 
@@ -318,7 +304,7 @@ def test_advice_where_nothing_is_determined_yet(monkeypatch):
 
 @pytest.fixture
 def panel(fake, tmp_path):
-    with Panel(fake(), tmp_path / "s") as made:
+    with page.Panel(fake(), tmp_path / "s") as made:
         yield made
 
 
@@ -330,12 +316,10 @@ def pressed(panel, name):
 
 
 def wait_until(holds):
-    done = threading.Event()
-    for _ in range(int(WAIT_S / 0.05)):
-        if holds():
-            return
-        done.wait(0.05)
-    pytest.fail("it does not happen")
+    end = time.monotonic() + WAIT_S
+    while not holds():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.05)
 
 
 def test_buttons_do_it_all(panel):
@@ -377,7 +361,7 @@ def test_errors_appear_in_the_panel(panel, tmp_path):
 def test_a_lost_camera_is_said_until_it_is_back(panel):
     panel.connect()
     camera, parts = panel.collector.rig.cameras["left"], panel.parts
-    newest, camera.newest = camera.newest, lambda **_: (_ for _ in ()).throw(LineLost("camera left is lost: its plug"))
+    newest, camera.newest = camera.newest, raising(LineLost("camera left is lost: its plug"))
     wait_until(lambda: "camera left is lost: its plug" in parts.error.value)
     assert "left" not in panel.collector.view.frames
     with pytest.raises(LineLost, match="its plug"):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -202,32 +203,17 @@ def test_frames_draw_the_columns_of_their_rotation(ax):
     assert [to_hex(line.get_color()) for line in ax.lines] == list(recording.AXES_RGB)
 
 
-class Recorder:
-    """Axes that keep the coordinates they are given."""
-
-    def __init__(self):
-        self.surfaces, self.curves = [], []
-
-    def plot_surface(self, *xyz, **_):
-        self.surfaces.append(np.stack(xyz, axis=-1).reshape(-1, 3))
-
-    def plot(self, *xyz, **_):
-        self.curves.append(np.stack(xyz, axis=-1))
-
-    def add_collection3d(self, _):
-        pass
-
-
 def test_feature_surfaces_lie_where_the_feature_puts_them():
-    axes, point, direction = Recorder(), np.array([1.0, 0.0, 2.0]), np.array([0.6, 0.0, 0.8])
+    axes, point, direction = Mock(), np.array([1.0, 0.0, 2.0]), np.array([0.6, 0.0, 0.8])
     rig.cylinder(axes, point, direction, 0.5, 2.0)
     rig.sphere(axes, point, 0.7)
     rig.slab(axes, point, direction, 0.4, 1.0)
-    cylinder, sphere = axes.surfaces
+    cylinder, sphere = (np.stack(call.args, axis=-1).reshape(-1, 3) for call in axes.plot_surface.call_args_list)
     np.testing.assert_allclose(np.linalg.norm(np.cross(cylinder - point, direction), axis=1), 0.5)
     np.testing.assert_allclose(np.ptp((cylinder - point) @ direction), 4.0)
     np.testing.assert_allclose(np.linalg.norm(sphere - point, axis=1), 0.7)
-    line, face, parallel = ((curve - point) @ direction for curve in axes.curves)
+    curves = (np.stack(call.args, axis=-1) for call in axes.plot.call_args_list)
+    line, face, parallel = ((curve - point) @ direction for curve in curves)
     np.testing.assert_allclose(line, [-2.0, 2.0])
     np.testing.assert_allclose(np.r_[face, parallel], np.repeat([0.0, 0.4], 5), atol=1e-12)
 

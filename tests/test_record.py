@@ -114,18 +114,13 @@ def test_the_platform_log_tells_commanded_and_measured_pitch(path, feedback):
     assert open_session(path).reference["pitch"].startswith("told by the head" if feedback else "dead reckoning")
 
 
-def test_a_continuous_sweep_is_written_with_its_track(path):
-    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-4, 8, 1], count=1))
+def test_a_continuous_sweep_is_written_with_its_track_and_a_scene_as_one(path):
+    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-4, 8, 1], placements=[{"number": 1, "board": False}]))
     write(rig, path).finish()
-    sweep = open_session(path).sweep(1)
+    sweep, scenes = open_session(path).sweep(1), open_session(path).scene_placements
     assert len(sweep.pitch) > 5 and np.all(np.diff(sweep.pitch) >= 0) and np.ptp(np.degrees(sweep.pitch)) > 10
     told = rows(path, "platform.csv")[1:]
-    assert all(float(row[1]) == 8 for row in told[2:]) and len(told) == 2 + len(rig.head.track)
-
-
-def test_a_scene_has_images_of_a_scene(path):
-    write(make_rig(rig_data(placements=[{"number": 1}, {"number": 2, "board": False}])), path)
-    assert open_session(path).scene_placements == (2,)
+    assert all(float(row[1]) == 8 for row in told[2:]) and len(told) == 2 + len(rig.head.track) and scenes == (1,)
 
 
 def test_every_event_is_on_the_disk_when_it_is_seen(path, rig):
@@ -224,26 +219,25 @@ def test_a_session_is_never_written_over(path, rig):
 
 def test_placements_are_begun_and_finished_one_by_one(path, rig):
     recorder = SessionRecorder(path, rig.stated.board, rig.stated.lrf, rig.stated.cameras.values())
-
-    def refused(message, call, *arguments):
-        with pytest.raises(SessionError, match=message):
+    for message, call, *arguments in (
+        ("placement 1 was not begun", recorder.add_telegrams, 1, [telegram(0.0)], 0.0),
+        ("no placement is being recorded", recorder.finish_placement),
+        ("", recorder.begin_placement, 1),
+        ("placement 1 is being recorded", recorder.begin_placement, 2),
+        ("", recorder.add_telegrams, 1, [telegram(0.0)], 0.0),
+        ("", recorder.finish_placement),
+        ("placement 1 cannot be begun; recorded: 1", recorder.begin_placement, 1),
+        ("no placement 4 to drop; recorded: 1", recorder.drop_placement, 4),
+        ("", recorder.begin_placement, 2),
+        ("", recorder.finish),
+    ):
+        with pytest.raises(SessionError, match=message) if message else contextlib.nullcontext():
             call(*arguments)
-
-    refused("placement 1 was not begun", recorder.add_telegrams, 1, [telegram(0.0)], 0.0)
-    refused("no placement is being recorded", recorder.finish_placement)
-    recorder.begin_placement(1)
-    refused("placement 1 is being recorded", recorder.begin_placement, 2)
-    recorder.add_telegrams(1, [telegram(0.0)], 0.0)
-    recorder.finish_placement()
-    refused("placement 1 cannot be begun; recorded: 1", recorder.begin_placement, 1)
-    refused("no placement 4 to drop; recorded: 1", recorder.drop_placement, 4)
-    recorder.begin_placement(2)
-    recorder.finish()
     assert open_session(path).placements == (1,)
 
 
 def test_a_recording_that_was_left_is_finished_from_outside(path, rig):
-    write(rig, path, count=1)
+    write(rig, path, count=1).close()
     finish(path)
     assert open_session(path).placements == (1,) and validate(path) == []
 

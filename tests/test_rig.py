@@ -1,17 +1,19 @@
 """The rig file, and what a rig records of one placement: with devices that are not there."""
 
+import contextlib
 import json
 import math
+import operator
 import os
-import socket
+import socketserver
 import threading
 import time
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 import pytest
-from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, rig_data, telegram
+from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, raising, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.head import HeadSettings
@@ -104,16 +106,14 @@ VALUES = [None, True, -1, 0, 1.5, 99, 10**400, 1e9, 1e-320, 1e308, math.nan, mat
 
 def paths(data, way=()):
     """Where all values of a rig file stand."""
-    for key, value in data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ():
-        yield (*way, key)
-        yield from paths(value, (*way, key))
+    inner = dict(enumerate(data)) if isinstance(data, list) else data if isinstance(data, dict) else {}
+    return [place for key in inner for place in ((*way, key), *paths(inner[key], (*way, key)))]
 
 
 def every_key():
     """A rig file that states all that can be stated about devices and plan."""
     data = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
-    head = {name: getattr(HeadSettings(), name) for name in vars(HeadSettings())}
-    data["devices"]["head"] |= head | {"degrees_per_second": 4.0, "repeat_s": 0.5, "pitch_limits_deg": [-60, 60]}
+    data["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
     data["devices"]["lrf"] |= {"baudrate": 9600, "address": 1, "password": "SICK_LMS", "measuring_mode": 0,
                                "realtime_indices": True, "interlaced": False}  # fmt: skip
     data["devices"]["cameras"]["left"] |= {"size": list(SIZE), "exposure": 0.01, "fps": 10, "silence_s": 10}
@@ -122,15 +122,12 @@ def every_key():
     return data
 
 
-@pytest.mark.parametrize("way", list(paths(every_key())), ids=lambda way: ".".join(map(str, way)))
+@pytest.mark.parametrize("way", paths(every_key()), ids=lambda way: ".".join(map(str, way)))
 def test_any_value_anywhere_is_taken_or_refused_in_words(tmp_path, way):
     """What is taken can be asked of the drivers: their calls raise nothing but DeviceError, and no time is endless."""
     for value in VALUES:
         data = every_key()
-        at = data
-        for key in way[:-1]:
-            at = at[key]
-        at[way[-1]] = value
+        reduce(operator.getitem, way[:-1], data)[way[-1]] = value
         try:
             stated = read(tmp_path, data)
         except RigFileError as error:
@@ -146,50 +143,41 @@ def test_any_value_anywhere_is_taken_or_refused_in_words(tmp_path, way):
                 open_port(f"/nowhere{device.port}", head.baudrate, timeout=0.1)
         bytes(7) * head.sends, range(head.retries)
         for one in cameras:
-            find_source(one.source, one.silence_s or 1.0)
+            with contextlib.suppress(PortError):
+                find_source(one.source, one.silence_s or 1.0)
 
 
-@pytest.mark.parametrize("text", [b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b""])
-def test_what_is_no_json_is_said(tmp_path, text):
-    (tmp_path / "rig.json").write_bytes(text)
-    with pytest.raises(RigFileError, match=r"rig\.json: "):
-        read_rig_file(tmp_path / "rig.json")
+NO_JSON = (b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b"", b"{")
+NO_FILES = (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero"))
 
 
-def test_no_rig_file(tmp_path):
-    with pytest.raises(RigFileError, match=r"none\.json: No such file.*emulate --rig-file"):
-        read_rig_file(tmp_path / "none.json")
-    (tmp_path / "text.json").write_text("{")
-    with pytest.raises(RigFileError, match=r"text\.json: not JSON"):
-        read_rig_file(tmp_path / "text.json")
-    with pytest.raises(RigFileError, match="the file is .*: an object"):
-        read(tmp_path, [1, 2])
-    os.mkfifo(tmp_path / "fifo")
-    for path in (tmp_path / "fifo", tmp_path, "/dev/zero"):
-        with pytest.raises(RigFileError, match="no file, or one of more than"):
-            read_rig_file(path)
+@pytest.mark.parametrize(("made", "message"), [
+    (lambda path: None, "No such file.*emulate --rig-file"),
+    (lambda path: path.write_text("[1, 2]"), "the file is .*: an object"),
+    *((lambda path, text=text: path.write_bytes(text), "not JSON") for text in NO_JSON),
+    *((make, "no file, or one of more than") for make in NO_FILES),
+])  # fmt: skip
+def test_no_rig_file(tmp_path, made, message):
+    path = tmp_path / "rig.json"
+    made(path)
+    with pytest.raises(RigFileError, match=rf"rig\.json: {message}"):
+        read_rig_file(path)
 
 
 def test_interlaced_scans_need_a_head_at_rest(tmp_path):
-    data = changed("devices.lrf.interlaced", True)
-    stated = read(tmp_path, data)
+    stated = read(tmp_path, changed("devices.lrf.interlaced", True))
     with pytest.raises(RigFileError, match=r"devices\.lrf\.interlaced is true"):
         stated.with_mode("continuous")
 
 
-@pytest.mark.parametrize("step", [0.3, 1, 2.5, 7, 100])
-def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step):
+@pytest.mark.parametrize(("step", "stops"), [(0.1, 151), (0.3, 51), (1, 16), (2.5, 7), (7, 4), (100, 2)])
+def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step, stops):
     odd, even = Plan(pitch_deg=(-10, 5, step), count=2).to_do()
     np.testing.assert_allclose(np.degrees(odd.pitch[[0, -1]]), [-10, 5])
-    assert np.diff(odd.pitch).max() <= math.radians(step) + 1e-12
+    assert np.diff(odd.pitch).max() <= math.radians(step) + 1e-12 and len(odd.pitch) == stops
     assert np.ptp(np.diff(odd.pitch)) < 1e-12
     np.testing.assert_array_equal(even.pitch, odd.pitch[::-1])
     assert (odd.direction, even.direction) == (1, -1)
-
-
-def test_a_step_that_divides_the_sweep_is_kept():
-    (placement,) = Plan(pitch_deg=(-10, 5, 0.1), count=1).to_do()
-    assert len(placement.pitch) == 151
 
 
 def test_listed_placements_come_as_they_are_listed():
@@ -204,26 +192,29 @@ def test_listed_placements_come_as_they_are_listed():
 # ------------------------------------------------------------------------------------------------- stop-and-go
 
 
-def events_of(rig, number=1):
-    placement = next(p for p in rig.stated.plan.to_do() if p.number == number)
-    return list(rig.acquire(placement))
+def begun(rig, number=1, events=0):
+    """The recording of a placement, which is that far."""
+    running = rig.acquire(rig.stated.plan.to_do()[number - 1])
+    for _ in range(events):
+        next(running)
+    return running
+
+
+def events_of(rig, number=1, kind=object):
+    return [event for event in begun(rig, number) if isinstance(event, kind)]
 
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_stops_scans_and_images_come_in_order(number):
     rig = make_rig(rig_data(cameras=("left", "right"), image_pitch_deg=[-1.5, 2], scans_per_stop=2))
     events = events_of(rig, number)
-    moves = [e for e in events if isinstance(e, Moved)]
+    moves, scans, images = ([e for e in events if isinstance(e, kind)] for kind in (Moved, Scanned, Photographed))
     wanted = sorted([*range(-4, 5), -1.5], reverse=number == 2)
     np.testing.assert_allclose([math.degrees(m.commanded) for m in moves], wanted)
     assert [m.number for m in moves] == list(range(1, 11)) and {m.of for m in moves} == {10}
-    scans = [e for e in events if isinstance(e, Scanned)]
-    assert [len(e.readings) for e in scans] == [2] * 9
-    images = [e for e in events if isinstance(e, Photographed)]
+    assert [len(e.readings) for e in scans] == [2] * 9 and {e.purpose for e in images} == {"board"}
     assert [(e.camera, round(math.degrees(e.pitch), 6)) for e in images] == [
-        (camera, pitch) for pitch in sorted([-1.5, 2], reverse=number == 2) for camera in ("left", "right")
-    ]
-    assert {e.purpose for e in images} == {"board"}
+        (camera, pitch) for pitch in sorted([-1.5, 2], reverse=number == 2) for camera in ("left", "right")]
 
 
 def test_what_is_recorded_at_a_stop_is_later_than_its_rest():
@@ -272,7 +263,7 @@ def test_scans_that_began_before_the_rest_are_asked_for_again():
 def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
     rig = make_rig()
     rig.lrf.lost = 1
-    assert len([e for e in events_of(rig) if isinstance(e, Scanned)]) == 9
+    assert len(events_of(rig, kind=Scanned)) == 9
     assert rig.lrf.reconnects == 1 and "the line is lost; looking for" in caplog.text
     rig.lrf.lost = 2
     with pytest.raises(DeviceError, match="the line is lost"):
@@ -281,13 +272,13 @@ def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
 
 def test_interlaced_scans_are_streamed():
     rig = make_rig(changed("devices.lrf.interlaced", True, scans_per_stop=2))
-    assert [len(e.readings) for e in events_of(rig) if isinstance(e, Scanned)] == [2] * 9
+    assert [len(e.readings) for e in events_of(rig, kind=Scanned)] == [2] * 9
     assert not rig.lrf.streaming
 
 
 def test_nothing_is_held_back():
     rig = make_rig()
-    events = rig.acquire(rig.stated.plan.to_do()[0])
+    events = begun(rig)
     for _ in range(3):
         at = rig.head.at
         assert isinstance(next(events), Moved) and rig.head.at != at
@@ -296,9 +287,9 @@ def test_nothing_is_held_back():
     events.close()
 
 
-def test_a_head_without_feedback_says_so():
-    assert not any(e.measured for e in events_of(make_rig(feedback=False)) if isinstance(e, Moved))
-    assert all(e.measured for e in events_of(make_rig()) if isinstance(e, Moved))
+@pytest.mark.parametrize("feedback", [True, False])
+def test_a_head_without_feedback_says_so(feedback):
+    assert {e.measured for e in events_of(make_rig(feedback=feedback), kind=Moved)} == {feedback}
 
 
 def scans(moving, noise, step=0.0):
@@ -331,42 +322,22 @@ def test_a_head_that_tells_nothing_and_does_not_move_ends_the_sweep(mode):
     assert events_of(rig)
 
 
-class Boom(Exception):
-    pass
-
-
-@pytest.mark.parametrize("error", [DeviceError("gone"), KeyboardInterrupt(), Boom()])
+@pytest.mark.parametrize("error", [DeviceError("gone"), KeyboardInterrupt(), ZeroDivisionError(), None])
 @pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
 def test_whatever_goes_wrong_the_head_and_the_scans_stop(mode, error):
+    """Also where the recording is broken off."""
     rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]))
-    events = rig.acquire(rig.stated.plan.to_do()[0])
-    for _ in range(4):
-        next(events)
+    events = begun(rig, events=4)
     rig.head.fail = error
-    with pytest.raises(type(error)):
-        list(events)
+    with pytest.raises(type(error)) if error else contextlib.nullcontext():
+        list(events) if error else events.close()
     assert rig.head.stops == 1 and not rig.lrf.streaming
 
 
-@pytest.mark.parametrize("mode", ["stop-and-go", "continuous"])
-def test_a_placement_that_is_broken_off_stops_the_head(mode):
-    rig = make_rig(rig_data(mode=mode, pitch_deg=[-10, 30, 1]))
-    events = rig.acquire(rig.stated.plan.to_do()[0])
-    for _ in range(4):
-        next(events)
-    events.close()
-    assert rig.head.stops == 1 and not rig.lrf.streaming
-
-
-def test_the_scans_stop_also_where_the_head_cannot(caplog):
+def test_the_scans_stop_also_where_the_head_cannot(caplog, monkeypatch):
     rig = make_rig()
-    events = rig.acquire(rig.stated.plan.to_do()[0])
-    next(events)
-
-    def gone():
-        raise DeviceError("the line is lost")
-
-    rig.head.stop = gone
+    events = begun(rig, events=1)
+    monkeypatch.setattr(rig.head, "stop", raising(DeviceError("the line is lost")))
     events.close()
     assert not rig.lrf.streaming
     assert "the head could not be stopped (the line is lost): cut its power" in caplog.text
@@ -404,7 +375,7 @@ def test_scans_of_a_sweep_have_the_pitch_of_their_instant(heads):
 
 def test_scans_of_a_sweep_are_handed_out_while_it_goes_on():
     rig = make_rig(rig_data(mode="continuous", pitch_deg=[-10, 50, 1]))
-    shares = [e.share for e in events_of(rig) if isinstance(e, Scanned)]
+    shares = [e.share for e in events_of(rig, kind=Scanned)]
     assert len(shares) > 2 and shares == sorted(shares) and shares[0] < 0.7 and shares[-1] == 1.0
 
 
@@ -430,26 +401,21 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
 # --------------------------------------------------------------------------------------------- opening, the board
 
 
-def stated_rig(**plan):
-    return rig_of(json.loads(json.dumps(rig_data(**plan))))
-
-
 def fake_drivers(monkeypatch, size=SIZE, **instead):
     """Let Rig.open make fakes, and list which are open; a driver may raise an error instead."""
     clock, made = Clock(), []
     head = Head(clock)
     lrf, camera = Lrf(head, clock), Camera("left", head, clock)
-    lrf.set_variant, camera.settings = lambda *_: True, {"size": {"asked": SIZE, "got": size}}
-    for name, device in (("PanTilt", head), ("LMS2xx", lrf), ("Camera", camera)):
+    camera.settings = {"size": {"asked": SIZE, "got": size}}
 
-        def make(*_, driver=name, fake=device, **__):
-            if driver in instead:
-                raise instead[driver]
-            made.append(driver)
-            fake.close = lambda: made.remove(driver)
-            return fake
+    def make(driver, fake, *_, **__):
+        made.append(driver)
+        fake.close = lambda: made.remove(driver)
+        return fake
 
-        monkeypatch.setattr(rig_module, name, make)
+    for driver, fake in (("PanTilt", head), ("LMS2xx", lrf), ("Camera", camera)):
+        opener = raising(instead[driver]) if driver in instead else partial(make, driver, fake)
+        monkeypatch.setattr(rig_module, driver, opener)
     return made
 
 
@@ -463,7 +429,7 @@ def test_the_clock_of_a_rig_is_not_set_by_others(monkeypatch):
 
 def test_all_devices_are_closed_again(monkeypatch):
     made = fake_drivers(monkeypatch)
-    with Rig.open(stated_rig()) as rig:
+    with Rig.open(rig_of(rig_data())) as rig:
         assert sorted(made) == ["Camera", "LMS2xx", "PanTilt"] and list(rig.cameras) == ["left"]
     assert made == []
 
@@ -477,7 +443,7 @@ def test_all_devices_are_closed_again(monkeypatch):
 def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
     made = fake_drivers(monkeypatch, **options)
     with pytest.raises(error, match=message):
-        Rig.open(stated_rig())
+        Rig.open(rig_of(rig_data()))
     assert made == []
 
 
@@ -499,28 +465,24 @@ def test_a_recording_begins_with_the_configuration():
     assert raw[4] == CONFIGURATION and parse_configuration(raw).measuring_mode == 0
 
 
+class Control(socketserver.StreamRequestHandler):
+    """The control socket of a rig that has eight placements."""
+
+    def handle(self):
+        number = json.loads(self.rfile.readline())["arguments"][0]
+        answer = {"ok": True} if number < 9 else {"ok": False, "error": f"no placement {number}"}
+        self.wfile.write(json.dumps(answer).encode() + b"\n")
+
+
 def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
-    rig = make_rig()
+    rig, path = make_rig(), str(tmp_path / "control")
     assert rig.move_board(1) is False and rig.hold_close("left", 0) is False
-    path, heard = str(tmp_path / "control"), []
-    server = socket.socket(socket.AF_UNIX)
-    server.bind(path)
-    server.listen()
-
-    def serve():
-        for answer in (b'{"ok": true}\n', b'{"ok": false, "error": "no placement 9"}\n'):
-            link = server.accept()[0]
-            heard.append(json.loads(link.makefile().readline()))
-            link.sendall(answer)
-            link.close()
-
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
     rig = make_rig(changed("devices.control", path))
-    assert rig.move_board(3) is True and heard == [{"command": "place", "arguments": [3]}]
-    with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
-        rig.move_board(9)
-    thread.join()
-    server.close()
+    with socketserver.ThreadingUnixStreamServer(path, Control) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        assert rig.move_board(3) is True
+        with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
+            rig.move_board(9)
+        server.shutdown()
     with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
         rig.move_board(3)

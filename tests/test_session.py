@@ -1,30 +1,21 @@
 """A session survives the disk, and every kind of damage is named."""
 
-import csv
 import json
 import math
+import shutil
 from functools import reduce
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.session import stated
 from lrfcal_lib.session.read import image_size, open_session, validate
-from lrfcal_lib.session.stated import (
-    CameraInfo,
-    LensStated,
-    LrfInfo,
-    SessionError,
-    board_from_json,
-    board_to_json,
-    from_json,
-    model_to_json,
-    transform_from_json,
-    transform_to_json,
-)
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
 from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
@@ -46,26 +37,37 @@ def wall(lines=3):
     return ranges, BEARINGS, np.radians(np.linspace(-1, 1, lines))
 
 
-def write(path, **options):
+def write(path, *sweeps, **options):
+    """A session of sweeps as :func:`wall` gives them, or of two sweeps and five images."""
     with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, licence="CC0", source="a test", **options) as writer:
-        writer.add_sweep(1, *wall())
-        writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
-        for camera in ("left", "right"):
-            writer.add_image(camera, pixels(1), 1, pitch=0.1)
-            writer.add_image(camera, pixels(2), 2, time_s=3.5)
-        writer.add_image("left", pixels(3), purpose="intrinsics")
+        for number, sweep in enumerate(sweeps, 1):
+            writer.add_sweep(number, *sweep)
+        if not sweeps:
+            writer.add_sweep(1, *wall())
+            writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
+            for camera in ("left", "right"):
+                writer.add_image(camera, pixels(1), 1, pitch=0.1)
+                writer.add_image(camera, pixels(2), 2, time_s=3.5)
+            writer.add_image("left", pixels(3), purpose="intrinsics")
     return path
 
 
+@pytest.fixture(scope="module")
+def written_once(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("sessions") / "trip")
+
+
 @pytest.fixture
-def path(tmp_path):
-    return write(tmp_path / "trip")
+def path(written_once, tmp_path):
+    return shutil.copytree(written_once, tmp_path / "trip")
 
 
-def edit_scans(path, **arrays):
+def edit_scans(path, **changes):
+    """Other arrays in scans.npz; a function makes them of those that are there."""
     file = path / "lrf" / "scans.npz"
     with np.load(file) as archive:
-        np.savez(file, **({k: archive[k] for k in archive.files} | arrays))
+        there = dict(archive)
+    np.savez(file, **there | {key: new(there[key]) if callable(new) else new for key, new in changes.items()})
 
 
 def same(a, b):
@@ -82,6 +84,7 @@ def test_what_is_written_is_read(path):
     assert validate(path) == []
     assert session.lrf.field_of_view == pytest.approx(LRF.field_of_view, abs=1e-12)
     assert session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12) and session.lrf.max_range == 8.0
+    np.testing.assert_array_equal(session.board.corners, triangle_board().corners)
     same(session.T_head_lrf, HEAD)
     same(session.cameras["left"].guess, HEAD)
     np.testing.assert_array_equal(session.cameras["left"].model.parameters, MODEL.parameters)
@@ -98,8 +101,7 @@ def test_sweeps_keep_order_gaps_and_times(path):
 
 
 def test_intensities_are_kept_where_all_sweeps_have_them(tmp_path):
-    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
-        writer.add_sweep(1, *wall(), intensities=np.full((3, len(BEARINGS)), 7.0))
+    write(tmp_path / "s", (*wall(), None, np.full((3, len(BEARINGS)), 7.0)))
     assert (open_session(tmp_path / "s").sweep(1).intensities == 7).all()
 
 
@@ -125,40 +127,33 @@ def test_image_files_are_copied_byte_for_byte(tmp_path):
 
 def test_the_direction_of_a_sweep(tmp_path):
     ranges, bearings, pitch = wall(9)
-    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
-        for number, values in enumerate((pitch, pitch[::-1], 0 * pitch)):
-            writer.add_sweep(number, ranges, bearings, values)
-    session = open_session(tmp_path / "s")
+    session = open_session(write(tmp_path / "s", *((ranges, bearings, way * pitch) for way in (1, -1, 0))))
     assert [session.sweep_direction(p) for p in session.placements] == [1, -1, 0]
 
 
 def test_boards_models_and_transforms_survive_json():
+    def through(data):
+        return json.loads(json.dumps(data))
+
     board = Board("b", ("n", "e", "s", "w"), None, Chessboard(8, 6, 0.0775, (0.1, 0.2)), ("n", "w"))
-    assert board_from_json(json.loads(json.dumps(board_to_json(board)))) == board
-    triangle = board_from_json(json.loads(json.dumps(board_to_json(triangle_board()))))
-    np.testing.assert_array_equal(triangle.corners, triangle_board().corners)
-    model = from_json(LensStated, json.loads(json.dumps(model_to_json(MODEL)))).made(32, 24)
-    np.testing.assert_array_equal(model.parameters, MODEL.parameters)
+    assert stated.board_from_json(through(stated.board_to_json(board))) == board
+    model = stated.from_json(stated.LensStated, through(stated.model_to_json(MODEL))).made(32, 24)
     np.testing.assert_array_equal(model.covariance, MODEL.covariance)
-    assert transform_from_json(transform_to_json(None)) is None and model_to_json(None) is None
-    same(transform_from_json(json.loads(json.dumps(transform_to_json(HEAD)))), HEAD)
+    assert stated.transform_from_json(stated.transform_to_json(None)) is None and stated.model_to_json(None) is None
+    same(stated.transform_from_json(through(stated.transform_to_json(HEAD))), HEAD)
 
 
 def test_picks_override_by_camera_file_and_edge(path):
-    text = "camera,file,edge,u1,v1,u2,v2\nleft,images/left/0001.png,ab,1,2,20,3.5\n"
-    (path / "edges.csv").write_text(text)
+    pick("left,images/left/0001.png,ab,1,2,20,3.5")(path)
     session = open_session(path)
-    (pick,) = session.picks
-    assert pick.edge == "ab" and pick.file == session.images("left", 1)[0].file
-    assert pick.ends.tolist() == [[1, 2], [20, 3.5]]
+    (found,) = session.picks
+    assert found.edge == "ab" and found.file == session.images("left", 1)[0].file
+    assert found.ends.tolist() == [[1, 2], [20, 3.5]]
 
 
 def test_zero_and_infinite_ranges_are_no_returns(path):
-    with np.load(path / "lrf" / "scans.npz") as archive:
-        ranges = archive["ranges"]
-    ranges[0, :2] = 0.0, np.inf
-    edit_scans(path, ranges=ranges)
-    assert np.isnan(open_session(path).sweep(1).ranges[0, :2]).all()
+    edit_scans(path, ranges=lambda ranges: np.where(np.arange(61) < 2, [[0.0], [np.inf]] * 3, ranges))
+    assert np.isnan(open_session(path).sweep(1).ranges[:, :2]).all()
 
 
 # ---------------------------------------------------------------------------------------------- crashes
@@ -198,8 +193,9 @@ def test_an_existing_target_is_refused(path):
 # ---------------------------------------------------------------------------------------------- missing parts
 
 
-def test_a_placement_without_data_is_listed_and_spoils_nothing(tmp_path):
-    session = open_session(write(tmp_path / "s", placements=[1, 2, 3]))
+def test_a_placement_without_data_is_listed_and_spoils_nothing(path):
+    change(path, "placements", [1, 2, 3])
+    session = open_session(path)
     assert session.problems[0] == "placement 3: no scan line with a range"
     assert "placement 3: no image of camera 'left'" in session.problems
     assert session.sweep(1).ranges.shape == (3, len(BEARINGS))
@@ -209,16 +205,10 @@ def test_a_placement_without_data_is_listed_and_spoils_nothing(tmp_path):
         session.sweep(9)
 
 
-def test_a_placement_of_nan_is_listed(path):
-    with np.load(path / "lrf" / "scans.npz") as archive:
-        ranges, placement = archive["ranges"], archive["placement"]
-    ranges[placement == 2] = np.nan
-    edit_scans(path, ranges=ranges)
+def test_scan_lines_that_cannot_be_used_are_listed(path):
+    edit_scans(path, ranges=lambda ranges: np.where(np.arange(6)[:, None] > 2, np.nan, ranges))
     assert validate(path) == ["placement 2: no scan line with a range"]
-
-
-def test_scan_lines_of_an_unknown_placement_are_listed(path):
-    edit_scans(path, placement=np.array([1, 1, 1, 7, 7, 7]))
+    edit_scans(path, placement=np.array([1, 1, 7, 7, 7, 7]))
     assert "placement 7: in the scan lines but not in session.json, ignored" in open_session(path).problems
 
 
@@ -264,14 +254,18 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
 ]
 
 
-@pytest.mark.parametrize(("place", "value", "message"), CHANGES)
-def test_a_wrong_statement_is_named(path, place, value, message):
+def change(path, place, value):
     file = path / "session.json"
     data = json.loads(file.read_text())
     *way, key = place.split(".")
     holder = reduce(dict.__getitem__, way, data)
     holder.pop(key) if value == "gone" else holder.update({key: value})
     file.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(("place", "value", "message"), CHANGES)
+def test_a_wrong_statement_is_named(path, place, value, message):
+    change(path, place, value)
     with pytest.raises(SessionError, match=message):
         open_session(path)
 
@@ -301,29 +295,16 @@ def gone(name):
 def cell(column, value):
     """Another value in the first row of images.csv."""
 
-    def change(path):
-        with (path / "images.csv").open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        rows[0][column] = value
-        with (path / "images.csv").open("w", newline="") as stream:
-            table = csv.DictWriter(stream, rows[0].keys())
-            table.writeheader()
-            table.writerows(rows)
+    def edit(path):
+        table = pd.read_csv(path / "images.csv", dtype=str)
+        table.loc[0, column] = value
+        table.to_csv(path / "images.csv", index=False)
 
-    return change
+    return edit
 
 
 def pick(row):
     return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
-
-
-def another_size(path):
-    cv2.imwrite(str(path / "images" / "left" / "0002.png"), pixels()[:20])
-
-
-def telegrams_alone(path):
-    gone("lrf/scans.npz")(path)
-    written("lrf/telegrams.bin", b"\x02")(path)
 
 
 SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the session's folder, got "
@@ -350,7 +331,7 @@ DAMAGE = [
     (arrays(pitch=np.r_[np.full(3, np.nan), 0, 0, 0]), "3 values of pitch are not finite"),
     (arrays(bearings=BEARINGS[::-1]), "bearings must ascend"),
     (arrays(time_s=np.zeros(2)), r"time_s has shape \(2,\)"),
-    (telegrams_alone, r"index\.csv: No such file.*needs this file"),
+    (lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"), r"index\.csv: No such file.*needs this file"),
     (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
     (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
     (cell("file", ""), OUT + "''"),
@@ -362,7 +343,7 @@ DAMAGE = [
     (cell("placement", "12"), "placement 12 is not in session.json"),
     (cell("placement", "first"), "line 2: invalid literal"),
     (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
-    (another_size, r"0002\.png: 32 x 20 pixels, but camera 'left' has 32 x 24"),
+    (written("images/left/0002.png", cv2.imencode(".png", pixels()[:20])[1]), r"0002\.png: 32 x 20 pixels, but camera"),
     (gone(IMAGES), r"images\.csv: No such file"),
     (written(IMAGES, b""), "got an empty file"),
     (written(IMAGES, b"\xff\xfe"), "not a CSV file in UTF-8"),
@@ -385,15 +366,12 @@ def test_damage_is_named(path, damage, message):
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg"])
-def test_truncated_images(tmp_path, kind):
-    file = tmp_path / f"a.{kind}"
-    cv2.imwrite(str(file), pixels())
-    assert image_size(file) == (32, 24)
-    data = file.read_bytes()
+def test_truncated_images(kind):
+    data = cv2.imencode(f".{kind}", pixels())[1].tobytes()
+    assert image_size("a", data) == (32, 24)
     for part in (12, len(data) // 2, len(data) - 70):
-        file.write_bytes(data[:part])
-        with pytest.raises(SessionError, match="truncated after"):
-            image_size(file)
+        with pytest.raises(SessionError, match="a: the image is truncated after"):
+            image_size("a", data[:part])
 
 
 def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
@@ -402,22 +380,24 @@ def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
     assert "0001.png: cannot be decoded" in problem
 
 
+RANGES, _, PITCH = wall()
+REFUSED = [
+    ("add_sweep", (2, 1000 * RANGES, BEARINGS, PITCH), "placement 2: the median range .*millimetres"),
+    ("add_sweep", (2, RANGES, BEARINGS, PITCH[:2]), "pitch has shape"),
+    ("add_sweep", (2, RANGES, BEARINGS + 0.1, PITCH), "one grid a session"),
+    ("add_image", ("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
+    ("add_image", ("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
+]
+
+
 def test_the_writer_refuses_what_the_reader_would(tmp_path):
     writer = SessionWriter(tmp_path / "s", triangle_board(), LRF, CAMERAS)
-    ranges, bearings, pitch = wall()
-    writer.add_sweep(1, ranges, bearings, pitch)
-    for wrong, message in (
-        (lambda: writer.add_sweep(2, 1000 * ranges, bearings, pitch), "placement 2: the median range .*millimetres"),
-        (lambda: writer.add_sweep(2, ranges, bearings, pitch[:2]), "pitch has shape"),
-        (lambda: writer.add_sweep(2, ranges, bearings + 0.1, pitch), "one grid a session"),
-        (lambda: writer.add_image("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
-        (lambda: writer.add_image("left", pixels(), purpose="fun"), "purposes intrinsics, board, scene"),
-        (lambda: writer.add_image("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
-        (
-            lambda: SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)]),
-            "left.mount is 'car'",
-        ),
-    ):
+    writer.add_sweep(1, *wall())
+    for method, wrong, message in REFUSED:
         with pytest.raises(SessionError, match=message):
-            wrong()
+            getattr(writer, method)(*wrong)
+    with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
+        writer.add_image("left", pixels(), purpose="fun")
+    with pytest.raises(SessionError, match="left.mount is 'car'"):
+        SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
     assert not (tmp_path / "t").exists()

@@ -6,104 +6,87 @@ import re
 import shutil
 import subprocess
 import tomllib
-from pathlib import Path
+from importlib.metadata import version
 
 import pytest
+from shared import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
+from lrfcal_lib.solvers import METHODS
+
 TOP_LEVEL = {
     "notebooks", "lrfcal_lib", "data", "tests", "reports", "environment.txt", "README.md", "LICENSE", "CITATION.cff",
     "Makefile", "pyproject.toml", ".ci", ".gitignore", ".gitattributes",
 }  # fmt: skip
 
 
-def requirements():
-    lines = [line.split("#")[0].strip() for line in (ROOT / "environment.txt").read_text().splitlines()]
-    return [line for line in lines if line]
-
-
-def git(*arguments):
-    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+README = (ROOT / "README.md").read_text()
+LISTED = (ROOT / "environment.txt").read_text()
+PINS = [line.split("#")[0].strip() for line in LISTED.splitlines() if line.split("#")[0].strip()]
 
 
 def normal(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_every_package_is_pinned_exactly_and_once():
-    names = []
-    for line in requirements():
-        pin = re.fullmatch(r"([A-Za-z0-9._-]+)==\d[\w.]*", line)
-        assert pin, f"'{line}' is no exact pin"
-        names.append(normal(pin[1]))
+def test_every_package_is_pinned_exactly_and_once_and_direct_ones_say_why():
+    assert [line for line in PINS if not re.fullmatch(r"[A-Za-z0-9._-]+==\d[\w.]*", line)] == []
+    names = [normal(line.split("==")[0]) for line in PINS]
     assert len(names) == len(set(names)) and len(names) > 100
-
-
-def test_direct_packages_say_why():
-    direct = (ROOT / "environment.txt").read_text().split("# What those need in turn")[0]
-    lines = [line for line in direct.splitlines() if "==" in line]
-    assert len(lines) >= 15
-    assert all(re.search(r"==\S+\s+# \w+$", line) for line in lines)
+    lines = [line for line in LISTED.split("# What those need in turn")[0].splitlines() if "==" in line]
+    assert len(lines) >= 15 and all(re.search(r"==\S+\s+# \w+$", line) for line in lines)
 
 
 def test_what_the_package_needs_is_pinned():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     needs = project["project"]["dependencies"] + sum(project["project"]["optional-dependencies"].values(), [])
     needs += project["build-system"]["requires"]
-    pinned = {normal(line.split("==")[0]) for line in requirements()}
+    pinned = {normal(line.split("==")[0]) for line in PINS}
     assert {normal(re.match(r"[\w.-]+", need)[0]) for need in needs} <= pinned
 
 
 def test_pins_are_what_runs_here():
-    from importlib.metadata import version
-
-    pins = dict(line.split("==") for line in requirements())
+    pins = dict(line.split("==") for line in PINS)
     for name in ("numpy", "scipy", "opencv-python-headless", "pandas", "matplotlib", "nbval", "pytest"):
         assert version(name) == pins[name]
 
 
 def test_quick_start_is_exactly_two_commands():
-    section = (ROOT / "README.md").read_text().split("## Quick start")[1].split("\n## ")[0]
+    section = README.split("## Quick start")[1].split("\n## ")[0]
     (block,) = re.findall(r"```sh\n(.*?)```", section, re.S)
     assert block.split("\n") == ["make report", "make test", ""]
 
 
-def test_readme_lists_every_notebook_and_every_method():
-    from lrfcal_lib.solvers import METHODS
-
-    text = (ROOT / "README.md").read_text()
-    for path in (ROOT / "notebooks").glob("*.ipynb"):
-        assert f"(notebooks/{path.name})" in text
-    for method in METHODS:
-        assert f"| `{method}` |" in text
-
-
-def test_files_the_readme_points_to_exist():
-    text = (ROOT / "README.md").read_text()
-    for target in re.findall(r"\]\(([^)#:]+)\)", text):
-        assert (ROOT / target).is_file(), target
+def test_readme_lists_every_notebook_and_method_and_points_to_what_exists():
+    assert [p.name for p in (ROOT / "notebooks").glob("*.ipynb") if f"(notebooks/{p.name})" not in README] == []
+    assert [method for method in METHODS if f"| `{method}` |" not in README] == []
+    assert [name for name in re.findall(r"\]\(([^)#:]+)\)", README) if not (ROOT / name).is_file()] == []
+    names = re.findall(r"^\| `([a-z_.]+)\.([a-z_]+)\(", README, re.M)
+    assert len(names) == 10
+    for module, function in names:
+        assert callable(getattr(importlib.import_module(f"lrfcal_lib.{module}"), function))
 
 
 def test_ci_runs_make_test_and_nothing_else():
     script = ROOT / ".ci" / "run"
     lines = [line for line in script.read_text().splitlines() if line and not line.startswith(("#", "set ", "cd "))]
-    assert lines == ["make test"]
-    assert os.access(script, os.X_OK)
+    assert lines == ["make test"] and os.access(script, os.X_OK)
+
+
+def git(*arguments, most=0):
+    """Lines that git prints; skips the test where there is no checkout."""
+    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+    if done.returncode > most:
+        pytest.skip("no git checkout")
+    return done.stdout.splitlines()
 
 
 def test_nothing_else_lies_at_the_top():
-    done = git("ls-files", "-co", "--exclude-standard")
-    if done.returncode:
-        pytest.skip("no git checkout")
-    assert {line.split("/")[0] for line in done.stdout.splitlines()} <= TOP_LEVEL
+    assert {line.split("/")[0] for line in git("ls-files", "-co", "--exclude-standard")} <= TOP_LEVEL
 
 
 def test_reports_and_recordings_are_ignored_by_git():
     ignored = ["reports/x/index.html", "reports/.sessions/x/session.json", ".venv/x"]
-    done = git("check-ignore", "--no-index", *ignored, "reports/README.md", "reports/readme.png")
-    if done.returncode > 1:
-        pytest.skip("no git checkout")
-    assert done.stdout.split() == ignored
+    assert git("check-ignore", "--no-index", *ignored, "reports/README.md", "reports/readme.png", most=1) == ignored
 
 
 FAKE_PYTHON = """
@@ -113,6 +96,12 @@ case "$*" in
     -) [ -z "$MISSING" ] || echo "$MISSING" ;;
 esac
 """
+
+
+def run_in(folder, *command, **variables):
+    """Run a command that finds stand-ins for others in a folder."""
+    environment = {"PATH": f"{folder / 'bin'}:/usr/bin:/bin", "HOME": str(folder)} | variables
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
 def write_command(path, script):
@@ -132,8 +121,7 @@ def run_setup(tmp_path):
     def run(missing="", **commands):
         for name, script in commands.items():
             write_command(tmp_path / "bin" / name.replace("_", "-"), script)
-        environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path), "MISSING": missing}
-        return subprocess.run([".ci/setup"], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        return run_in(tmp_path, ".ci/setup", MISSING=missing)
 
     return run
 
@@ -186,22 +174,13 @@ def lab(tmp_path, uid, *arguments):
     write_command(tmp_path / "bin" / "id", f"echo {uid}")
     (tmp_path / "notebooks").mkdir(exist_ok=True)
     shutil.copy(ROOT / "Makefile", tmp_path)
-    environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path)}
-    call = ["make", "-s", "lab", *arguments]
-    return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+    return run_in(tmp_path, "make", "-s", "lab", *arguments).stdout.strip()
 
 
-@pytest.mark.parametrize("name", ["plain", "a b", "it's $HOME; \"x\""])
+@pytest.mark.parametrize("name", ["plain", "a b", 'it\'s $HOME; "x"'])
 def test_the_lab_opens_any_session_and_as_root(tmp_path, name):
     (tmp_path / name).mkdir()
     said = lab(tmp_path, 0, "SESSION=" + name.replace("$", "$$"))
-    assert said.strip().endswith(f"LRFCAL_SESSION={tmp_path.resolve() / name}") and "--allow-root" in said
-    assert "--allow-root" not in lab(tmp_path, 1000) and lab(tmp_path, 1000).strip().endswith("LRFCAL_SESSION=")
-
-
-def test_the_functions_that_the_readme_names_are_there():
-    names = re.findall(r"^\| `([a-z_.]+)\(", (ROOT / "README.md").read_text(), re.M)
-    assert len(names) == 10
-    for name in names:
-        module, function = name.rsplit(".", 1)
-        assert callable(getattr(importlib.import_module(f"lrfcal_lib.{module}"), function))
+    assert said.endswith(f"LRFCAL_SESSION={tmp_path.resolve() / name}") and "--allow-root" in said
+    said = lab(tmp_path, 1000)
+    assert said.endswith("LRFCAL_SESSION=") and "--allow-root" not in said

@@ -45,16 +45,14 @@ def path(tmp_path):
     return record(tmp_path / "trip", (1, scans(first), PITCH, [1.0, 2, 3, 4]), (2, scans(second), 0.1))
 
 
+@pytest.fixture
+def recorded(tmp_path):
+    """Records batches and opens the session."""
+    return lambda *batches, **options: open_session(record(tmp_path / "s", *batches, **options))
+
+
 def telegrams(path):
     return path / "lrf" / "telegrams.bin"
-
-
-def edit_index(path, change):
-    """Apply a change to the rows of index.csv, the header being row 0."""
-    file = path / "lrf" / "index.csv"
-    rows = [line.split(",") for line in file.read_text().splitlines()]
-    change(rows)
-    file.write_text("".join(",".join(row) + "\n" for row in rows))
 
 
 def interlaced(dense, number=None):
@@ -96,8 +94,8 @@ def test_special_values_are_counted_by_reason(path):
 
 
 @pytest.mark.parametrize("values, first, step", [(101, 40, 1), (201, 40, 0.5), (181, 0, 1), (361, 0, 0.5)])
-def test_the_field_of_view_is_that_of_the_telegrams(tmp_path, values, first, step):
-    session = open_session(record(tmp_path / "s", (1, scans(room(beams=values)), PITCH)))
+def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, step):
+    session = recorded((1, scans(room(beams=values)), PITCH))
     bearings = np.degrees(session.sweep(1).bearings)
     np.testing.assert_allclose(bearings, first + step * np.arange(values))
     last = first + step * (values - 1)
@@ -108,11 +106,11 @@ def test_the_field_of_view_is_that_of_the_telegrams(tmp_path, values, first, ste
     )
 
 
-def test_interlaced_scans_become_dense_lines(tmp_path):
+def test_interlaced_scans_become_dense_lines(recorded):
     dense = room(3, 721)
     sent = [raw for line in dense for raw in interlaced(line)]
-    pitch = np.repeat([0.0, 0.0, 0.1], 4)
-    sweep = open_session(record(tmp_path / "s", (1, sent, pitch, np.arange(12.0)))).sweep(1)
+    session = recorded((1, sent, np.repeat([0.0, 0.0, 0.1], 4), np.arange(12.0)))
+    sweep = session.sweep(1)
     dense[np.isinf(dense)] = np.nan
     np.testing.assert_allclose(sweep.ranges, dense, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.degrees(sweep.bearings), np.arange(0, 180.1, 0.25))
@@ -120,58 +118,47 @@ def test_interlaced_scans_become_dense_lines(tmp_path):
     np.testing.assert_allclose(sweep.pitch, [0, 0, 0.1])
 
 
-def test_half_degree_parts_make_half_degree_lines(tmp_path):
-    dense = room(2, 721)
-    sent = [raw for line in dense for raw in interlaced(line)[::2]]
-    sweep = open_session(record(tmp_path / "s", (1, sent, 0.2))).sweep(1)
+def test_half_degree_parts_make_half_degree_lines(recorded):
+    sent = [raw for line in room(2, 721) for raw in interlaced(line)[::2]]
+    sweep = recorded((1, sent, 0.2)).sweep(1)
     assert sweep.ranges.shape == (2, 361) and np.degrees(sweep.bearings[1]) == pytest.approx(0.5)
 
 
-def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(tmp_path):
+def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(recorded):
     a, b, c = room(3, 721, seed=2)
     a[3:6] = 5.0
     sent = interlaced(a, 100)[:2] + interlaced(b, 104)[2:] + interlaced(c, 254)
-    sweep = open_session(record(tmp_path / "s", (1, sent, 0.0))).sweep(1)
+    sweep = recorded((1, sent, 0.0)).sweep(1)
     found = [{int(k) for k in np.arange(721)[np.isfinite(line)] % 4} for line in sweep.ranges]
     assert found == [{0, 1}, {2, 3}, {0, 1, 2, 3}]
 
 
-def test_parts_at_different_pitch_or_placement_are_not_merged(tmp_path):
+def test_parts_at_different_pitch_or_placement_are_not_merged(recorded):
     four = interlaced(np.full(721, 3.0))
-    session = open_session(record(tmp_path / "s", (1, four, [0, 0, 0.1, 0.1]), (2, four[:2], 0), (3, four[2:], 0)))
+    session = recorded((1, four, [0, 0, 0.1, 0.1]), (2, four[:2], 0), (3, four[2:], 0))
     assert [session.sweep(p).ranges.shape[0] for p in (1, 2, 3)] == [2, 1, 1]
 
 
-def test_the_measuring_mode_follows_the_device(tmp_path):
+def test_the_measuring_mode_follows_the_device(recorded):
     far, near = np.full((1, 361), 20.0), np.full((1, 361), 7.5)
-    batches = (1, scans(far), 0.0), (-1, [configuration(0)]), (2, scans(near, mode=0, flags=5), 0.0)
-    session = open_session(record(tmp_path / "s", *batches))
+    session = recorded((1, scans(far), 0.0), (-1, [configuration(0)]), (2, scans(near, mode=0, flags=5), 0.0))
     np.testing.assert_allclose([session.sweep(1).ranges, session.sweep(2).ranges], [far, near])
 
 
-def test_without_configuration_the_factory_mode_is_assumed_and_told(tmp_path):
+def test_without_configuration_the_factory_mode_is_assumed_and_told(recorded):
     near = np.full((2, 401), 7.5)
-    session = open_session(record(tmp_path / "s", (1, scans(near, mode=0, flags=1), 0.0), first=scans(near, mode=0)[0]))
+    session = recorded((1, scans(near, mode=0, flags=1), 0.0), first=scans(near, mode=0)[0])
     np.testing.assert_allclose(session.sweep(1).ranges, near)
     (problem,) = session.problems
     assert "telegrams.bin: no status or configuration telegram: measuring mode 00 (factory) assumed" in problem
 
 
-def test_other_telegrams_and_scans_of_no_placement_are_ignored(tmp_path):
-    a0 = encode_telegram(0xA0, b"\0", status=0x10)
-    short_f4 = encode_telegram(0xF4, b"\0", status=0x10)
-    batches = (-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0)
-    session = open_session(record(tmp_path / "s", *batches))
+def test_other_telegrams_and_scans_of_no_placement_are_ignored(recorded):
+    a0, short_f4 = (encode_telegram(code, b"\0", status=0x10) for code in (0xA0, 0xF4))
+    session = recorded((-1, [a0, short_f4]), (-1, scans(room(1, 361))), (1, [*scans(room()), a0], 0.0))
     assert session.sweep(1).ranges.shape == (4, 401)
     (problem,) = session.problems
     assert "line 4, offset 51, length 9: reply F4 has 1 bytes of data, needs 7; ignored" in problem
-
-
-def test_sessions_of_scan_lines_have_no_telegrams(tmp_path):
-    with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
-        writer.add_sweep(1, np.full((1, 3), 2.0), [1.0, 1.5, 2.0], [0.0])
-    with pytest.raises(SessionError, match="only lrf/telegrams.bin tells"):
-        open_session(tmp_path / "s").telegram_report()
 
 
 def test_a_report_of_an_unknown_placement_is_refused(path):
@@ -224,8 +211,15 @@ def test_a_row_cut_off_by_a_crash_is_left_out_until_finish_removes_it(path):
 
 
 def cell(row, column, value):
-    """Another value in index.csv."""
-    return lambda path: edit_index(path, lambda rows: rows[row].__setitem__(column, value))
+    """Another value in index.csv, the header being row 0."""
+
+    def change(path):
+        file = path / "lrf" / "index.csv"
+        rows = [line.split(",") for line in file.read_text().splitlines()]
+        rows[row][column] = value
+        file.write_text("".join(",".join(cells) + "\n" for cells in rows))
+
+    return change
 
 
 def data(change):
@@ -244,7 +238,7 @@ def again(*batches, **options):
 
 
 def no_rows(path):
-    edit_index(path, lambda rows: rows.__delitem__(slice(1, None)))
+    (path / "lrf" / "index.csv").write_text("t_s,offset,length,placement,pitch_deg\n")
 
 
 HALF = np.ones((4, 361))
@@ -273,27 +267,32 @@ def test_what_does_not_fit_is_refused(path, damage, message):
         open_session(path)
 
 
+ONE, LINE = scans(room(1)), (np.ones((1, 3)), [1.0, 1.5, 2.0], [0.0])
+REFUSED = [
+    ((1, ONE[0], 0.0), "one bytes each: put a single one into a list"),
+    ((1, [], 0.0), "got lengths none"),
+    ((1, [b"\x06"], 0.0), "7 or more bytes are needed, got lengths 1"),
+    ((1, ONE), "finite radians"),
+    ((1, ONE, 30.0), "a pitch is 30: finite radians"),
+    ((1, ONE, [0.0, 0.1]), "placement 1: .*shape"),
+]
+
+
 def test_the_writer_refuses_what_it_could_not_read_again(tmp_path):
-    one = scans(room(1))
     with SessionWriter(tmp_path / "s", triangle_board(), LRF) as writer:
-        for batch, message in (
-            ((1, one[0], 0.0), "one bytes each: put a single one into a list"),
-            ((1, [], 0.0), "got lengths none"),
-            ((1, [b"\x06"], 0.0), "7 or more bytes are needed, got lengths 1"),
-            ((1, one), "finite radians"),
-            ((1, one, 30.0), "a pitch is 30: finite radians"),
-            ((1, one, [0.0, 0.1]), "placement 1: .*shape"),
-        ):
+        for batch, message in REFUSED:
             with pytest.raises(SessionError, match=message):
                 writer.add_telegrams(*batch)
         assert not telegrams(writer.path).exists()
-        writer.add_telegrams(1, one, 0.0)
+        writer.add_telegrams(1, ONE, 0.0)
         with pytest.raises(SessionError, match="records telegrams: add_telegrams, or begin another"):
-            writer.add_sweep(2, np.ones((1, 3)), [1.0, 1.5, 2.0], [0.0])
+            writer.add_sweep(2, *LINE)
     with SessionWriter(tmp_path / "t", triangle_board(), LRF) as writer:
-        writer.add_sweep(1, np.ones((1, 3)), [1.0, 1.5, 2.0], [0.0])
+        writer.add_sweep(1, *LINE)
         with pytest.raises(SessionError, match="has scan lines: add_sweep, or begin another"):
-            writer.add_telegrams(1, one, 0.0)
+            writer.add_telegrams(1, ONE, 0.0)
+    with pytest.raises(SessionError, match="only lrf/telegrams.bin tells"):
+        open_session(tmp_path / "t").telegram_report()
 
 
 # ------------------------------------------------------------------------------------------- real recordings

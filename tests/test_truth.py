@@ -34,10 +34,6 @@ def test_the_true_calibration_has_no_error():
     assert max(tables.axis_errors(truth.T_head_lrf, truth)) < 1e-6
 
 
-def test_without_truth_there_are_no_errors():
-    assert tables.camera_errors(None, None, "left") == {}
-
-
 def test_only_evaluate_reads_the_truth():
     """Of the library; the simulator writes it."""
     for path in (ROOT / "lrfcal_lib").rglob("*.py"):

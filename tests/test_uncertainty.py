@@ -4,30 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.uncertainty import (
-    COLUMNS,
-    Chain,
-    beams_of_pixels,
-    beams_to,
-    carried,
-    chain_of,
-    point_sigma,
-    projection_sigma,
-    range_noise,
-    spread,
-)
+from lrfcal_lib.evaluate import uncertainty
+from lrfcal_lib.evaluate.uncertainty import Chain, beams_to, carried, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.simulate.draw import bench, board_poses, observe
+from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers.joint import solve_joint
 
 HEAD = RigidTransform.from_components([0.0, 0.03, -0.05], Rotation.from_rotvec([0.0, 0.02, -0.03]))
 TURN = Rotation.from_rotvec([0.02, -0.03, 0.01]) * Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 CAMERA = RigidTransform.from_components([0.1, 0.1, -0.05], TURN)
-MOUNTS = ("head", "platform")
+MODEL = ShotSetup().model
 
 
 def random_chain(mount, rng, camera=CAMERA, size=1e-3):
@@ -47,11 +37,10 @@ def moved_points(chain, bearing, pitch, distance, change, image_pitch):
     return geometry.pose_transform(geometry.move_pose(chain.camera, change[4:10])).apply(source)
 
 
-@pytest.fixture(scope="module", params=MOUNTS)
+@pytest.fixture(scope="module", params=["head", "platform"])
 def solved(request):
-    rng = np.random.default_rng(3)
-    rig = bench(rng, mount=request.param)
-    return rig, solve_joint(JointObservations(**observe(rig, board_poses(rng, 10), rng)), required=False)
+    obs, _, rig = draw(np.random.default_rng(3), 10, mount=request.param, pitch_step=np.radians(0.5))
+    return rig, solve_joint(obs, required=False)
 
 
 @pytest.mark.parametrize(("mount", "camera"), [("head", CAMERA), ("platform", CAMERA), ("head", None)])
@@ -64,52 +53,48 @@ def test_jacobian_of_the_chain(mount, camera):
     for column in range(13):
         step = 1e-6 * np.eye(13)[column]
         ends = [moved_points(chain, bearing, pitch, distance, s * step, 0.1) for s in (1, -1)]
-        assert np.allclose(J[..., column], (ends[0] - ends[1]) / 2e-6, atol=1e-7), COLUMNS[column]
+        assert np.allclose(J[..., column], (ends[0] - ends[1]) / 2e-6, atol=1e-7), uncertainty.COLUMNS[column]
     turned = [moved_points(chain, bearing, pitch + s * 1e-6, distance, np.zeros(13), 0.1) for s in (1, -1)]
     assert np.allclose(by_pitch, (turned[0] - turned[1]) / 2e-6, atol=1e-7)
 
 
 def test_beams_to_inverts_the_platform():
+    """Points that no scan reaches have no beam."""
     rng = np.random.default_rng(1)
     bearing, pitch, distance = rng.uniform(0.6, 2.5, 50), rng.uniform(-0.8, 0.8, 50), rng.uniform(0.5, 5, 50)
     points = geometry.lrf_to_platform(geometry.polar_to_points(distance, bearing), pitch, HEAD)
     assert np.allclose(beams_to(points, HEAD), [bearing, pitch, distance], atol=1e-9)
-
-
-def test_points_that_no_scan_reaches_have_no_beam():
     tilted = RigidTransform.from_rotation(Rotation.from_rotvec([0, 0.3, 0]))
-    assert np.isnan(beams_to(np.array([[3.0, 0.1, 0.0]]), tilted)[1]).all()
+    assert np.isnan(beams_to([3.0, 0.1, 0.0], tilted)[1])
 
 
-def drawn(chain, rng, count=1500):
-    return rng.multivariate_normal(np.zeros(13), chain.covariances[0], count)
+def scatter(chain, ends):
+    """Root mean square scatter of the ends of beams over calibrations drawn from the chain's covariance."""
+    changes = np.random.default_rng(2).multivariate_normal(np.zeros(13), chain.covariances[0], 1500)
+    return np.sqrt(np.sum(np.var([ends(change) for change in changes], axis=0), axis=-1))
 
 
 @pytest.mark.parametrize(("mount", "image_pitch"), [("head", 0.05), ("platform", 0.0)])
 def test_projection_sigma_is_what_perturbed_calibrations_show(mount, image_pitch):
-    rng = np.random.default_rng(2)
-    chain, model = random_chain(mount, rng), bench(rng).model
-    found = projection_sigma(chain, "left", model, 1.5, (3, 2), image_pitch=image_pitch)
-    uv = np.stack(np.meshgrid(found.columns, found.rows), axis=-1)
-    bearing, pitch = (a.ravel() for a in beams_of_pixels(chain, model, uv, 1.5, image_pitch))
+    chain = random_chain(mount, np.random.default_rng(2))
+    found = projection_sigma(chain, "left", MODEL, 1.5, (3, 2), image_pitch=image_pitch)
+    uv = np.stack(np.meshgrid(found.columns, found.rows), axis=-1).reshape(-1, 2)
+    bearing, pitch = uncertainty.beams_of_pixels(chain, MODEL, uv, 1.5, image_pitch)
 
     def pixels(change):
-        return project(moved_points(chain, bearing, pitch, 1.5, change, image_pitch), model)
+        return project(moved_points(chain, bearing, pitch, 1.5, change, image_pitch), MODEL)
 
-    assert np.allclose(pixels(np.zeros(13)), uv.reshape(-1, 2), atol=1e-6)
-    scatter = np.sqrt(np.sum(np.var([pixels(change) for change in drawn(chain, rng)], axis=0), axis=-1))
-    assert np.allclose(found.sigma[0].ravel(), scatter, rtol=0.07)
+    assert np.allclose(pixels(np.zeros(13)), uv, atol=1e-6)
+    assert np.allclose(found.sigma[0].ravel(), scatter(chain, pixels), rtol=0.07)
 
 
 def test_point_sigma_is_what_perturbed_calibrations_show():
-    rng = np.random.default_rng(4)
-    chain = random_chain("head", rng, None)
+    chain = random_chain("head", np.random.default_rng(4), None)
     bearings, pitches = np.array([1.2, 1.9]), np.array([-0.2, 0.1, 0.3])
     found = point_sigma(chain, bearings, pitches, 2.0, reference=0.1)
     b, p = (a.ravel() for a in np.meshgrid(bearings, pitches))
-    points = np.array([moved_points(chain, b, p, 2.0, c, 0.1) for c in drawn(chain, rng)])
-    scatter = np.sqrt(np.sum(np.var(points, axis=0), axis=-1))
-    assert np.allclose(found.sigma[0].ravel(), scatter, rtol=0.07)
+    moved = scatter(chain, lambda change: moved_points(chain, b, p, 2.0, change, 0.1))
+    assert np.allclose(found.sigma[0].ravel(), moved, rtol=0.07)
     assert np.allclose(found.parts["axis"][0, 1], 0, atol=1e-12)  # measured at the reference: the axis cancels
     assert (found.parts["axis"][0, [0, 2]] > 1e-5).all()
 
@@ -130,21 +115,16 @@ def test_scatter_over_placements_only_adds(solved):
     noise_only = replace(solution, solution=replace(solution.solution, covariance_placements=None))
     plain, both = (projection_sigma(s, "right", rig.model, 2.0, (4, 3)).sigma for s in (noise_only, solution))
     assert (both >= plain - 1e-12).all() and (both > plain).any()
-    assert (point_sigma(solution, 1.5, 0.1, 2.0).parts["range noise"] == range_noise(solution)).all()
-    assert range_noise(solution) == pytest.approx(rig.sigma_range, rel=0.1)
+    assert point_sigma(solution, 1.5, 0.1, 2.0).parts["range noise"] == pytest.approx(rig.sigma_range, rel=0.1)
 
 
 def test_undetermined_motions_have_no_bound():
-    chain = random_chain("head", np.random.default_rng(5))
-    chain = Chain(chain.head, chain.camera, True, chain.covariances, np.eye(13)[[2]])
-    J = np.zeros((2, 1, 13))
-    J[0, 0, 2], J[1, 0, 5] = 1.0, 1.0
-    assert np.isinf(spread(chain, J)).tolist() == [True, False]
+    chain = replace(random_chain("head", np.random.default_rng(5)), unseen=np.eye(13)[[2]])
+    assert np.isinf(uncertainty.spread(chain, np.eye(13)[[[2], [5]]])).tolist() == [True, False]
 
 
 def test_errors_of_single_sweeps_count_in_the_cloud():
-    chain = random_chain("head", np.random.default_rng(6), None, size=1e-9)
-    chain = Chain(chain.head, None, True, chain.covariances, chain.unseen, (0.01, 0.1))
+    chain = replace(random_chain("head", np.random.default_rng(6), None, size=1e-9), sweep_sigma=(0.01, 0.1))
     found = point_sigma(chain, np.pi / 2, [0.0, 0.2], 2.0)
     assert np.allclose(found.sigma[0, :, 0], np.hypot(0.01, [0.0, 0.02]) * np.hypot(2.03, 0.05), rtol=0.03)
 
@@ -159,6 +139,6 @@ def test_pixels_beyond_the_sweeps_stay_empty(solved):
 def test_bad_input_is_named(solved):
     rig, solution = solved
     with pytest.raises(ValueError, match="cameras are left, right; got 'rear'"):
-        chain_of(solution, "rear")
+        uncertainty.chain_of(solution, "rear")
     with pytest.raises(ValueError, match=r"distances must be positive, metres; got \[0.0\]"):
         projection_sigma(solution, "left", rig.model, 0.0)

@@ -197,66 +197,11 @@ def test_a_url_that_nobody_serves(server, host):
 
 def test_size_and_exposure_that_a_stream_cannot_set(server, caplog):
     with Camera(server.url, name="left", size=(640, 480), exposure=0.01) as camera:
-        assert camera.settings["size"] == {"asked": (640, 480), "got": (64, 48)}
-        assert camera.settings["exposure"] == {"asked": 0.01, "got": None}
-        assert camera.settings["warnings"] == [
-            "camera left: size is (64, 48), asked (640, 480)",
-            "camera left: exposure cannot be set, asked 0.01",
-        ]
+        assert (camera.settings["size"]["got"], camera.settings["exposure"]["got"]) == ((64, 48), None)
+        said = "size is (64, 48), asked (640, 480)", "exposure cannot be set, asked 0.01"
+        assert camera.settings["warnings"] == [f"camera left: {text}" for text in said]
         assert all(text in caplog.text for text in camera.settings["warnings"])
         camera.newest(timeout=WAIT_S)
-
-
-# ---------------------------------------------------------------------------------------------------- recorded
-
-
-@pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*"])
-def test_images_in_the_order_of_their_names(tmp_path, pattern):
-    for number in (3, 1, 2):
-        cv2.imwrite(str(tmp_path / f"{number:04d}.png"), numbered(number))
-    (tmp_path / "notes.txt").write_text("no image")
-    with Camera(tmp_path / pattern if pattern else tmp_path, name="right") as camera:
-        assert camera.settings["size"]["got"] == (64, 48)
-        frames = [camera.newest(after=time.time()) for _ in range(3)]
-        assert [(number_of(frame), frame.index) for frame in frames] == [(1, 0), (2, 1), (3, 2)]
-        assert frames[0].time_s <= frames[1].time_s <= frames[2].time_s and not camera.lost
-        with pytest.raises(LineLost, match="at the end of its 3 recorded images"):
-            camera.newest()
-        assert camera.lost
-
-
-def test_one_grey_image(tmp_path):
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((10, 20), 7, np.uint8))
-    with Camera(tmp_path / "grey.png", name="right") as camera:
-        assert np.array_equal(camera.newest().image, np.full((10, 20, 3), 7))
-    with pytest.raises(DeviceError, match="right is closed"):
-        camera.newest()
-
-
-def test_video_file(tmp_path):
-    path = tmp_path / "video.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
-    assert writer.isOpened()
-    for number in range(5):
-        writer.write(numbered(number))
-    writer.release()
-    with Camera(str(path), name="right", fps=25, size=(64, 48)) as camera:
-        assert camera.settings["fps"] == {"asked": 25, "got": 25.0} and camera.settings["warnings"] == []
-        assert [number_of(camera.newest()) for _ in range(5)] == list(range(5))
-        with pytest.raises(LineLost, match="at the end of its 5"):
-            camera.newest()
-
-
-@pytest.mark.parametrize(("name", "what"), [
-    ("none.avi", "there is no video"), ("text.avi", "is no video"), ("none.png", "there are no images in"),
-    ("empty", "there are no images in"), ("x*.png", "there are no images in"), ("bad.png", "bad.png is no image"),
-])  # fmt: skip
-def test_bad_files(tmp_path, name, what):
-    (tmp_path / "text.avi").write_text("no video")
-    (tmp_path / "bad.png").write_text("no image")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(PortError, match=what):
-        Camera(tmp_path / name, name="right").newest()
 
 
 # -------------------------------------------------------------------------------------------------------- V4L2
@@ -306,34 +251,23 @@ def device(monkeypatch):
     return Device
 
 
-def test_what_a_device_does_as_told(device):
-    with Camera(0, name="left", size=(320, 240), exposure=0.005, fps=15) as camera:
-        assert camera.settings == {
-            "size": {"asked": (320, 240), "got": (320, 240)},
-            "exposure": {"asked": 0.005, "got": pytest.approx(0.005)},
-            "fps": {"asked": 15, "got": 15.0},
-            "warnings": [],
-        }
-        assert camera.newest(timeout=WAIT_S).image.shape == (240, 320, 3)
+FIXED = (cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH)
 
 
-def test_device_left_as_it_is(device):
-    with Camera("/dev/video3", name="left") as camera:
-        assert camera.settings["exposure"] == {"asked": None, "got": pytest.approx(0.0157)}
-        assert camera.settings["warnings"] == []
-        device.grey = True
-        assert camera.newest(after=time.time() + 0.05, timeout=WAIT_S).image.shape == (480, 640, 3)
-
-
-def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
-    device.fixed = {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH}
-    with Camera("0", name="left", size=(1024, 480), exposure=0.005) as camera:
-        assert camera.settings["exposure"]["got"] is None
-        assert camera.settings["size"]["got"] == (640, 480)
-        assert len(camera.settings["warnings"]) == 2
-        camera.newest(timeout=WAIT_S)
-    assert "exposure cannot be set, asked 0.005" in caplog.text
-    assert "size is (640, 480), asked (1024, 480)" in caplog.text
+@pytest.mark.parametrize(("source", "asked", "fixed", "got", "warnings"), [
+    (0, {"size": (320, 240), "exposure": 0.005, "fps": 15}, (), ((320, 240), 0.005, 15.0), []),
+    ("/dev/video3", {}, (), ((640, 480), 0.0157, 30.0), []),
+    ("0", {"size": (1024, 480), "exposure": 0.005}, FIXED, ((640, 480), None, 30.0),
+     ["size is (640, 480), asked (1024, 480)", "exposure cannot be set, asked 0.005"]),
+])  # fmt: skip
+def test_what_a_device_does_of_what_it_is_told(device, caplog, source, asked, fixed, got, warnings):
+    device.fixed, device.grey = set(fixed), not asked
+    with Camera(source, name="left", **asked) as camera:
+        names, warnings = ("size", "exposure", "fps"), [f"camera left: {text}" for text in warnings]
+        assert [camera.settings[name]["asked"] for name in names] == [asked.get(name) for name in names]
+        assert [camera.settings[name]["got"] for name in names] == [got[0], pytest.approx(got[1]), got[2]]
+        assert camera.settings["warnings"] == warnings and all(text in caplog.text for text in warnings)
+        assert camera.newest(timeout=WAIT_S).image.shape == (*got[0][::-1], 3)
 
 
 def test_device_lost_and_found(device):
@@ -353,10 +287,12 @@ def test_device_lost_and_found(device):
     ({"opens": False}, True, "/dev/video0 gives no video: close other programs"),
     ({}, False, "no permission for /dev/video0: run 'sudo usermod -aG video"),
     ({"there": False}, True, "there is no camera /dev/video0: check its plug; present are"),
+    ({"source": "images/*.png"}, True, "images/.*.png is no camera: name a device, .*, or a URL"),
 ])  # fmt: skip
 def test_devices_that_cannot_be_opened(device, monkeypatch, habits, allowed, what):
+    source = habits.pop("source", 0)
     for name, value in habits.items():
         setattr(device, name, value)
     monkeypatch.setattr(video.os, "access", lambda path, mode: allowed)
     with pytest.raises(PortError, match=what):
-        Camera(0, name="left")
+        Camera(source, name="left")

@@ -242,15 +242,12 @@ class Collector(Closed):
     def stop(self):
         """Stop the head at once, and whatever was under way; returns when it has ended."""
         rig, end = self.rig, time.monotonic() + WAIT_S
-        if rig is None:
-            return
         self.stopped.set()
-        rig.head.emergency_stop()
-        while not self._devices.acquire(timeout=AGAIN_S):
-            rig.head.emergency_stop()  # the next move of a sweep may have begun in between
-            if time.monotonic() > end:
+        while rig is not None and time.monotonic() < end:
+            rig.head.emergency_stop()  # again: the next move of a sweep may have begun in between
+            if self._devices.acquire(timeout=AGAIN_S):
+                self._devices.release()
                 return
-        self._devices.release()
 
     def look(self):
         """The View of the rig, unless it is busy: then what it records is in `view` already.

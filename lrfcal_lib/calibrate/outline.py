@@ -35,29 +35,16 @@ def as_recorded(placement, p_lrf, pitch):
 class EdgeModel:
     """What a calibration knows about how a sensor sees edges.
 
-    Attributes
-    ----------
-    log_odds : float
-        See :mod:`lrfcal_lib.fit.residuals`.
-    log_odds_sigma : float
-    spread : float
-        Standard deviation of the log odds from side to side: backgrounds are not equally bright.
-    softness : float
-        Standard deviation of where single readings flip, in spot radii.
-    range_offset, range_offset_sigma : float
-        Recorded minus true range, metres.
-    T_head_lrf : RigidTransform
-    correct : callable
-        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to
-        points is not used, `range_offset` is.
+    `sensor` and `sigma` are values and standard deviations by name, as in a
+    :class:`lrfcal_lib.solvers.joint.JointSolution`: log odds and log softness of the edge, and range offset. `spread`
+    is the standard deviation of the log odds from side to side, because backgrounds are not equally bright.
+    ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to points
+    is not used, the range offset is.
     """
 
-    log_odds: float = 0.0
-    log_odds_sigma: float = 0.0
+    sensor: dict
+    sigma: dict = field(default_factory=dict)
     spread: float = 0.0
-    softness: float = 0.1
-    range_offset: float = 0.0
-    range_offset_sigma: float = 0.0
     T_head_lrf: RigidTransform = field(default_factory=RigidTransform.identity)
     correct: Callable = as_recorded
 
@@ -70,16 +57,11 @@ class MeasuredBoard:
     ----------
     T_platform_plane : ndarray, shape (4, 4)
         Origin in the middle of the face, z along the normal towards the sensor.
-    lines : dict of str to ndarray, shape (3,)
-        Sides that were measured, in plane coordinates: ``a x + b y + c = 0``, metres.
-    corners : dict of str to ndarray, shape (2,)
-        Where an edge starts (it meets the edge before it), by the name of the edge.
-    lengths : dict of str to float
-        Metres; only edges of which both ends are measured.
-    scatter : dict of str to float
-        Rms distances of points from the lines, metres (least squares only).
-    sigma : dict of str to float
-        Standard deviations of the lengths, metres (likelihood only).
+    lines, corners : dict of str to ndarray, shapes (3,) and (2,)
+        Sides that were measured, ``a x + b y + c = 0`` in the plane, metres, and where an edge meets the one before it.
+    lengths, scatter, sigma : dict of str to float
+        Metres: edges of which both ends are measured; rms distances of points from the lines (least squares only);
+        standard deviations of the lengths (likelihood only).
     """
 
     T_platform_plane: np.ndarray
@@ -146,28 +128,12 @@ def named_sides(prepared, placement, variant="half_step", stretch=0.0):
 
 
 def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
-    """Measure the board's outline in the cloud of a placement by least squares.
+    """Measure the board's outline in the cloud of a placement by least squares: MeasuredBoard, and edges by the pitch.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    placement : int
-    variant : {'half_step', 'last_beam'}
-    T_head_lrf : RigidTransform, optional
-        The session's own when left out.
-
-    Returns
-    -------
-    measured : MeasuredBoard
-        Without sides of which less than 40 % is seen: a stub does not carry a line to its corners.
-    across : frozenset of str
-        Edges found across the scan lines (where the sweep enters or leaves the board): their place hangs on the
-        recorded pitch.
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the sweep does not cross enough scan lines to span a plane.
+    The platform is the session's own when left out. Sides of which less than 40 % is seen are missing: a stub does not
+    carry a line to its corners. The second result are the edges found across the scan lines (where the sweep enters or
+    leaves the board), a frozenset: their place hangs on the recorded pitch. DegenerateGeometry if the sweep does not
+    cross enough scan lines to span a plane.
     """
     T_head_lrf = platform_of(prepared, T_head_lrf)
     points, pitch, _ = face_points(prepared.scans[placement])
@@ -221,10 +187,11 @@ def measure_outline(cells, face, names, edges, model):
     lines, middle = start_lines(rays)
     lines, information = fit_sides(rays, lines, middle, model)
     covariance = block_diag(*np.linalg.inv(information + FAR))
-    slope = edge_shift(model.log_odds, rays["radius"], rays["background"])[1]
+    slope = edge_shift(model.sensor["edge_log_odds"], rays["radius"], rays["background"])[1]
     slope = np.sum(slope * rays["used"], axis=1) / rays["used"].sum(axis=1)
     # beside the beams' own: the log odds common to all sides, and what differs from side to side
-    covariance[::2, ::2] += model.log_odds_sigma**2 * np.outer(slope, slope) + np.diag((model.spread * slope) ** 2)
+    common = model.sigma.get("edge_log_odds", 0.0) * slope
+    covariance[::2, ::2] += np.outer(common, common) + np.diag((model.spread * slope) ** 2)
 
     def measured(lines):
         """Sides by name, corners and lengths."""
@@ -246,7 +213,7 @@ def face_surface(face, model):
     """
     points, pitch, _ = face
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    p = lrf_to_platform(points - model.range_offset * rays, pitch, model.T_head_lrf)
+    p = lrf_to_platform(points - model.sensor["range_offset"] * rays, pitch, model.T_head_lrf)
     pose = plane_frame(p)
     p = (p - pose[:3, 3]) @ pose[:3, :3]
     A, freedom = _quadratic(p[:, 0], p[:, 1]), max(len(p) - 6, 1)
@@ -292,8 +259,9 @@ def side_block(rays, lines, middle, model):
     across = np.sum(normal * rays["direction"][..., :2], axis=-1)
     factor = np.abs(z) / np.hypot(np.where(rays["used"], z, 1.0), across)
     u = (np.sum(normal * rays["at"], axis=-1) + lines[:, 2:]) * factor  # distance from the edge, positive outside
-    shift, _ = edge_shift(model.log_odds, rays["radius"], rays["background"])
-    sigma, _ = flip_sigma(model.softness, np.where(rays["used"], rays["radius"], 1.0), rays["step"])
+    shift, _ = edge_shift(model.sensor["edge_log_odds"], rays["radius"], rays["background"])
+    softness, radius = np.exp(model.sensor["edge_log_softness"]), np.where(rays["used"], rays["radius"], 1.0)
+    sigma, _ = flip_sigma(softness, radius, rays["step"])
     cost, score, information, _ = beam_terms(shift - u, sigma, rays["hit"], LAPSE)
     turned = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
     J = np.stack([factor, -factor * np.sum(turned * (rays["at"] - middle[:, None]), axis=-1)], axis=-1)
@@ -340,43 +308,28 @@ def _by_face(pose, face, size, model):
     slant = np.sqrt(max(1 - cosine**2, 0.0)) / max(cosine, 0.1)
     spread = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)) / 2)
     tilt_sigma = sigma * max(cosine, 0.1) / np.sqrt(len(points)) / max(spread, 1e-3)
-    return (size * slant * tilt_sigma) ** 2 + (size * model.range_offset_sigma / np.median(away)) ** 2
+    offset = model.sigma.get("range_offset", 0.0) / np.median(away)
+    return size**2 * ((slant * tilt_sigma) ** 2 + offset**2)
 
 
 def fused_outline_of(joint, placement):
     """Measure the outline of a board whose size nobody knows: image edges on the plane of the cloud.
 
-    Parameters
-    ----------
-    joint : JointCalibration
-        Its estimate without the placement is used where there is one.
-    placement : int
-
-    Returns
-    -------
-    measured : MeasuredBoard
-        Every camera's edges count alike.
-    across : None
-        No end hangs on beams or on where a sweep enters or leaves the board.
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the sweep does not span a plane, or no image shows an edge.
+    From the estimate without the placement where the JointCalibration has one; every camera's edges count alike.
+    Returns a MeasuredBoard, and None: no end hangs on beams or on where a sweep enters or leaves the board.
+    DegenerateGeometry if the sweep does not span a plane, or no image shows an edge.
     """
     solution, prepared = joint.without.get(placement, joint.solution), joint.prepared
     points, pitch = solution.correct(placement, *face_points(prepared.scans[placement])[:2])
     face = lrf_to_platform(points, pitch, solution.T_head_lrf)
-    centre = face.mean(axis=0)
-    normal = np.linalg.svd(face - centre, full_matrices=False)[2][2]
-    sides = {}
+    pose, sides = plane_frame(face), {}
     for camera, views in prepared.views.items():
         view = views.get(placement)
         if view is None or camera not in solution.transforms:
             continue
         T_platform_camera = solution.camera_at(camera, solution.correct(placement, np.zeros(3), view.pitch)[1]).inv()
         for edge in view.edges:
-            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, centre, normal)
+            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, pose[:3, 3], pose[:3, 2])
             sides.setdefault(edge.name, []).append(points)
     if not sides:
         raise DegenerateGeometry(f"placement {placement}: no image shows an edge of the board")

@@ -54,11 +54,6 @@ class PlatformCalibration:
     stated_sigma: tuple
 
     @property
-    def T_head_lrf(self):
-        """The platform to use."""
-        return self.axes["combined"][0]
-
-    @property
     def covariance(self):
         """Of its axis, shape (4, 4)."""
         return self.axes["combined"][1]
@@ -116,12 +111,8 @@ class JointCalibration:
         """What the estimate knows about how the sensor sees edges, an EdgeModel: from all placements but one."""
         solution = self.without.get(placement, self.solution)
         sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
-        return EdgeModel(
-            solution.sensor["edge_log_odds"], sigma.get("edge_log_odds", 0.0),
-            spread=solution.noise["side_sigma"] if self.settings["sides"] else 0.0,
-            softness=float(np.exp(solution.sensor["edge_log_softness"])), range_offset=solution.sensor["range_offset"],
-            range_offset_sigma=sigma.get("range_offset", 0.0), T_head_lrf=solution.T_head_lrf, correct=solution.correct,
-        )  # fmt: skip
+        spread = solution.noise["side_sigma"] if self.settings["sides"] else 0.0
+        return EdgeModel(solution.sensor, sigma, spread, solution.T_head_lrf, solution.correct)
 
 
 @dataclass(frozen=True)
@@ -130,14 +121,10 @@ class Calibration:
 
     Attributes
     ----------
-    prepared : Prepared
-    platform : PlatformCalibration
     observations : dict of (str, str) to CameraObservations
         By camera and edge-point variant, made with the calibrated platform.
-    solutions : dict of (str, str) to Solution
-        By camera and method.
-    problems : dict of (str, str) to str
-        Why a method has no result for a camera; ``('rig', 'joint')`` for the joint estimate.
+    solutions, problems : dict of (str, str) to Solution, or to str
+        By camera and method; why there is no result. ``('rig', 'joint')`` for the joint estimate.
     joint : JointCalibration or None
         Its cameras are in `solutions` as method 'joint', with observations of their own under that variant.
     """
@@ -167,7 +154,7 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     """
     prepared = prepare(session)
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
-    observations = observe_all(prepared, platform.T_head_lrf)
+    observations = observe_all(prepared, platform.transform("combined"))
     found = Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
     return with_joint(found) if joint and prepared.views else found
 

@@ -348,7 +348,7 @@ class LMS2xx(Closed):
             self._stream()
 
         interval_s = (4 if interlaced else 1) * self._assembler.interval_s
-        self._reader = ScanReader(receive, recover, interval_s, self._log, self._host)
+        self._reader = ScanReader(receive, recover, interval_s, self._interrupted, self._log, self._host)
 
     def _stream(self):
         self._prepare(self._interlaced)
@@ -406,7 +406,7 @@ class LMS2xx(Closed):
         if self._reader is None:
             return
         self._interrupted.set()
-        self._reader.quit()
+        self._reader.thread.join()
         self._reader = None
         self._interrupted.clear()
         if self._link is None:

@@ -392,7 +392,7 @@ AGAIN_S = 0.1
 
 
 class ScanReader:
-    """A thread that reads scans until `quit`.
+    """A thread that reads scans until the event `leave` is set.
 
     ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
     ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
@@ -406,19 +406,19 @@ class ScanReader:
         Instant of the newest reading that somebody waited for.
     """
 
-    def __init__(self, receive, recover, interval_s, log, host):
-        self._receive, self._recover, self.interval_s, self._log, self._host = receive, recover, interval_s, log, host
+    def __init__(self, receive, recover, interval_s, leave, log, host):
+        self._receive, self._recover, self.interval_s = receive, recover, interval_s
+        self._leave, self._log, self._host, self._news = leave, log, host, host.event()
         self.readings, self.handed_s, self._trouble = [], -math.inf, None
-        self._news, self._leave = host.event(), host.event()
-        self._thread = host.thread(self._run, "LMS2xx reader")
-        self._thread.start()
+        self.thread = host.thread(self._run, "LMS2xx reader")
+        self.thread.start()
 
     def wait(self, find, timeout):
         """The reading that ``find(readings)`` gives as soon as it is not None; NoReply if there is none in time."""
         end = self._host.now() + timeout
         while True:
             self._news.clear()
-            alive, found = self._thread.is_alive(), find(self.readings)
+            alive, found = self.thread.is_alive(), find(self.readings)
             if found is not None:
                 self.handed_s = max(self.handed_s, found.time_s)
                 return found
@@ -427,12 +427,6 @@ class ScanReader:
                 state = "the stream is silent" if alive else "the reader thread ended"
                 raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
             self._news.wait(min(left, 0.2))
-
-    def quit(self):
-        """End the thread."""
-        self._leave.set()
-        if self._thread.is_alive():
-            self._thread.join()
 
     def _run(self):
         """Read; whatever goes wrong with the line, find the device again."""
@@ -454,7 +448,7 @@ class ScanReader:
                 raise
 
     def _read(self):
-        """Post readings until the stream falls silent, or until `quit`."""
+        """Post readings until the stream falls silent, or until the end."""
         last = self._host.now()
         while not self._leave.is_set():
             found = self._receive()

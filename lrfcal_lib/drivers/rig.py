@@ -6,6 +6,7 @@ import math
 import time
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 
@@ -326,13 +327,10 @@ def _placed(readings, track):
     if len(track) < 2:
         return None, readings
     times, pitch = np.array([point[:2] for point in track], float).T
-    middle = [float(np.mean(one.beam_times_s[[0, -1]])) for one in readings]
-    inside = [(one, t) for one, t in zip(readings, middle, strict=True) if times[0] <= t <= times[-1]]
-    later = [one for one, t in zip(readings, middle, strict=True) if t > times[-1]]
-    if not inside:
-        return None, later
-    found, instants = zip(*inside, strict=True)
-    return (found, np.interp(instants, times, pitch)), later
+    middle = np.array([np.mean(one.beam_times_s[[0, -1]]) for one in readings])
+    inside, later = (middle >= times[0]) & (middle <= times[-1]), list(compress(readings, middle > times[-1]))
+    known = tuple(compress(readings, inside)), np.interp(middle[inside], times, pitch)
+    return known if inside.any() else None, later
 
 
 def unchanged(scans):

@@ -1,4 +1,4 @@
-"""Colour cameras: devices, streams and files; the newest frame with the time at which it was grabbed."""
+"""Colour cameras, devices and streams: the newest frame with the time at which it was grabbed."""
 
 import contextlib
 import glob
@@ -9,7 +9,6 @@ import select
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -26,7 +25,6 @@ LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
 EXPOSURE_UNIT_S = 1e-4  # of V4L2
 MANUAL = 1  # exposure mode of V4L2
 WIDTH, HEIGHT, FPS = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS
-IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 
@@ -83,7 +81,9 @@ class MjpegStream:
         """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for what is unknown."""
         if self._image is None:
             self._held = self.grab()
-        return _size_of(self.retrieve()[1], key)
+        image = self.retrieve()[1]
+        height, width = (0, 0) if image is None else image.shape[:2]
+        return float({WIDTH: width, HEIGHT: height}.get(key, 0))
 
     def release(self):
         """Close the connection."""
@@ -110,41 +110,6 @@ class MjpegStream:
             self._fill()
         taken, self._buffer = self._buffer[:count], self._buffer[count:]
         return taken
-
-
-class Files:
-    """Image files that are read like cv2.VideoCapture, in the order of their names."""
-
-    def __init__(self, path):
-        paths = Path(path).iterdir() if os.path.isdir(path) else map(Path, glob.glob(path))
-        self._left = sorted(one for one in paths if one.suffix.lower() in IMAGES)
-        if not self._left:
-            raise PortError(f"there are no images in {path}: name a folder or pattern with some")
-
-    def grab(self):
-        """Take the next file, if there is one."""
-        self._path, *self._left = self._left or [None]
-        return self._path is not None
-
-    def retrieve(self):
-        """Decode it: (True, image)."""
-        image = cv2.imread(os.fspath(self._path))
-        if image is None:
-            raise PortError(f"{self._path} is no image that OpenCV can read")
-        return True, image
-
-    def get(self, key):
-        """Size of the next image; 0 for what is unknown."""
-        return _size_of(cv2.imread(os.fspath(self._left[0])), key)
-
-    def release(self):
-        """Nothing is open."""
-        self._left = []
-
-
-def _size_of(image, key):
-    height, width = (0, 0) if image is None else image.shape[:2]
-    return float({WIDTH: width, HEIGHT: height}.get(key, 0))
 
 
 def _opened(message, *arguments):
@@ -179,35 +144,26 @@ def _open_stream(source):
     return _opened(f"{source.path} gives no video: {source.remedy}", source.path, cv2.CAP_FFMPEG, waits)
 
 
-def _open_video(source):
-    if not os.path.exists(source.path):
-        raise PortError(f"there is no video {source.path}: name a file, a device, a folder of images or a URL")
-    return _opened(f"{source.path} is no video that OpenCV can read", source.path)
-
-
 class Source(NamedTuple):
-    """Where images come from: ``open(source)`` gives what reads like cv2.VideoCapture; live ones can be lost."""
+    """Where images come from: ``open(source)`` gives what reads like cv2.VideoCapture."""
 
     path: str
     open: object
-    live: bool = False
-    remedy: str = "look at its file"
-    silence_s: float = 0.0
+    remedy: str
+    silence_s: float
 
 
 def find_source(source, silence_s):
-    """The Source that is meant by an int, str or Path, see :class:`Camera`."""
+    """The Source that is meant by an int, str or Path, see :class:`Camera`; a PortError for what can be none."""
     path = os.fspath(source) if not isinstance(source, int) else str(source)
     path = f"/dev/video{path}" if path.isdigit() else path
     if "://" in path:
         remedy = f"open {path} in a browser, and check network and power of the camera"
-        return Source(path, _open_stream, True, remedy, silence_s)
+        return Source(path, _open_stream, remedy, silence_s)
     if path.startswith("/dev/"):
-        return Source(path, _open_device, True, f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows")
-    pattern = glob.has_magic(path) and not os.path.exists(path)
-    if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
-        return Source(path, lambda source: Files(source.path))
-    return Source(path, _open_video)
+        remedy = f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows"
+        return Source(path, _open_device, remedy, silence_s)
+    raise PortError(f"{path} is no camera: name a device, /dev/video0 or its number, or a URL")
 
 
 @dataclass(frozen=True)
@@ -232,14 +188,12 @@ class Frame:
 class Camera(Closed):
     """A camera, set to what is asked for; what came of it is read back. A context manager.
 
-    A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
-    source again when it is lost. A recorded one (video file, images) gives its next image each time it is asked.
+    A thread grabs its frames, keeps the newest only, and looks for the camera again when it is lost.
 
     Parameters
     ----------
     source : int, str or Path
-        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such as
-        ``"images/*.png"``.
+        V4L2 index or path (/dev/video0), or URL.
     name : str
     size : (int, int), optional
         Width and height, pixels.
@@ -257,7 +211,7 @@ class Camera(Closed):
         'size' (width, height) in pixels, 'exposure' in s and 'fps', each a dict of 'asked' and 'got' (None where it is
         unknown), and 'warnings', a list of str: what could not be set.
     lost : bool
-        A live source gave no frame when it should have, and was not found again yet; a recorded one is at its end.
+        It gave no frame when it should have, and was not found again yet.
 
     Raises
     ------
@@ -273,24 +227,16 @@ class Camera(Closed):
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
         self._capture = self._source.open(self._source)
         self._apply()
-        self._thread = None
-        if self._source.live:
-            self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
-            self._thread.start()
+        self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
+        self._thread.start()
 
     def newest(self, after=None, timeout=5.0):
-        """The newest frame within so many seconds, grabbed later than `after` by the host's clock if that is given.
-
-        A recorded source gives its next image.
-
-        Returns
-        -------
-        Frame
+        """The newest Frame within so many seconds, grabbed later than `after` by the host's clock if that is given.
 
         Raises
         ------
         LineLost
-            If the source is lost and did not come back in time, or a recorded one is at its end.
+            If the camera is lost and did not come back in time.
         NoReply
             If no such frame came in time.
         DeviceError
@@ -301,16 +247,9 @@ class Camera(Closed):
             return self._frame is not None and (after is None or self._frame.time_s > after)
 
         with self._new:
-            if self._thread is not None:
-                self._new.wait_for(lambda: self._quit.is_set() or there(), timeout)
+            self._new.wait_for(lambda: self._quit.is_set() or there(), timeout)
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
-            if self._thread is None:
-                self.lost = not self._capture.grab() or not self._keep(self._clock())
-                if self.lost:
-                    raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: "
-                                   "open it again")  # fmt: skip
-                return self._frame
             if there():
                 return self._frame
         if self.lost:
@@ -318,14 +257,11 @@ class Camera(Closed):
         raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._source.remedy}")
 
     def close(self):
-        """Close the source; a second call does nothing."""
+        """Close the camera; a second call does nothing."""
         self._quit.set()
         with self._new:
             self._new.notify_all()
-        if self._thread is not None:
-            self._thread.join(CLOSE_S)
-        else:
-            self._release()
+        self._thread.join(CLOSE_S)
 
     # ------------------------------------------------------------------------------------------------- grabbing
 
@@ -346,18 +282,18 @@ class Camera(Closed):
         self._release()
 
     def _keep(self, instant):
-        """Decode what was grabbed, three channels of it; whether that was an image."""
+        """Decode what was grabbed, three channels of it, if it is an image."""
         done, image = self._capture.retrieve()
-        if done:
-            grey = image.ndim == 2 or image.shape[2] == 1
-            with self._new:
-                self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
-                self._count += 1
-                if self.lost:
-                    self._log.warning("camera %s is back", self.name)
-                self.lost = False
-                self._new.notify_all()
-        return done
+        if not done:
+            return
+        grey = image.ndim == 2 or image.shape[2] == 1
+        with self._new:
+            self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
+            self._count += 1
+            if self.lost:
+                self._log.warning("camera %s is back", self.name)
+            self.lost = False
+            self._new.notify_all()
 
     def _lose(self):
         """Forget the last frame, and look for the source."""

@@ -205,17 +205,15 @@ def _judge(trials, index, factor):
     """One row: a group in its unit, or (factor None) unknowns of many units, each in its own bounds."""
     e = trials.errors[:, index]
     C, B = (X[:, index][:, :, index] for X in (trials.covariances, trials.bounds))
-    stated_sigma, least_sigma = (np.sqrt(np.diagonal(X, axis1=1, axis2=2)) for X in (C, B))
-    unit = 1 / least_sigma if factor is None else np.full(e.shape, factor)
-    scale = unit[:, :, None] * unit[:, None, :]
-    rmse = np.sqrt(np.mean(np.sum((unit * e) ** 2, axis=1)))
-    crb, stated = (np.sqrt(np.mean(np.trace(X * scale, axis1=1, axis2=2))) for X in (B, C))
-    count, mean = len(e), np.mean(C, axis=0)
-    correlation = mean / np.sqrt(np.multiply.outer(np.diagonal(mean), np.diagonal(mean)))
-    free, seen = count * _freedom(np.mean(B * scale, axis=0)), max(round(count * _freedom(correlation)), 1)
+    mean = np.mean(C, axis=0)
+    seen = max(round(len(e) * _freedom(mean / np.sqrt(np.outer(np.diagonal(mean), np.diagonal(mean))))), 1)
+    unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2)) if factor is None else np.full(e.shape, factor)
+    e, (C, B) = unit * e, (unit[:, :, None] * X * unit[:, None, :] for X in (C, B))
+    crb, stated = (np.sqrt(np.mean(np.trace(X, axis1=1, axis2=2))) for X in (B, C))
+    rmse, free = np.sqrt(np.mean(np.sum(e**2, axis=1))), len(e) * _freedom(np.mean(B, axis=0))
     row = {
         "rmse": rmse, "crb": crb, "rmse_over_crb": rmse / crb, "stated_over_crb": stated / crb,
-        "coverage": np.mean(np.abs(e / stated_sigma) < HALF_WIDTH),
+        "coverage": np.mean(np.abs(e) < HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))),
         "nees": np.mean(np.sum(e * np.linalg.solve(C, e[..., None])[..., 0], axis=-1)) / len(index),
     }  # fmt: skip
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
@@ -230,20 +228,10 @@ def _freedom(C):
 
 
 def observations(shots, setup, last_beam=False):
-    """Drawn shots as the preprocessing makes observations of a scan line, with a leading trial axis.
+    """Drawn shots as the preprocessing makes CameraObservations of a scan line, with a leading trial axis.
 
-    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24 face points.
-
-    Parameters
-    ----------
-    shots : dict of ndarray
-        Of :func:`lrfcal_lib.simulate.draw.draw_shots`.
-    setup : ShotSetup
-    last_beam : bool
-
-    Returns
-    -------
-    CameraObservations
+    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24 face points. `shots`
+    and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
     """
     ranges, bearings, (t, p, _) = shots["ranges"], setup.bearings(), shots["ranges"].shape
     flat, half = ranges.reshape(t * p, -1), np.array([-0.5, 0.5]) * setup.step

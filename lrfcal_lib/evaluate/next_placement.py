@@ -14,11 +14,11 @@ from scipy.stats import norm
 from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import edge_shift, flip_sigma, named_blocks
-from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS
+from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.solvers.joint import UNSEEN
+from lrfcal_lib.solvers.joint import UNSEEN, WORDS
 
 FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # upright ahead of the LRF, print towards it
 LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
@@ -38,10 +38,6 @@ ALONG = (np.arange(5) + 0.5) / 5  # an edge
 CHUNK = 400  # placements at a time: memory
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 LARGE, MOST = 0.5, 3  # of a direction, components above this share of the largest are named, and so many of them
-OTHERS = {
-    "range_offset": "the range offset", "edge_log_odds": "the edge bias", "pitch_scale": "the scale of the pitch",
-    "pitch_by_direction": "the pitch offset by sweep direction",
-}  # fmt: skip
 
 
 def outline(solution):
@@ -54,14 +50,10 @@ def outline(solution):
 def board_grid(solution, distances, bearings, elevations, turns, leans):
     """All combinations of a grid of poses, visible or not; every lean above zero in four directions.
 
-    Returns
-    -------
-    places : DataFrame
-        distance of the board's middle from the LRF (metres), bearing to the left, elevation, turn in the board's plane
-        (anticlockwise as the rig sees it; 0 with the board's x to the right), lean out of the upright plane that faces
-        the LRF (radians), towards ('back' with the top farther away, 'forward', 'left', 'right'; '' upright).
-    boards : ndarray, shape (n, 3, 4)
-        ``T_platform_board``.
+    A DataFrame with distance of the board's middle from the LRF (metres), bearing to the left, elevation, turn in the
+    board's plane (anticlockwise as the rig sees it; 0 with the board's x to the right), lean out of the upright plane
+    that faces the LRF (radians), towards ('back' with the top farther away, 'forward', 'left', 'right'; '' upright);
+    and ``T_platform_board``, shape (n, 3, 4).
     """
     leant = [(lean, way) for lean in leans for way in LEANS if bool(lean) == bool(way)]
     places = [(*place, *lean) for *place, lean in product(distances, bearings, elevations, turns, leant)]
@@ -169,14 +161,11 @@ def _view_covariance(pose, features, model):
 
 def _inner(solution, number):
     """Points spread over the board, shape (n, 3)."""
-    corners = outline(solution)[:, :2]
+    corners, middle = outline(solution), (np.arange(number) + 0.5) / number
     low, high = corners.min(axis=0), corners.max(axis=0)
-    middle = (np.arange(number) + 0.5) / number
-    x = np.stack(np.meshgrid(*(low[i] + middle * (high - low)[i] for i in (0, 1))), -1).reshape(-1, 2)
-    along, away = np.roll(corners, -1, axis=0) - corners, x[:, None] - corners
-    side = along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0]
-    x = x[np.all(side > 0, axis=1) | np.all(side < 0, axis=1)]
-    return np.column_stack([x, np.zeros(len(x))])
+    x = low + np.stack(np.meshgrid(middle, middle, [0.0]), axis=-1).reshape(-1, 3) * (high - low)
+    side = np.cross(np.roll(corners, -1, axis=0) - corners, x[:, None] - corners)[..., 2]
+    return x[np.all(side > 0, axis=1) | np.all(side < 0, axis=1)]
 
 
 def _sampled(boards, local, solution, rate):
@@ -312,15 +301,14 @@ def observability(solution):
     values, vectors = np.linalg.eigh(H)
     least, cameras = max(1e-13 * values[-1], UNSEEN**-2), tuple(solution.transforms)
     sigmas = np.where(values > least, np.maximum(values, least) ** -0.5, np.inf)
-    words = [direction_words(x, names[index], cameras) for x in vectors.T]
-    return [Direction(*pair) for pair in zip(words, sigmas.tolist(), strict=True)]
+    found = zip(vectors.T, sigmas.tolist(), strict=True)
+    return [Direction(direction_words(x, names[index], cameras), sigma) for x, sigma in found]
 
 
 def direction_words(direction, names, cameras):
     """A direction (k,) of unknowns, scaled to metres at 2 m, in words; what cameras have in common is said once."""
     value = dict(zip(names, np.asarray(direction) / np.max(np.abs(direction)), strict=True))
-    single = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | OTHERS
-    words = [(abs(value[n]), w) for n, w in single.items() if n in value]
+    words = [(abs(value[name]), what) for name, what in WORDS.items() if name in value]
     for kind, part in (("rotation about", geometry.POSE_NAMES[:3]), ("shift along", geometry.POSE_NAMES[3:])):
         found = {f"camera '{c}'": np.array([value[f"{c}_{p}"] for p in part]) for c in cameras}
         mean = np.mean([*found.values()], axis=0) if found else 0.0

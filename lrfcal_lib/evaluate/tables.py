@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import cv2
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
 from lrfcal_lib.evaluate.next_placement import outline
@@ -30,7 +30,6 @@ from lrfcal_lib.solvers.joint_noise import on_board
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
-USED = {"crossing": "crossing_placement", "plane": "placements", "scene": "scene_placement"}
 ALL = 10**9  # crossings
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
@@ -62,16 +61,8 @@ def rms(values):
 class Truth:
     """What a simulated session was made with.
 
-    Attributes
-    ----------
-    T_head_lrf : RigidTransform
-    cameras : dict of str to RigidTransform
-        ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base.
-    board : Board
-    boards : dict of int to RigidTransform
-        ``T_platform_board`` by placement.
-    pitch : dict of int to ndarray, shape (n_scan_lines,)
-        Of every scan line, radians.
+    `cameras` are ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base; `boards`
+    ``T_platform_board`` by placement, `pitch` that of every scan line by placement, radians.
     """
 
     T_head_lrf: RigidTransform
@@ -169,8 +160,7 @@ def poses_under(obs, model):
             start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
             seen = obs.pattern_points[good], pixels[good], model.matrix, model.distortion
             _, rotvec, shift = cv2.solvePnP(*seen, *start, useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE)
-            turn = Rotation.from_rotvec(rotvec[:, 0])
-            pose[:] = RigidTransform.from_components(shift[:, 0], turn).as_matrix()
+            pose[:3, :3], pose[:3, 3:] = cv2.Rodrigues(rotvec)[0], shift
     return moved
 
 
@@ -240,7 +230,8 @@ def method_comparison(observations, solutions, truth=None, joint=None):
             held = () if joint is None else jointly_left_out(joint, camera)
         else:
             own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
-            used, held = getattr(own, USED[METHODS[name].uses]), left_out(own, judge, name, solution)
+            used = own.placements if METHODS[name].uses == "plane" else getattr(own, f"{METHODS[name].uses}_placement")
+            held = left_out(own, judge, name, solution)
         edge, held = edge_residuals_px(judge, solution.transform, solution.model), left_out_residuals(held)
         row = {
             "camera": camera, "method": name, "n_placements": len(np.unique(used)),
@@ -573,31 +564,6 @@ def edge_misses_px(joint, camera):
     return edge_residuals_px(obs, pose) - shift * obs.model.fx / pose.apply(obs.crossing_points)[:, 2]
 
 
-def size_error(joint):
-    """How much larger the board is in the cloud than stated, ranges as recorded, and the standard deviation of that.
-
-    An offset of all ranges would stretch the cloud until it fits a board whose size is stated wrong, so it is left out;
-    the offset that the maker admits is a part of the expected error, beside the scatter over placements and the edge
-    bias. The error is the mean relative one of the lengths whose ends beams decide; NaN with fewer than three
-    placements, or where nobody knows the outline.
-    """
-    prepared, model = joint.prepared, replace(joint.edge_model(), range_offset=0.0)
-    if prepared.board.corners is None:
-        return np.nan, np.nan
-    true, edges, found = prepared.board.lengths(), prepared.board.edges, []
-    for placement in joint.solution.boards:
-        with suppress(DegenerateGeometry):
-            measured, across = likely_outline_of(prepared, placement, model)
-            own = [v / true[k] - 1 for k, v in measured.lengths.items() if ends_of(edges, k, across) == "scan"]
-            found += [np.mean(own)] if own else []
-    if len(found) < 3:
-        return np.nan, np.nan
-    slope = edge_shift(model.log_odds, np.median(joint.observations.beam_radius))[1]
-    bias = 2 * slope * model.log_odds_sigma / np.mean(list(true.values()))
-    offset = prepared.session.lrf.admitted_offset / np.median(joint.observations.face_range)
-    return float(np.mean(found)), float(np.linalg.norm([np.std(found, ddof=1) / np.sqrt(len(found)), offset, bias]))
-
-
 def random_halves(joint, pairs=8):
     """How far estimates from two random halves of the placements differ, beside what their sigmas predict.
 
@@ -609,11 +575,10 @@ def random_halves(joint, pairs=8):
     rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
     for pair in range(pairs):
         parts = np.array_split(rng.permutation(numbers), 2)
-        try:
+        halves = []
+        with suppress(DegenerateGeometry):
             halves = [solve_again(joint.observations.select(np.sort(part)), joint.solution) for part in parts]
-        except DegenerateGeometry:
-            continue
-        for camera in joint.observations.cameras:
+        for camera in joint.observations.cameras if halves else ():
             turn, shift = geometry.transform_difference(*(half.transforms[camera] for half in halves))
             lens = np.diag(joint.solution.lens)[joint.solution.columns(f"{camera}_")]
             sigma = 2 * np.sqrt(np.maximum(joint.solution.camera(camera).trusted_sigma ** 2 - lens, 0.0))

@@ -25,20 +25,11 @@ ROUNDS = 12  # of the search for the beam that ends in a pixel
 class Chain:
     """From a beam to the frame of an image, and how well each link is known.
 
-    Attributes
-    ----------
-    head : ndarray, shape (3, 4)
-        ``T_head_lrf``.
-    camera : ndarray, shape (3, 4), or None
-        ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the cloud.
-    on_head : bool
-    covariances : tuple of ndarray, shape (13, 13)
-        Of `COLUMNS` (increments ``[w, v]`` of the transforms; metres; fraction; radians). Where there are several, the
-        one that gives more counts, quantity by quantity.
-    unseen : ndarray, shape (m, 13)
-        Motions that nothing determines: what depends on them has no bound.
-    sweep_sigma : tuple of float
-        Offset (radians) and stretch of the pitch that every sweep has of its own.
+    `head` is ``T_head_lrf`` (3, 4); `camera` ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``, None
+    for points of the cloud. `covariances`, each (13, 13), are those of `COLUMNS` (increments ``[w, v]`` of the
+    transforms; metres; fraction; radians): where there are several, the one that gives more counts, quantity by
+    quantity. `unseen` (m, 13) are motions that nothing determines: what depends on them has no bound. `sweep_sigma`:
+    offset (radians) and stretch of the pitch that every sweep has of its own.
     """
 
     head: np.ndarray
@@ -122,20 +113,9 @@ def chain_of(solution, camera=None):
 def carried(chain, bearing, pitch, distance, image_pitch=0.0):
     """Ends of beams in the frame of an image, and what moves them.
 
-    Parameters
-    ----------
-    chain : Chain
-    bearing, pitch, distance : array_like, shape (...)
-        Radians, radians, and metres from the mirror.
-    image_pitch : float
-        Radians; only for a camera on the head.
-
-    Returns
-    -------
-    points : ndarray, shape (..., 3)
-        Camera frame; without a camera the LRF frame of a scan at `image_pitch`. Metres.
-    jacobian, by_pitch : ndarray, shapes (..., 3, 13) and (..., 3)
-        By `COLUMNS`, and by the pitch of the beam.
+    Of beams with bearing, pitch (radians) and distance from the mirror (metres), and for an image of a camera on the
+    head at `image_pitch`: points (..., 3) in the camera frame (without a camera the LRF frame of a scan at that pitch),
+    metres, and their derivatives by `COLUMNS` (..., 3, 13) and by the pitch of the beam (..., 3).
     """
     bearing, pitch, distance = np.broadcast_arrays(*(np.asarray(a, float) for a in (bearing, pitch, distance)))
     R, t = chain.head[:, :3], chain.head[:, 3]

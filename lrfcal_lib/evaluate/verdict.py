@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from lrfcal_lib.evaluate.alternatives import doubtful, far_from_stated, places_of_cameras
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
-from lrfcal_lib.evaluate.tables import handed_over, placements_table, size_error
+from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
@@ -27,6 +28,8 @@ MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the nois
 STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a word, and not that noise at all
 DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
+LARGE = {"squares": 0.02, "ranges": 0.02}  # errors of sizes that no estimate survives
+LARGE_SCALE = 0.01  # of the pitch
 LOST = 0.1  # share of the placements that may be left out without a warning
 SIZES = (
     "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
@@ -47,7 +50,8 @@ class Reason:
     ----------
     answer : {'with care', 'no'}
     kind : str
-        A key: 'handed over', 'left out', 'range offset', 'size', 'dependent', 'convergence', 'unobservable', 'cameras',
+        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', of
+        :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
         'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error', 'noise',
         'warning', 'error'.
     words : str
@@ -136,33 +140,29 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
-    suggestion, problem = None, ""
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
     found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
-    if suggest:
-        try:
-            suggestion = suggest_placement(solution, models, **options)
-        except DegenerateGeometry as error:
-            problem = f"No placement can be suggested: {error}."
-    return replace(found, suggestion=suggestion, no_suggestion=problem)
+    try:
+        return replace(found, suggestion=suggest_placement(solution, models, **options) if suggest else None)
+    except DegenerateGeometry as error:
+        return replace(found, no_suggestion=f"No placement can be suggested: {error}.")
 
 
 def _expected(chains, models, pitch, noise, reasons, doubt):
     """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
     # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have taken it up
     unsure = np.diag([doubt**2 * (name in ("range_offset", *POSE_NAMES[3:])) for name in COLUMNS])
-    more = {c: tuple(C + unsure for C in chain.covariances) for c, chain in chains.items()}
-    chains = {c: replace(chain, covariances=more[c]) for c, chain in chains.items()}
+    chains = {k: replace(v, covariances=tuple(C + unsure for C in v.covariances)) for k, v in chains.items()}
     low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
     middle = (low + high) / 2
     field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
     cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
-    maps, looks = {"cloud_mm": 1000 * cloud.rms()}, {"image_pitch": sum(field) / 2, "pitches": field}
-    for camera, chain in chains.items():
-        if camera is not None:
-            found = projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks)
-            maps[f"{camera}_px"] = found.rms()
+    looks = {"image_pitch": sum(field) / 2, "pitches": field}
+    maps = {"cloud_mm": 1000 * cloud.rms()} | {
+        f"{camera}_px": projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks).rms()
+        for camera, chain in chains.items() if camera is not None
+    }  # fmt: skip
     errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
     if large:
@@ -204,7 +204,8 @@ def judge(calibration, method=None, **options):
     if reasons:  # with the words of those that the estimate excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
-    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", words)
+    places = [] if joint is None else places_of_cameras(joint.solution)
+    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
     return replace(_answered(found, sizes + reasons), notes=notes)
 
 
@@ -231,7 +232,7 @@ def _without_joint(calibration, method, doubt):
     # the range offset of the cloud may be what the maker admits
     platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
-    head, offset = pose_array(platform.T_head_lrf), np.diag([admitted**2, 0.0, 0.0])
+    head, offset = pose_array(platform.transform("combined")), np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
@@ -246,11 +247,12 @@ def _without_joint(calibration, method, doubt):
 def contradicts_stated(joint):
     """Reasons to doubt what is stated of sizes, and by how much all ranges are off if they are wrong (metres).
 
-    The reasons are a range offset that no maker admits, and edges of another length in the cloud.
+    The reasons are a range offset that no maker admits, and what :mod:`lrfcal_lib.evaluate.alternatives` finds.
     """
     solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
-    margin = CONTRADICTS * dict(zip(solution.names, solution.trusted_sigma, strict=True)).get("range_offset", 0.0)
+    sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
+    margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     if abs(offset) > admitted + margin:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
@@ -258,16 +260,23 @@ def contradicts_stated(joint):
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = abs(offset)
-    error, sigma = size_error(joint)
-    if abs(error) > CONTRADICTS * sigma:
-        length = 1000 * error * np.mean(list(joint.prepared.board.lengths().values()))
+    asked = doubtful(joint.solution, admitted)
+    if asked:
+        best = asked[0]
+        large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
+        words = f"statements contradict the data: {'; or '.join(doubt.words for doubt in asked)}"
+        reasons.append(Reason(NO if large else CARE, best.kind, words))
+        off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
+        doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
+    scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
+    if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (
-            f"the board's edges are {abs(length):.0f} mm ({100 * abs(error):.1f} %) "
-            f"{'longer' if error > 0 else 'shorter'} in the cloud than stated, {abs(error) / sigma:.0f} times the "
-            f"expected error: {SIZES}"
+            f"the platform turns {100 * abs(scale):.1f} +- {100 * spread:.1f} % {'more' if scale > 0 else 'less'} than "
+            "its recorded pitch says: check its gear or encoder (the estimate has taken this off)"
         )
-        reasons.append(Reason(NO if abs(error) > 2 * CONTRADICTS * sigma else CARE, "size", words))
-        doubt = max(doubt, abs(error) * float(np.median(joint.solution.observations.face_range)))
+        reasons.append(Reason(CARE, "pitch scale", words))
+    for words, angle in far_from_stated(joint):
+        reasons.append(Reason(NO if angle > np.pi / 2 else CARE, "far from stated", words))
     return reasons, doubt
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 
 import numpy as np
-from matplotlib.ticker import FormatStrFormatter
 
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of
 
@@ -102,8 +101,7 @@ def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
     ax.grid(False)
     if good.count() and good.max() > 1.05 * good.min():
         ax.clabel(ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize="x-small", fmt="%.3g")
-    bar = ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8)
-    bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.3g"))
+    ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8, format="%.3g")
     ax.set_aspect("equal")
     rms = scale * found.rms()[index]
     said = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"

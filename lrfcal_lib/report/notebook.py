@@ -56,8 +56,7 @@ def start():
 
 def session_path():
     """Folder to work on: ``LRFCAL_SESSION``, else the shipped session, else the one that ``make report`` imported."""
-    stated = os.environ.get("LRFCAL_SESSION")
-    if stated:
+    if stated := os.environ.get("LRFCAL_SESSION"):
         return Path(stated)
     for path in (SHIPPED, SCRATCH):
         if (path / "session.json").is_file():
@@ -67,10 +66,9 @@ def session_path():
 
 def report_file(name):
     """Path of a file of the report (e.g. ``"cloud.ply"``), its folder made; None outside a report run."""
-    folder = os.environ.get("LRFCAL_REPORT")
-    if not folder:
+    if not os.environ.get("LRFCAL_REPORT"):
         return None
-    path = Path(folder) / name
+    path = Path(os.environ["LRFCAL_REPORT"]) / name
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -90,10 +88,9 @@ def save(fig, name, caption, *, main=True):
         Whether the first page of the report shows it.
     """
     _record("figures", name, {"name": name, "caption": caption, "main": main})
-    path = report_file(f"figures/{name}.png")
     # drawing gives a figure without layout engine the default one, which would move what was placed by hand
     with plt.rc_context({"figure.constrained_layout.use": False}):
-        if path:
+        if path := report_file(f"figures/{name}.png"):
             fig.savefig(path, metadata={"Software": None})
         if get_ipython() is not None:
             display(fig)
@@ -124,8 +121,7 @@ def table(df, name, digits=3, caption=""):
     # none shows a minus before a zero
     shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
     _record("tables", name, {"name": name, "caption": caption, "formats": shapes})
-    path = report_file(f"tables/{name}.csv")
-    if path:
+    if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
     shown = df.reset_index(drop=True)
     for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
@@ -151,8 +147,7 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     main : bool
         Whether the first page shows it.
     """
-    value = value.item() if hasattr(value, "item") else value
-    shown = value
+    shown = value = value.item() if hasattr(value, "item") else value
     if isinstance(value, float):
         shown, value = (f"{value:z.{digits}f}", value) if math.isfinite(value) else ("unknown", None)
     shown = f"{shown} {unit}".strip()
@@ -179,6 +174,5 @@ def _record(kind, name, entry):
     if not re.fullmatch(r"[a-z0-9_]+", name):
         raise ValueError(f"'{name}' must consist of lower-case letters, digits and underscores: it becomes a file name")
     _found[kind].append(entry)
-    path = report_file(f"parts/{os.environ.get('LRFCAL_NOTEBOOK', 'notebook')}.json")
-    if path:
+    if path := report_file(f"parts/{os.environ.get('LRFCAL_NOTEBOOK', 'notebook')}.json"):
         path.write_text(json.dumps(_found, indent=1))

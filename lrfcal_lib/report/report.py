@@ -24,8 +24,18 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
+import cv2
+import nbformat
+import pandas as pd
+from jinja2 import Environment
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
+from nbconvert import HTMLExporter
+from tqdm import tqdm
+
 from lrfcal_lib.report.notebook import ROOT, SCRATCH, SHIPPED
 from lrfcal_lib.session.cache import VARIABLE as CACHE
+from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 
@@ -99,10 +109,6 @@ def execute(path, environment):
 
     Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback of that cell or ''.
     """
-    import nbformat
-    from nbclient import NotebookClient
-    from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
-
     notebook, error = nbformat.read(path, as_version=4), ""
     place = {"metadata": {"path": str(Path(path).parent)}}
     options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
@@ -128,8 +134,6 @@ def store(path, session_path, cache=""):
     may carry no licence), execution counts are kept. `cache` is the folder of stages that other notebooks have worked
     out.
     """
-    import nbformat
-
     environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
     notebook, error = execute(path, environment | {CACHE: cache})
     if error:
@@ -151,8 +155,6 @@ def default_session():
     recordings = Path(os.environ.get("LRFCAL_REAL_DATA") or ROOT.parent / "shared" / "real") / "lms400_zed"
     if not recordings.is_dir():
         raise SessionError(SOURCE_OF_SESSIONS)
-    from lrfcal_lib.session.importers import import_lasersetero
-
     shutil.rmtree(SCRATCH, ignore_errors=True)
     SCRATCH.parent.mkdir(parents=True, exist_ok=True)
     import_lasersetero(recordings, SCRATCH)
@@ -197,9 +199,9 @@ def _report(session, options):
     failed = [run for run in runs if run.error]
     for run in failed:
         print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
-    seconds = time.monotonic() - begin
-    print(f"{len(runs) - len(failed)} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
-    return 1 if failed else 0
+    good, seconds = len(runs) - len(failed), time.monotonic() - begin
+    print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
+    return int(bool(failed))
 
 
 def _store_all(session):
@@ -208,7 +210,7 @@ def _store_all(session):
         errors = {path.name: store(path, session.resolve(), cache) for path in sorted(NOTEBOOKS.glob(NUMBERED))}
     for name, error in errors.items():
         print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
-    return 1 if any(errors.values()) else 0
+    return int(any(errors.values()))
 
 
 @contextmanager
@@ -252,8 +254,6 @@ def _take_place(new, out):
 
 def _execute_all(paths, environment, out, jobs):
     """Execute and convert notebooks side by side; the bar shows on a terminal only."""
-    from tqdm import tqdm
-
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
@@ -275,8 +275,6 @@ def _execute_all(paths, environment, out, jobs):
 
 def _run(path, environment, out):
     """Execute one notebook and write its page: prose, figures and numbers, without the code."""
-    from nbconvert import HTMLExporter
-
     begin = time.monotonic()
     notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
     # first heading and first paragraph
@@ -293,8 +291,6 @@ def _run(path, environment, out):
 
 
 def _write_index(out, session, runs, found, seconds):
-    from jinja2 import Environment
-
     source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source).render(
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
@@ -310,8 +306,6 @@ def _write_index(out, session, runs, found, seconds):
 
 def _thumbnail(file):
     """A picture as data URI, so that the page needs no other file; '' where there is none."""
-    import cv2
-
     picture = cv2.imread(str(file))
     if picture is None:
         return ""
@@ -323,8 +317,6 @@ def _thumbnail(file):
 
 def _rows(file, shapes):
     """Header, alignment and formatted cells of a table; None where its notebook failed before writing it."""
-    import pandas as pd
-
     if not file.is_file():
         return None
     table = pd.read_csv(file)
@@ -341,6 +333,6 @@ def _provenance(session):
         commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
     except FileNotFoundError:
         commit = ""
-    pairs = [("session.json (SHA-256)", digest), ("date", date.today().isoformat()), ("commit", commit)]
-    pairs += [("Python", platform.python_version())] + [(name, version(name)) for name in PACKAGES]
-    return [(name, value) for name, value in pairs if value]
+    pairs = {"session.json (SHA-256)": digest, "date": date.today().isoformat(), "commit": commit}
+    pairs |= {"Python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    return [(name, value) for name, value in pairs.items() if value]

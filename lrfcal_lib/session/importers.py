@@ -12,7 +12,7 @@ from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import image_size
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, reading, transform_to_json
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, read_bytes, reading, transform_to_json
 from lrfcal_lib.session.write import SessionWriter
 
 # LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder ZED_STEREO_LASER_SWEEP.
@@ -22,10 +22,8 @@ LASERSETERO_HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])
 LASERSETERO_CLOUD = RigidTransform.from_translation([0.0, 0.0, 0.2])  # T_cloud_platform
 # The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of bolted plates.
 LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
-LASERSETERO_STEP_DEG = 0.1
-LASERSETERO_VIEW_DEG = (55.0, 125.0)  # the LMS400 sees 70 deg
-LASERSETERO_COUNT = 0.001  # metres, one count of the LMS400
-LASERSETERO_SQUARE = 0.0775
+STEP_DEG, FIRST, LAST = 0.1, 550, 1250  # the LMS400 sees 70 deg: from the first to the last of these steps
+COUNT = 0.001  # metres, one count of the LMS400
 LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
 
@@ -56,12 +54,13 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     clouds = numbered(src, "plane_*.pcd")
     published = {name: read_bouguet(Path(src) / f"Calib_Results_{name}.m") for name in ("left", "right")}
     images = {name: numbered(src, f"{name}_*.png") for name in published}
-    sizes = {name: image_size(next(iter(files.values()))) for name, files in images.items()}
+    first = {name: next(iter(files.values())) for name, files in images.items()}
+    sizes = {name: image_size(file, read_bytes(file)) for name, file in first.items()}
     models = {name: result["model"] if intrinsics == "published" else None for name, result in published.items()}
     cameras = [CameraInfo(name, "platform", *sizes[name], models[name]) for name in published]
-    pattern, view = Chessboard(8, 6, LASERSETERO_SQUARE), tuple(np.radians(LASERSETERO_VIEW_DEG))
-    board = Board("chessboard 9 x 7", ("top", "right", "bottom", "left"), None, pattern, ("left", "top"))
-    lrf = LrfInfo("SICK LMS400", view, np.radians(LASERSETERO_STEP_DEG), 0.005, 0.0, LASERSETERO_COUNT, 3.0)
+    edges, view = ("top", "right", "bottom", "left"), tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG]))
+    board = Board("chessboard 9 x 7", edges, None, Chessboard(8, 6, 0.0775), ("left", "top"))
+    lrf = LrfInfo("SICK LMS400", view, np.radians(STEP_DEG), 0.005, 0.0, COUNT, 3.0)
     # the authors' result is printed with four digits, so made orthonormal again
     turn = Rotation.from_matrix([[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]])
     T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
@@ -73,7 +72,7 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
         "cameras": {name: result["reference"] for name, result in published.items()},
     }
     about = {"licence": "none stated by the authors", "source": LASERSETERO, "reference": reference}
-    about |= {"platform_sigma": LASERSETERO_PLATFORM_SIGMA}
+    about["platform_sigma"] = LASERSETERO_PLATFORM_SIGMA
     with SessionWriter(dst, board, lrf, cameras, LASERSETERO_HEAD, **about) as writer:
         misses = []
         for placement, file in clouds.items():
@@ -88,8 +87,8 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
 
 def numbered(folder, pattern):
     """Files by the number in their names."""
-    names = ((re.search(r"_(\d+)\.", file.name), file) for file in sorted(Path(folder).glob(pattern)))
-    found = {int(number[1]): file for number, file in names if number}
+    files = sorted(Path(folder).glob(pattern))
+    found = {int(number[1]): file for file in files if (number := re.search(r"_(\d+)\.", file.name))}
     if not found:
         raise SessionError(f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?")
     return found
@@ -122,9 +121,9 @@ def recover_polar(points, name="points"):
     p_platform = LASERSETERO_CLOUD.inv().apply(points)
     S = np.sqrt(np.maximum(np.sum(p_platform[:, 1:] ** 2, axis=1) - offset**2, 0.0))
     across, along = p_platform[:, 0] - x, S - ahead
-    ranges = np.round(np.hypot(across, along) / LASERSETERO_COUNT) * LASERSETERO_COUNT
-    steps = np.round(np.degrees(np.arctan2(along, across)) / LASERSETERO_STEP_DEG)  # 0.1 deg, so no .5 to round
-    bearing = np.radians(steps * LASERSETERO_STEP_DEG)
+    ranges = np.round(np.hypot(across, along) / COUNT) * COUNT
+    steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG)  # 0.1 deg, so no .5 to round
+    bearing = np.radians(steps * STEP_DEG)
     # Once more with the exact range and bearing: now the pitch carries the rounding of the published points only.
     S = ranges * np.sin(bearing) + ahead
     pitch = np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
@@ -137,13 +136,13 @@ def recover_polar(points, name="points"):
             f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than {1000 * LARGEST_MISS:g} mm; "
             "not points of this rig?"
         )
-    first, last = (round(v / LASERSETERO_STEP_DEG) for v in LASERSETERO_VIEW_DEG)
-    if steps.min() < first or steps.max() > last:
-        low, high = LASERSETERO_STEP_DEG * steps.min(), LASERSETERO_STEP_DEG * steps.max()
-        raise SessionError(f"bearings reach {low:.1f} .. {high:.1f} deg, the LMS400 sees 55 .. 125 deg")
-    grid = np.full((line[-1] + 1, last - first + 1), np.nan)
-    grid[line, steps.astype(int) - first] = ranges
-    return grid, np.radians(np.arange(first, last + 1) * LASERSETERO_STEP_DEG), pitch, miss
+    low, high = steps.min(), steps.max()
+    if low < FIRST or high > LAST:
+        reach = f"{STEP_DEG * low:.1f} .. {STEP_DEG * high:.1f} deg"
+        raise SessionError(f"bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
+    grid = np.full((line[-1] + 1, LAST - FIRST + 1), np.nan)
+    grid[line, steps.astype(int) - FIRST] = ranges
+    return grid, np.radians(np.arange(FIRST, LAST + 1) * STEP_DEG), pitch, miss
 
 
 def source_text(file):
@@ -179,11 +178,9 @@ def read_bouguet(file):
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
     need = ("fc", "cc", "kc", "nx", "ny", "fc_error", "cc_error", "kc_error")
-    lacking = [key for key in need if key not in values]
-    if lacking:
+    if lacking := [key for key in need if key not in values]:
         raise SessionError(f"{file}: no value of {', '.join(lacking)}; is this a Calib_Results.m?")
     intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
-    sigma = sigma / 3
     model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
     poses = {}
     for key in values:
@@ -191,6 +188,6 @@ def read_bouguet(file):
             rotation, shift = Rotation.from_rotvec(values[key]), values[f"Tc_{number[1]}"] / 1000
             poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
-    both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma}
+    both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
     reference = {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
-    return {"model": model.with_parameters(intrinsics, np.diag(sigma**2)), "reference": reference}
+    return {"model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)), "reference": reference}

@@ -100,7 +100,7 @@ def encode_telegram(code, data=b"", *, status=None, address=None):
     ValueError
         For numbers that are no bytes, or more than 65535 bytes of data.
     """
-    address = address if address is not None else HOST if status is None else DEVICE
+    address = (HOST if status is None else DEVICE) if address is None else address
     for what, value in (("code", code), ("status", status or 0), ("address", address)):
         if not 0 <= value <= 0xFF:
             raise ValueError(f"{what} must be a byte, 0 to 255, got {value}")
@@ -215,16 +215,8 @@ class Mode:
     """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper ones flags."""
 
     bits: int
-
-    @property
-    def top(self):
-        """Largest number the range bits hold: 'not valid'."""
-        return (1 << self.bits) - 1
-
-    @property
-    def largest(self):
-        """Largest number that is a range; the nine above are special."""
-        return self.top - 9
+    top = property(lambda self: (1 << self.bits) - 1, doc="Largest number the range bits hold: 'not valid'.")
+    largest = property(lambda self: self.top - 9, doc="Largest number that is a range; the nine above are special.")
 
 
 # flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others: level of a reflector
@@ -264,9 +256,8 @@ class Scans:
     @property
     def reasons(self):
         """Index into `REASONS` of every value, 0 for a range; ndarray of uint8, shape (n, B)."""
-        special, found = special_values(self.words, self.mode)
         reasons = np.zeros(self.words.shape, np.uint8)
-        reasons[special] = found
+        special, reasons[special] = special_values(self.words, self.mode)
         return reasons
 
     @property
@@ -410,7 +401,7 @@ def decode_scans(data, offset, length, mode=0):
     rows = rows[data[offset[rows] + 4] == SCAN]
     head = word(data, offset[rows] + 5)
     extra = length[rows] - 10 - 2 * (head & 0x3FF)
-    sound = ((extra == 0) | (extra == 2)) & (head < 1 << 15)
+    sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
     rows, head, extra, out = rows[sound], head[sound], extra[sound], []
     for group in alike(head & 0xE3FF, extra):
         at, head_of, indexed = offset[rows[group]], head[group], extra[group[0]] > 0
@@ -438,19 +429,16 @@ def scan_quarters(values, partial=-1):
 
     The number of values tells the variant (angle and resolution) of the device. TelegramError if none sends that many.
     """
-    if partial >= 0:
-        if values != 181 - (partial > 0):
-            raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
-        return 4 * np.arange(values) + partial
-    if values not in GRIDS:
+    if partial >= 0 and values != 181 - (partial > 0):
+        raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
+    if partial < 0 and values not in GRIDS:
         known = ", ".join(map(str, sorted(GRIDS)))
         raise TelegramError(f"a whole scan has {known} values, got {values}: only a sub-range was asked for?")
-    first, step = GRIDS[values]
+    first, step = GRIDS[values] if partial < 0 else (partial, 4)
     return first + step * np.arange(values)
 
 
-STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xB2, 0xBA, 0xBB, 0xF4, 0xF7
-SEVERITIES = ("ok", "info", "warning", "error", "fatal")
+STATUS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xBA, 0xBB, 0xF4, 0xF7
 BAUD = {0x8067: 9600, 0x8033: 19200, 0x8019: 38400, 0x8001: 500000}
 CONFIGURATION_BYTES = 34
 
@@ -502,20 +490,9 @@ class Configuration:
 
     block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
 
-    @property
-    def realtime_indices(self):
-        """Whether scans carry their indices."""
-        return bool(self.block[4] & 2)
-
-    @property
-    def measuring_mode(self):
-        """Key of `MODES`."""
-        return self.block[5]
-
-    @property
-    def unit(self):
-        """'cm' or 'mm'."""
-        return unit_of(self.block[6:])
+    realtime_indices = property(lambda self: bool(self.block[4] & 2), doc="Whether scans carry their indices.")
+    measuring_mode = property(lambda self: self.block[5], doc="Key of `MODES`.")
+    unit = property(lambda self: unit_of(self.block[6:]), doc="'cm' or 'mm'.")
 
     def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
         """The same Configuration with other values; what is None stays."""
@@ -552,13 +529,6 @@ def parse_status(raw):
 def parse_type(raw):
     """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063', 'V02.10')."""
     return tuple(part.strip() for part in text(reply_data(raw, TYPE, 1)).split(";"))
-
-
-def parse_errors(raw):
-    """Error reply 0xB2: list of severity (one of `SEVERITIES`, 'unknown'), whether it is over, number of the error."""
-    data, words = reply_data(raw, ERRORS, 0), dict(enumerate(SEVERITIES))
-    pairs = zip(data[::2], data[1::2], strict=False)
-    return [(words.get(kind & 7, "unknown"), kind >= 0x80, number) for kind, number in pairs]
 
 
 def parse_configuration(raw):

@@ -64,14 +64,12 @@ def read_scans(path, file):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     if file is None:
         file = next((name for name in SOURCES if os.path.lexists(path / name)), SOURCES[0])
-    target = inside(path, file, "session.json: file of the LRF")
+    target, lexists = inside(path, file, "session.json: file of the LRF"), os.path.lexists
     if file not in SOURCES:
         raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
-    lrf, lexists = path / "lrf", os.path.lexists
-    if not lexists(target) and lexists(lrf) and any(map(PART.fullmatch, stated.listed(lrf, path))):
-        raise SessionError(
-            f"{path}: the recording was interrupted; lrfcal_lib.session.write.finish('{path}') completes it"
-        )
+    if not lexists(target) and lexists(path / "lrf") and any(map(PART.fullmatch, stated.listed(path / "lrf", path))):
+        remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
+        raise SessionError(f"{path}: the recording was interrupted; {remedy}")
     if file == "lrf/scans.npz":
         return read_npz(target, path), None
     scans, log = read_telegrams(target, path)
@@ -182,7 +180,7 @@ def read_images(path, facts, unfinished=None):
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
             out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
-            check_image_size(target, image_size(target, path), cameras[row["camera"]])
+            check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
     return tuple(out)
 
 
@@ -207,16 +205,8 @@ def read_edges(path, facts, records):
     return tuple(out)
 
 
-def image_size(file, within=None):
-    """Width and height of a PNG or JPEG image from its header; SessionError if it is missing, cut off, or neither.
-
-    `within` is the session's folder, where the image is a file of a session.
-    """
-    return size_in_header(file, stated.read_bytes(file, within))
-
-
-def size_in_header(file, data):
-    """Width and height of an image of which the bytes are known, see :func:`image_size`."""
+def image_size(file, data):
+    """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         header, complete = data[16:24], b"IEND" in data[-16:]
         size = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")
@@ -237,13 +227,12 @@ def size_in_header(file, data):
     return size
 
 
-def check_image_size(file, size, camera):
-    """Refuse an image (width, height) of another size than its camera's."""
-    if tuple(size) != (camera.width, camera.height):
-        raise SessionError(
-            f"{file}: {size[0]} x {size[1]} pixels, but camera '{camera.name}' has {camera.width} x {camera.height}; "
-            "intrinsics hold for one image size only"
-        )
+def check_image_size(file, data, camera, size=None):
+    """Refuse an image of another size than its camera's; `size` is that of the decoded image."""
+    width, height = size or image_size(file, data)
+    if (width, height) != (camera.width, camera.height):
+        found = f"{width} x {height} pixels, but camera '{camera.name}' has {camera.width} x {camera.height}"
+        raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")
 
 
 # tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
@@ -325,13 +314,16 @@ class Session:
 
     def sweep(self, placement):
         """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
-        if placement not in self.placements:
-            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
-        rows = self.scans["placement"] == placement
+        rows = self.scans["placement"] == self._known(placement)
         picked = {k: v[rows] for k, v in self.scans.items() if k in ("ranges", "pitch", "time_s", "intensities")}
         if not np.isfinite(picked["ranges"]).any():
             raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
         return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
+
+    def _known(self, placement):
+        if placement not in self.placements:
+            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
+        return placement
 
     def images(self, camera=None, placement=None, purpose=None):
         """The records of images that match all that is given, in the order of images.csv."""
@@ -345,18 +337,17 @@ class Session:
         SessionError if the file cannot be decoded or has another size than the camera.
         """
         camera, data = self.cameras[record.camera], stated.read_bytes(record.file, self.path)
-        check_image_size(record.file, size_in_header(record.file, data), camera)
+        check_image_size(record.file, data, camera)
         with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             shape = image.shape  # there is none of an image that is None
-        check_image_size(record.file, shape[1::-1], camera)
+        check_image_size(record.file, data, camera, shape[1::-1])
         return image
 
     @property
     def scene_placements(self):
         """Placements that show a scene to be rebuilt, not the board: their images have the purpose 'scene'."""
-        scenes = {record.placement for record in self.images(purpose="scene")}
-        return tuple(p for p in self.placements if p in scenes)
+        return tuple(p for p in self.placements if self.images(placement=p, purpose="scene"))
 
     @property
     def board_placements(self):
@@ -380,9 +371,7 @@ class Session:
         """
         if self.telegrams is None:
             raise SessionError(f"{self.path}: recorded as lrf/scans.npz; only lrf/telegrams.bin tells about telegrams")
-        if placement is not None and placement not in self.placements:
-            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
-        return self.telegrams.report(placement)
+        return self.telegrams.report(placement if placement is None else self._known(placement))
 
     def sweep_direction(self, placement):
         """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one pitch."""

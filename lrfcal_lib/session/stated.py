@@ -102,22 +102,20 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
         with suppress(FileNotFoundError):  # a device is not even opened
             _refuse_other(file, os.stat(file.name, dir_fd=handle, follow_symlinks=False), "-", "a file")
         inner = os.open(file.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666, dir_fd=handle)
-    stream = os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
     try:
         status = os.fstat(inner)
         _refuse_other(file, status, "-", "a file")
         if flags == os.O_RDONLY and status.st_size > most:
             raise SessionError(f"{file}: {status.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
+        return os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
     except BaseException:
-        stream.close()
+        os.close(inner)
         raise
-    return stream
 
 
 def _refuse_other(file, status, kind, wanted):
     """Refuse what is no plain file (or folder), such as a link."""
-    found = stat.filemode(status.st_mode)[0]
-    if found != kind:
+    if (found := stat.filemode(status.st_mode)[0]) != kind:
         what = KINDS.get(found, "a file")
         raise SessionError(f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its place")
 
@@ -326,6 +324,11 @@ def transform_from_json(data):
 Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
 
 
+def plain(values):
+    """As JSON has them: lists for arrays and tuples."""
+    return json.loads(json.dumps(values, default=lambda array: array.tolist()))
+
+
 class LensStated(BaseModel):
     """Intrinsics as they stand in a file."""
 
@@ -346,12 +349,7 @@ class LensStated(BaseModel):
 
 def model_to_json(model):
     """Intrinsics (or None) as they stand in session.json."""
-    if model is None:
-        return None
-    out = {k: float(getattr(model, k)) for k in ("fx", "fy", "cx", "cy")}
-    out["distortion"] = np.asarray(model.distortion, float).tolist()
-    out["covariance"] = None if model.covariance is None else np.asarray(model.covariance).tolist()
-    return {**out, "rms_px": model.rms_px}
+    return model and plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
 class PatternStated(BaseModel):
@@ -395,13 +393,10 @@ class BoardStated(BaseModel):
 
 def board_to_json(board):
     """A board as it stands in session.json."""
-    p, pattern = board.pattern, None
-    if p is not None:
-        pattern = {"kind": "chessboard", "columns": p.columns, "rows": p.rows, "square_m": p.square}
-        pattern["origin_m"] = list(p.origin)
-    corners = None if board.corners is None else np.asarray(board.corners).tolist()
-    named = {"name": board.name, "edges": list(board.edges), "features": list(board.features)}
-    return {**named, "corners_m": corners, "pattern": pattern}
+    p = board.pattern
+    grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
+    named = {"name": board.name, "edges": board.edges, "features": board.features, "corners_m": board.corners}
+    return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
 
 
 def board_from_json(data):
@@ -412,13 +407,10 @@ def board_from_json(data):
 StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
 
 
-VIEW = "two ascending bearings within a turn are needed"
-
-
-def _turned(view):
-    return not view[0] < view[1] <= view[0] + 2 * math.pi + 1e-9
-
-
+View = Annotated[
+    tuple[Angle, Angle],
+    refused(lambda v: not v[0] < v[1] <= v[0] + 2 * math.pi + 1e-9, "two ascending bearings within a turn are needed"),
+]
 Endless = Annotated[
     float,  # null in the file where there is no limit
     BeforeValidator(lambda metres: math.inf if metres is None else metres),
@@ -451,7 +443,7 @@ class LrfInfo:
     """
 
     model: str
-    field_of_view: Annotated[tuple[Angle, Angle], refused(_turned, VIEW), Field(alias="field_of_view_deg")]
+    field_of_view: Annotated[View, Field(alias="field_of_view_deg")]
     bearing_step: Annotated[Step, Field(alias="bearing_step_deg")]
     sigma_range: Annotated[Length, Field(alias="sigma_range_m")]
     sigma_bearing: Annotated[Angle, Field(alias="sigma_bearing_deg")] = 0.0
@@ -561,9 +553,8 @@ class SessionStated(BaseModel):
 
 def parse_session(data):
     """The statements of session.json as fields of a Session; ValueError for a wrong one."""
-    found = from_json(SessionStated, data)
-    rig, platform = found.rig, found.rig.platform
-    names = ("name", "licence", "source", "simulated", "board", "placements", "reference", "unfinished")
-    plain = {name: getattr(found, name) for name in names}
-    devices = {"lrf": rig.lrf, "T_head_lrf": platform.T_head_lrf, "cameras": rig.cameras}
-    return plain | devices | {"platform_sigma": (platform.sigma_direction, platform.sigma_offset)}
+    found = dict(from_json(SessionStated, data))
+    rig = dict(found.pop("rig"))
+    platform = rig.pop("platform")
+    sigma = platform.sigma_direction, platform.sigma_offset
+    return found | rig | {"T_head_lrf": platform.T_head_lrf, "platform_sigma": sigma}

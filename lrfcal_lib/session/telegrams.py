@@ -13,7 +13,7 @@ from lrfcal_lib.session.stated import LARGEST_FILE, SessionError, check_amount, 
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
-SCANNED, OTHER, WRONG, TRUNCATED = range(len(OUTCOMES))
+SCANNED, OTHER, WRONG, TRUNCATED = range(4)
 LONGEST = codec.OVERHEAD + 0xFFFF  # bytes of a telegram
 FACTORY_MODE = 0
 

@@ -29,8 +29,6 @@ class SessionWriter:
         Must not exist or be an empty folder; its name is the session's `name` by default.
     board, lrf, cameras, T_head_lrf, platform_sigma, licence, source, simulated, reference
         See :class:`lrfcal_lib.session.read.Session`.
-    placements : iterable of int
-        Placements known beforehand; those of added sweeps and images are added.
 
     Raises
     ------
@@ -44,7 +42,7 @@ class SessionWriter:
 
     def __init__(
         self, path, board, lrf, cameras=(), T_head_lrf=None, *, name=None, licence="", source="", simulated=False,
-        platform_sigma=None, reference=None, placements=(),
+        platform_sigma=None, reference=None,
     ):  # fmt: skip
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
@@ -59,7 +57,7 @@ class SessionWriter:
             "simulated": simulated, "board": stated.board_to_json(board),
             "rig": {"lrf": stated.lrf_to_json(lrf), "platform": platform,
                     "cameras": {c.name: stated.camera_to_json(c) for c in self.cameras.values()}},
-            "placements": [int(p) for p in placements], "reference": reference or {},
+            "placements": [], "reference": reference or {},
         }  # fmt: skip
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
@@ -104,10 +102,10 @@ class SessionWriter:
 
     def _begin_table(self, name, columns):
         if not os.path.lexists(self.path / name):
-            self._write(name, ",".join(columns) + "\n")
+            self._write(name, as_lines([columns]))
 
     def _append_rows(self, name, rows):
-        append_file(self.path / name, "".join(",".join(map(str, row)) + "\n" for row in rows), self.path)
+        append_file(self.path / name, as_lines(rows), self.path)
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
@@ -175,10 +173,9 @@ class SessionWriter:
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
-        offsets, number = offset + np.cumsum([0, *lengths[:-1]]), "" if placement < 0 else placement
-        columns = map(cell, time_s), offsets, lengths, map(cell, np.degrees(pitch))
-        rows = [(time, at, length, number, angle) for time, at, length, angle in zip(*columns, strict=True)]
-        self._append_rows("lrf/index.csv", rows)
+        offsets, numbers = offset + np.cumsum([0, *lengths[:-1]]), ["" if placement < 0 else placement] * len(telegrams)
+        columns = map(cell, time_s), offsets, lengths, numbers, map(cell, np.degrees(pitch))
+        self._append_rows("lrf/index.csv", zip(*columns, strict=True))
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
         """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red pixels (h, w, 3).
@@ -194,14 +191,14 @@ class SessionWriter:
             content = cv2.imencode(".png", image)[1].tobytes()
         elif not isinstance(image, bytes):
             what, content = image, stated.read_bytes(image)
-        read.check_image_size(what, read.size_in_header(what, content), self.cameras[camera])
+        read.check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
         kind = "jpg" if content[:2] == b"\xff\xd8" else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
-        number = "" if placement < 0 else placement
-        self._append_rows("images.csv", [[cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]])
+        where = name, "" if placement < 0 else placement, cell(math.degrees(pitch))
+        self._append_rows("images.csv", [[cell(time_s), camera, *where, purpose]])
 
 
 def finish(path):
@@ -238,6 +235,11 @@ def mend_tables(path):
     for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
         if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
             write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
+
+
+def as_lines(rows):
+    """Text of the rows of a table."""
+    return "".join(",".join(map(str, row)) + "\n" for row in rows)
 
 
 def cell(value):
@@ -288,14 +290,11 @@ class SessionRecorder(SessionWriter):
     or one that states another board or rig, where it goes on.
     """
 
-    def __init__(self, path, board, lrf, cameras=(), T_head_lrf=None, *, resume=False, **about):
-        self._resume = resume
-        super().__init__(path, board, lrf, cameras, T_head_lrf, **about)
+    finished = property(lambda self: tuple(self.data["placements"]), doc="Numbers of the finished placements.")
 
-    @property
-    def finished(self):
-        """Numbers of the finished placements."""
-        return tuple(self.data["placements"])
+    def __init__(self, *rig, resume=False, **about):
+        self._resume = resume
+        super().__init__(*rig, **about)
 
     def _create(self):
         if self._resume and os.path.lexists(self.path / "session.json"):
@@ -322,10 +321,9 @@ class SessionRecorder(SessionWriter):
         mine, data = json.loads(json.dumps(self.data)), stated.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
-            for key in ("board", "rig"):
-                if data[key] != mine[key]:
-                    where = _first_difference(data[key], mine[key], key)
-                    raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
+            for key in (key for key in ("board", "rig") if data[key] != mine[key]):
+                where = _first_difference(data[key], mine[key], key)
+                raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
         self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
         self._make_folders()
         mend_tables(self.path)
@@ -385,19 +383,16 @@ class SessionRecorder(SessionWriter):
         return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
 
     def _note_placement(self, placement):
-        if placement >= 0 and placement not in self.data["unfinished"]:
+        if placement not in (-1, *self.data["unfinished"]):
             raise SessionError(f"{self.path}: placement {placement} was not begun")
 
     def _mark_dropped(self, placement):
-        marks = (
-            ("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}),
-            ("images.csv", read.IMAGE_COLUMNS, {"purpose": read.DROPPED}),
-        )
-        for name, columns, mark in marks:
+        images = "images.csv", read.IMAGE_COLUMNS, {"purpose": read.DROPPED}
+        for name, columns, mark in (("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}), images):
             if os.path.lexists(self.path / name):
                 rows = stated.read_table(self.path / name, columns, self.path)[0]
                 rows = [row | mark if row["placement"] == str(placement) else row for row in rows]
-                self._write(name, "\n".join([",".join(columns), *(",".join(row.values()) for row in rows)]) + "\n")
+                self._write(name, as_lines([columns, *(row.values() for row in rows)]))
 
 
 def _first_difference(old, new, where):

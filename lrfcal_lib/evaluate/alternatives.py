@@ -1,0 +1,175 @@
+"""What else could be wrong: statements tested one by one against the data, with words that name cause and remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lrfcal_lib.fit.least_squares import eliminate, whiten
+from lrfcal_lib.fit.residuals import named_blocks
+from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
+from lrfcal_lib.solvers.joint import gathered
+
+STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
+ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
+MIDDLE = np.pi / 2  # the bearing straight ahead
+ASKED = 4.0  # standard deviations beyond which the data contradict a statement
+FAR = 4.0  # standard deviations of the stated axis and its own
+FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
+LARGER = ("larger", "smaller")
+AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A statement that may be wrong.
+
+    Attributes
+    ----------
+    change : callable
+        Of observations and a value s: the observations as they would be if the truth were off by s.
+    worth : float
+        Smaller values of s are not worth a word.
+    unit : float
+        What s is multiplied by for the words.
+    words : str
+        With ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs` where s is positive.
+    remedy : str
+    """
+
+    change: Callable
+    worth: float
+    unit: float
+    signs: tuple
+    words: str
+    remedy: str
+
+
+def _views(obs, s):
+    pose = obs.view_pose.copy()
+    pose[:, :3, 3] *= 1 + s
+    return replace(obs, view_pose=pose)
+
+
+ALTERNATIVES = {
+    "squares": Alternative(
+        _views, 0.004, 100.0, LARGER, "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
+        "measure a square over many of them",
+    ),
+    "outline": Alternative(
+        lambda obs, s: replace(obs, corners=obs.corners * (1 + s)), 0.004, 100.0, LARGER,
+        "the board's outline is {size} +- {sigma} % {sign} than stated", "measure the board's edges",
+    ),
+    "ranges": Alternative(
+        lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)), 0.004, 100.0,
+        ("too short, or board and squares smaller than stated", "too long, or board and squares larger than stated"),
+        "all ranges are {size} +- {sigma} % {sign}",
+        "measure a square and an edge of the board, check the unit of the ranges",
+    ),
+    "bearings": Alternative(
+        lambda obs, s: replace(obs, **{
+            f"{group}_bearing": MIDDLE + (getattr(obs, f"{group}_bearing") - MIDDLE) * (1 + s)
+            for group in ("face", "beam")
+        }), 0.004, 100.0, ("small", "large"),
+        "bearings are {size} +- {sigma} % too {sign}", "check the angular step that session.json states",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What the data say of one alternative: its value, standard deviation and likelihood ratio (squared score)."""
+
+    kind: str
+    value: float
+    sigma: float
+    ratio: float
+    words: str
+
+
+def weigh(solution, admitted_offset):
+    """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest first.
+
+    A score test at the solution: no estimate is repeated. The standard deviation is the larger one of noise and scatter
+    over placements. A range offset takes up what a wrong size does to ranges; it is expected to be what the maker
+    admits.
+
+    Parameters
+    ----------
+    solution : JointSolution
+    admitted_offset : float
+        Of the range finder's maker, metres.
+    """
+    state, unknowns, obs = solution.state, solution.unknowns, solution.observations
+    before, c = named_blocks(state, gathered(obs, solution.data), unknowns), solution.unknowns.shared
+    prior, pull = np.zeros((2, c + 1))
+    if "range_offset" in unknowns.sensor:
+        where = unknowns.columns["range_offset"]
+        prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
+        pull[where] = prior[where] * solution.sensor["range_offset"]
+    found = []
+    for kind, alternative in ALTERNATIVES.items():
+        after = named_blocks(state, gathered(alternative.change(obs, STEP), solution.data), unknowns)
+        hessian = gradient = 0.0
+        for name, block in before.items():
+            r, J = whiten(block)
+            J = np.insert(J, c, (whiten(after[name], False)[0] - r) / STEP, axis=-1)
+            back = np.swapaxes(J, -1, -2)
+            hessian, gradient = hessian + back @ J, gradient + (back @ r[..., None])[..., 0]
+        reduced, score, _ = eliminate(hessian, gradient, c + 1)
+        covariance = np.linalg.pinv(reduced.sum(axis=0) + np.diag(prior), rcond=1e-13, hermitian=True)
+        step = -covariance @ (score.sum(axis=0) + pull)
+        own = (score + reduced @ step) @ covariance[-1]  # what each placement still pulls at the value found
+        sigma = np.sqrt(max(covariance[-1, -1], np.sum(own**2) * len(own) / max(len(own) - 1, 1)))
+        if covariance[-1, -1] > 0 and sigma < alternative.worth * 100:
+            size, spread = (f"{x * alternative.unit:.2g}" for x in (abs(step[-1]), sigma))
+            words = alternative.words.format(size=size, sigma=spread, sign=alternative.signs[int(step[-1] < 0)])
+            words = f"{words}: {alternative.remedy}"
+            found.append(Doubt(kind, float(step[-1]), float(sigma), float((step[-1] / sigma) ** 2), words))
+    return sorted(found, key=lambda doubt: -doubt.ratio)
+
+
+def doubtful(solution, admitted_offset):
+    """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well."""
+    found = weigh(solution, admitted_offset)
+    asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
+    return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
+
+
+def far_from_stated(joint):
+    """What lies far from where session.json puts it (JointCalibration): list of words and by what angle (radians).
+
+    A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of the other sense turns
+    the axis about: only the statement of the platform, or a camera's guess, can tell.
+    """
+    session, solution, far = joint.prepared.session, joint.solution, []
+    why = "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras look like this"
+    if session.T_head_lrf is not None and joint.settings["axis"]:
+        found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
+        own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
+        if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
+            far.append((f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}", found[0]))
+    for camera, pose in solution.transforms.items():
+        guess = session.cameras[camera].guess
+        if guess is not None:
+            turn, shift = transform_difference(pose, guess)
+            if turn > FAR_TURN or shift > FAR_SHIFT:
+                far.append((f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn))
+    return far
+
+
+def _apart(angle, distance):
+    return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
+
+
+def places_of_cameras(solution):
+    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it here."""
+    words = []
+    for camera in solution.transforms:
+        x, y, z = 1000 * (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+        sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
+        places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
+        words.append(f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder.")
+    return words
