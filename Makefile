@@ -62,7 +62,7 @@ data: setup
 	rm -rf $(addprefix data/,$(SIMULATED))
 	mv $(addprefix data/.new/,$(SIMULATED)) data
 	rmdir data/.new
-	$(RUN) -c "from lrfcal_lib.simulate.record import write_card; write_card('data', '$(SIMULATED)'.split())"
+	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*

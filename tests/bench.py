@@ -80,11 +80,7 @@ def decoding():
     yield "telegrams with their checksums", speed, "MB/s", "the line at 500 kBd", 20 * speed
 
 
-def main():
+if __name__ == "__main__":
     rows = [row for part in (solving, projecting, decoding) for row in part()]
     table = pd.DataFrame(rows, columns=["what", "value", "unit", "against", "times_faster"])
     print(table.round(2).to_string(index=False))
-
-
-if __name__ == "__main__":
-    main()

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.evaluate.uncertainty import beams_to
 from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole, project
-from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.model.observations import CameraObservations
 
 CORNERS = np.array([[-0.30, -0.22], [0.32, -0.25], [0.28, 0.24], [-0.33, 0.20]])
@@ -28,6 +29,11 @@ class Rig:
     T_camera_lrf: RigidTransform
     T_head_lrf: RigidTransform
     model: CameraModel
+
+
+def numeric(function, count, step=1e-6):
+    """Derivative of a function of increments (count,) about zero, along the last axis."""
+    return np.stack([(function(s) - function(-s)) / (2 * step) for s in step * np.eye(count)], axis=-1)
 
 
 def random_rig(rng):
@@ -121,24 +127,6 @@ def _crossings(rng, T_source_board, source, corners):
     return (outline + share[:, None] * (following - outline))[hit] * [1.0, 1.0, 0.0], np.flatnonzero(hit)
 
 
-def near_lines(rng, count):
-    """Rig and observations of single scan lines on small boards 0.4 to 0.9 m away, the camera turned by up to a radian.
-
-    Ranges have 4 mm of noise: a few per cent of a line's length.
-    """
-    rig, poses, corners = random_rig(rng), [], 0.5 * CORNERS
-    turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3))
-    T = RigidTransform.from_components(rig.T_camera_lrf.translation, turn * rig.T_camera_lrf.rotation)
-    for _ in range(count):
-        turn = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)) * Rotation.from_euler("x", 180, degrees=True)
-        centre = np.array([rng.uniform(-0.3, 0.3), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(0.4, 0.9)
-        middle = turn.apply([*corners.mean(axis=0), 0.0])
-        poses.append(RigidTransform.from_components(T.apply(centre) - middle, turn))
-    rig = Rig(T, rig.T_head_lrf, rig.model)
-    options = {"noise": 1.0, "sigma": (0.004, 1e-3), "pattern": False}
-    return rig, camera_observations(rng, rig, poses, corners=corners, **options)
-
-
 def _face(rng, T_source_board, crossings, source, count):
     """Points on the board: between the two crossings of a scan line, or anywhere inside for a sweep."""
     if source == "platform":
@@ -184,7 +172,7 @@ def edge_sweeps(rng, T_head_lrf, boards, corners, *, edges=(0, 1), noise=0.0):
             on_edge.append((*meet(board.apply(points), T_head_lrf), placement, number))
         inside = flat(rng.dirichlet(np.ones(len(corners)), 60) @ corners)
         on_face.append((*meet(board.apply(inside), T_head_lrf), placement))
-    for prefix, parts in (("", on_edge), ("face_", on_face)):
+    for prefix, parts in (("edge_", on_edge), ("face_", on_face)):
         points, pitch, placement, *number = zip(*parts, strict=True)
         of_point = np.repeat(np.arange(len(parts)), [len(p) for p in points])
         drawn, covariance, _ = measured(rng, np.concatenate(points), noise)
@@ -192,7 +180,7 @@ def edge_sweeps(rng, T_head_lrf, boards, corners, *, edges=(0, 1), noise=0.0):
         own |= {"placement": np.array(placement)[of_point]}
         out |= {prefix + name: values for name, values in own.items()}
         if number:
-            out["edge"] = np.array(number[0])[of_point]
+            out["edge_number"] = np.array(number[0])[of_point]
     return out
 
 
@@ -207,12 +195,6 @@ def sweep_boards(rng, count, turn=0.7):
 
 
 def meet(p_platform, T_head_lrf):
-    """LRF points and pitch at which the scan plane passes through platform points (the pitch nearest to 0)."""
-    normal, point = T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), T_head_lrf.translation
-    x, y, z = p_platform.T
-    # n . (Rx(-pitch) p - t) = 0:  a cos(pitch) + b sin(pitch) = c
-    a, b, c = normal[1] * y + normal[2] * z, normal[1] * z - normal[2] * y, normal @ point - normal[0] * x
-    base, reach = np.arctan2(b, a), np.arccos(np.clip(c / np.hypot(a, b), -1, 1))
-    both = (np.stack([base + reach, base - reach]) + np.pi) % (2 * np.pi) - np.pi
-    pitch = np.where(np.abs(both[0]) < np.abs(both[1]), both[0], both[1])
-    return T_head_lrf.inv().apply(tilt(p_platform, -pitch)) * [1.0, 1.0, 0.0], pitch
+    """LRF points and pitch at which the scan plane passes through platform points."""
+    bearing, pitch, away = beams_to(p_platform, T_head_lrf)
+    return polar_to_points(away, bearing), pitch

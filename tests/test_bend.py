@@ -15,18 +15,8 @@ from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.plots.results import board_bend
-from lrfcal_lib.preprocess.bend import (
-    Bend,
-    BoardBends,
-    Face,
-    around_pattern,
-    bend_of,
-    board_bends,
-    common_level,
-    face_of,
-    hull,
-    sheet_surface,
-)
+from lrfcal_lib.preprocess import bend as module
+from lrfcal_lib.preprocess.bend import Bend, BoardBends, Face, around_pattern, bend_of, common_level, face_of
 from lrfcal_lib.preprocess.board_in_scan import find_board
 from lrfcal_lib.preprocess.prepared import prepare_scans
 from lrfcal_lib.session.read import Sweep, open_session
@@ -47,7 +37,7 @@ def a_face(rng, n=4000, bend=(0.0, 0.0, 0.0), noise=0.004, level=0.0, waves=0.0)
     height += noise * rng.standard_normal(n) + level * (np.abs(flat - SIZE / 2).max(axis=1) > 0.27)
     across, along = (np.sin(2 * np.pi * v / 0.16 + rng.uniform(0, 6)) for v in (x, y))
     height += waves * across * along
-    return Face(flat, height, np.full(n, 0.98), around, hull(flat))
+    return Face(flat, height, np.full(n, 0.98), around)
 
 
 def a_scan(rng, bend=0.0, noise=0.003, stretch=0.0):
@@ -77,7 +67,7 @@ def test_the_bend_does_not_depend_on_how_the_board_lies():
     face = a_face(np.random.default_rng(2), bend=(0.03, -0.02, 0.06))
     turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
     flat = face.flat @ turn.T + [3.0, -2.0]
-    moved = replace(face, flat=flat, outline=hull(flat), height=face.height + 0.3 * flat[:, 0] - 1)
+    moved = replace(face, flat=flat, height=face.height + 0.3 * flat[:, 0] - 1)
     assert bend_of(moved).size == pytest.approx(bend_of(face).size, rel=0.03)
 
 
@@ -101,8 +91,7 @@ def test_what_does_not_count_as_a_bend():
     face = a_face(np.random.default_rng(4))
     face.height[np.random.default_rng(5).choice(len(face.height), 120, replace=False)] += 0.15
     assert not bend_of(face).bends, "outliers"
-    line = replace(face, flat=face.flat * [1, 0], outline=hull(face.flat * [1, 0]))
-    found = bend_of(line, 4)
+    found = bend_of(replace(face, flat=face.flat * [1, 0]), 4)
     assert np.isnan(found.size) and not found.bends
     assert "placement 4: the scan shows 6 of 36 parts of the board, 18 are needed" in found.reason
 
@@ -114,7 +103,7 @@ def a_triangle(rng, lines=22, beams=25, noise=0.01):
     flat = np.concatenate([np.linspace([0.0, y], [0.315 * s, y], int(2 + beams * s))
                            for y, s in zip(height, share, strict=True)])  # fmt: skip
     noise = noise * rng.standard_normal(len(flat))
-    return Face(flat, noise, np.full(len(flat), 0.98), np.zeros(len(flat)), hull(flat))
+    return Face(flat, noise, np.full(len(flat), 0.98), np.zeros(len(flat)))
 
 
 def test_coarse_sweeps_of_flat_boards_seldom_look_bent():
@@ -151,7 +140,7 @@ def test_places_about_a_pattern():
 @pytest.mark.parametrize("bend", [0.0, 0.08, -0.08])
 def test_scans_of_a_bent_board(bend):
     face = face_of(a_scan(np.random.default_rng(7), bend))
-    found, half = bend_of(face), np.ptp(face.outline, axis=0).min() / 2
+    found, half = bend_of(face), np.ptp(face.flat, axis=0).min() / 2
     assert 0.35 < half < 0.41
     assert found.size == pytest.approx(abs(bend) * half**2, abs=1.5e-3)
     assert found.bends == (bend != 0)
@@ -162,7 +151,7 @@ def test_scans_of_a_bent_board(bend):
 def test_a_stretched_pitch_looks_like_a_bend():
     """What the module says: s y^2 / r."""
     face = face_of(a_scan(np.random.default_rng(8), stretch=0.08))
-    assert bend_of(face).size == pytest.approx(0.08 * (np.ptp(face.outline, axis=0).min() / 2) ** 2 / 1.4, rel=0.2)
+    assert bend_of(face).size == pytest.approx(0.08 * (np.ptp(face.flat, axis=0).min() / 2) ** 2 / 1.4, rel=0.2)
 
 
 def views_of(bend, rng, noise=0.05):
@@ -182,9 +171,9 @@ def seen_by(cameras):
 
 def test_images_show_the_bend_of_the_sheet():
     rng, bend = np.random.default_rng(9), np.array([0.1, -0.2, 0.15])
-    exact, _ = sheet_surface(seen_by({"left": views_of(bend, rng, 1e-9)}), 1)
+    exact, _ = module.sheet_surface(seen_by({"left": views_of(bend, rng, 1e-9)}), 1)
     np.testing.assert_allclose(exact, bend, atol=1e-6)
-    found = [sheet_surface(seen_by({c: views_of(bend, rng) for c in ("left", "right")}), 1) for _ in range(60)]
+    found = [module.sheet_surface(seen_by({c: views_of(bend, rng) for c in ("left", "right")}), 1) for _ in range(60)]
     misses = np.array([np.linalg.solve(np.linalg.cholesky(C), q - bend) for q, C in found])
     assert 0.6 < np.mean(misses**2) < 1.3, "the covariance is that of the noise, or more where two cameras differ"
 
@@ -197,15 +186,15 @@ def test_sheets_are_measured_away_from_the_camera_whichever_way_their_frame_poin
     flip = RigidTransform.from_translation([0, height, 0]) * back
     other = SimpleNamespace(pixels=view.pixels.reshape(5, 5, 2)[::-1].reshape(-1, 2),
                             T_camera_board=view.T_camera_board * flip)  # fmt: skip
-    found, _ = sheet_surface(seen_by({"left": other}), 1)
+    found, _ = module.sheet_surface(seen_by({"left": other}), 1)
     np.testing.assert_allclose(found, bend * [1, -1, 1], atol=1e-6)
 
 
 def test_no_pattern_in_an_image_is_no_sheet():
-    assert sheet_surface(seen_by({"left": SimpleNamespace(pixels=None, T_camera_board=None)}), 1) is None
+    assert module.sheet_surface(seen_by({"left": SimpleNamespace(pixels=None, T_camera_board=None)}), 1) is None
     few = views_of(np.zeros(3), np.random.default_rng(0))
     few.pixels[5:] = np.nan
-    assert sheet_surface(seen_by({"left": few}), 1) is None
+    assert module.sheet_surface(seen_by({"left": few}), 1) is None
 
 
 def test_bends_in_words_and_in_a_table():
@@ -235,14 +224,14 @@ def test_the_figure_shows_what_bends():
 
 def test_flat_simulated_boards_do_not_bend():
     session = open_session(DATA / "sim_lms221")
-    found = board_bends(prepare_scans(session))
+    found = module.board_bends(prepare_scans(session))
     assert len(found.placements) == len(session.board_placements)
     assert not any(b.bends for b in found.placements.values()) and bend_words(found) == []
 
 
 def test_real_boards_that_bend_are_found(lms400):
     """The list was known when the threshold of 6 mm was chosen; 5 and 7 are flat by any measure."""
-    found = board_bends(lms400.prepared, board_maps(lms400.prepared))
+    found = module.board_bends(lms400.prepared, board_maps(lms400.prepared))
     bent = {p for p, b in found.placements.items() if b.bends}
     assert {15, 16, 18, 20} <= bent and not bent & {1, 2, 3, 4, 5, 6, 7, 9, 13, 17}
     assert found.level_applied and 0.004 < found.level < 0.008

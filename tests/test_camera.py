@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import numeric
 
 from lrfcal_lib.model import camera as c
 
@@ -13,11 +14,6 @@ MODEL = c.CameraModel(1280, 720, 700.0, 702.0, 640.0, 350.0, np.array([-0.17, 0.
 @pytest.fixture
 def points():
     return np.random.default_rng(0).uniform([-1, -0.6, 1.5], [1, 0.6, 3], (60, 3))
-
-
-def numeric(function, x, step=1e-6):
-    steps = step * np.eye(len(x))
-    return np.stack([(function(x + s) - function(x - s)) / (2 * step) for s in steps], axis=-1)
 
 
 def test_the_papers_distortion_is_opencvs(points):
@@ -38,11 +34,13 @@ def test_points_behind_the_camera_are_nan():
 def test_jacobians_are_the_numeric_ones(points):
     for p in points[:5]:
         by_point, by_intrinsics = c.project_jacobians(p, MODEL)
-        np.testing.assert_allclose(by_point, numeric(lambda x: c.project(x, MODEL), p), rtol=1e-6, atol=1e-5)
-        expected = numeric(lambda x: c.pinhole(x, MODEL), p)
-        np.testing.assert_allclose(c.pinhole_jacobian(p, MODEL), expected, rtol=1e-6, atol=1e-5)
-        expected = numeric(lambda k, p=p: c.project(p, MODEL.with_parameters(k)), MODEL.parameters)
-        np.testing.assert_allclose(by_intrinsics, expected, rtol=1e-6, atol=1e-5)
+        for found, function, at in (
+            (by_point, lambda x: c.project(x, MODEL), p),
+            (c.pinhole_jacobian(p, MODEL), lambda x: c.pinhole(x, MODEL), p),
+            (by_intrinsics, lambda k, p=p: c.project(p, MODEL.with_parameters(k)), MODEL.parameters),
+        ):
+            expected = numeric(lambda s, f=function, at=at: f(at + s), len(at))
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-5)
 
 
 def test_line_distance_is_signed_and_in_pixels():

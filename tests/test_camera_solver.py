@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case, camera_observations
+from synthetic import camera_case, camera_observations, numeric
 
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m, sight_normals
 from lrfcal_lib.model import observations
-from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block, start_from_lines, start_from_scene
 from lrfcal_lib.solvers.planes import start_from_planes
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 RESIDUALS = {"line": line_block, "wasielewski_strauss": distance_block, "bauermann": point_block}
-STEPS = 1e-6 * np.eye(6)
 
 
 def increment(found, truth):
@@ -68,11 +67,10 @@ def test_every_method_is_invariant_to_the_source_frame(name):
 
 
 @pytest.mark.parametrize("field", ["crossing_points", "crossing_covariance", "plane_points", "scene_points"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_refused(field, value):
+def test_values_that_are_not_finite_are_refused(field):
     _, obs = camera_case(3)
     values = getattr(obs, field).copy()
-    values[2].flat[1] = value
+    values[2].flat[1] = np.inf
     with pytest.raises(ValueError, match=f"{field} of camera 'left' holds 1 values that are not finite, .* row 2"):
         replace(obs, **{field: values})
 
@@ -89,20 +87,15 @@ def test_every_method_refuses_one_placement_only(name):
 @pytest.mark.parametrize(
     ("name", "prefix", "count", "words"),
     [
-        ("line", "crossing_", 5, "5 crossings of scan lines with edges, at least 6 needed"),
-        ("line_ml", "crossing_", 6, "6 crossings of scan lines with edges, at least 7 needed"),
-        ("wasielewski_strauss", "crossing_", 5, "5 crossings of scan lines with edges, at least 6 needed"),
+        *((name, "crossing_", n, f"{n} crossings of scan lines with edges, at least {n + 1} needed")
+          for name, n in (("line", 5), ("line_ml", 6), ("wasielewski_strauss", 5))),
         ("bauermann", "scene_", 2, "2 scene points, at least 3 needed"),
+        ("lines", "scene_", 2, "unknown method 'lines': use one of line_printed, line_last_beam, line,"),
     ],
 )
-def test_too_few_rows_are_refused(name, prefix, count, words):
-    with pytest.raises(DegenerateGeometry, match=words):
+def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words):
+    with pytest.raises(ValueError, match=words):
         solve_camera(rows_of(camera_case(6)[1], prefix, slice(count)), name)
-
-
-def test_unknown_methods_are_refused():
-    with pytest.raises(ValueError, match="unknown method 'lines': use one of line_printed, line_last_beam,"):
-        solve_camera(camera_case(3)[1], "lines")
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -127,9 +120,8 @@ def test_jacobians_against_numeric_ones(name):
     rig, obs = camera_case(9, noise=1.0)
     residual, pose = RESIDUALS[name], pose_array(rig.T_camera_lrf * OFF)
     J = residual(pose, obs).jacobian
-    for k, step in enumerate(STEPS):
-        high, low = (residual(move_pose(pose, s), obs).residuals for s in (step, -step))
-        np.testing.assert_allclose(J[:, k], (high - low) / 2e-6, rtol=1e-6, atol=1e-8 * np.abs(J).max())
+    expected = numeric(lambda s: residual(move_pose(pose, s), obs).residuals, 6)
+    np.testing.assert_allclose(J, expected, rtol=1e-6, atol=1e-8 * np.abs(J).max())
 
 
 @pytest.mark.parametrize("name", RESIDUALS)
@@ -137,25 +129,30 @@ def test_corrected_jacobians_are_the_gradient_of_chi_square(name):
     rig, obs = camera_case(10, 6, noise=1.0)
     residual, pose = RESIDUALS[name], pose_array(rig.T_camera_lrf)
     r, J = whiten(residual(pose, obs))
-    for k, step in enumerate(STEPS):
-        high, low = (np.sum(whiten(residual(move_pose(pose, s), obs))[0] ** 2) for s in (step, -step))
-        assert (J.T @ r)[k] == pytest.approx((high - low) / 4e-6, rel=1e-4, abs=1e-3)
+    half = numeric(lambda s: 0.5 * np.sum(whiten(residual(move_pose(pose, s), obs))[0] ** 2), 6)
+    np.testing.assert_allclose(J.T @ r, half, rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["line", "wasielewski_strauss"])
-@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize(
+    ("name", "weighted"),
+    [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False)],
+)
 def test_scipy_agrees(name, weighted):
-    rig, obs = camera_case(10, noise=1.0)
-    residual, start = RESIDUALS[name], pose_array(rig.T_camera_lrf)
+    rig, obs = camera_case(10, noise=1.0, source="platform" if name == "planes" else "lrf")
+    start, options = pose_array(rig.T_camera_lrf), dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
 
     def residuals(d):
-        block = residual(move_pose(start, d), obs)
+        pose = move_pose(start, d)
+        if name == "planes":
+            return plane_residuals_m(obs, pose_transform(pose))
+        block = RESIDUALS[name](pose, obs)
         return whiten(block)[0] if weighted else block.residuals
 
-    theirs = scipy.optimize.least_squares(residuals, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    ours = solve_camera(obs, name, rig.T_camera_lrf, weighted=weighted)
+    theirs = scipy.optimize.least_squares(residuals, np.zeros(6), **options)
+    ours = solve_camera(obs, "zhang_pless" if name == "planes" else name, rig.T_camera_lrf, weighted=weighted)
     np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=2e-6)
     assert not weighted or ours.chi2 / 2 == pytest.approx(theirs.cost, rel=1e-9)
+    assert ours.n_observations == len(obs.plane_points if name == "planes" else obs.crossing_points)
 
 
 def test_residuals_are_pixels_with_their_sign():
@@ -189,32 +186,6 @@ def test_a_distance_from_the_plane_of_sight_is_the_pixel_distance_scaled_by_dept
     assert (np.abs(sight.parameters - lines.parameters) / lines.sigma).max() < 0.1
 
 
-def test_many_trials_equal_single_ones():
-    rig, obs = camera_case(11, noise=1.0)
-    points = obs.crossing_points + np.random.default_rng(12).normal(0, 0.002, (4, *obs.crossing_points.shape))
-    points *= [1, 1, 0]
-    batch = solve_camera(replace(obs, crossing_points=points), "line", rig.T_camera_lrf)
-    for i in range(4):
-        single = solve_camera(replace(obs, crossing_points=points[i]), "line", rig.T_camera_lrf)
-        np.testing.assert_allclose(batch.transform.as_matrix()[i], single.transform.as_matrix(), atol=1e-8)
-        np.testing.assert_allclose(batch.covariance[i], single.covariance, rtol=1e-4)
-        np.testing.assert_allclose(batch.covariance_placements[i], single.covariance_placements, rtol=1e-3)
-
-
-def test_predicted_covariance_in_a_thousand_trials():
-    rig, obs = camera_case(13, count=20)
-    rng = np.random.default_rng(14)
-    root = np.linalg.cholesky(obs.crossing_covariance + 1e-16 * np.eye(3))
-    points = obs.crossing_points + (root @ rng.normal(size=(1000, *obs.crossing_points.shape, 1)))[..., 0]
-    lines = np.repeat(obs.crossing_lines[None], 1000, axis=0)
-    lines[..., 2] += rng.normal(0, obs.crossing_line_sigma, lines.shape[:2])
-    found = solve_camera(replace(obs, crossing_points=points, crossing_lines=lines), "line", rig.T_camera_lrf)
-    e = increment(found.transform, rig.T_camera_lrf)
-    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(found.covariance), e) / 6
-    assert found.converged.all() and 0.9 < nees.mean() < 1.1
-    assert np.abs(e.mean(axis=0) / (e.std(axis=0) / np.sqrt(1000))).max() < 4.5
-
-
 def test_robust_loss_resists_wrong_edges():
     rig, obs = camera_case(15, count=20, noise=1.0)
     lines = obs.crossing_lines.copy()
@@ -233,28 +204,11 @@ def test_robust_loss_resists_wrong_points_without_a_guess():
     assert found.weights.reshape(-1, 2)[::9].max() < 0.05
 
 
-def test_a_point_known_badly_is_weighed_down():
-    rig, obs = camera_case(3, 10)
-    points, covariance = obs.scene_points.copy(), obs.scene_covariance.copy()
-    points[0] += [0.3, 0.0, 0.2]
-    covariance[0] += 0.5**2 * np.eye(3)
-    trusted = replace(obs, scene_points=points)
-    weighed = replace(trusted, scene_covariance=covariance)
-    near, far = (miss(solve_camera(some, "bauermann", rig.T_camera_lrf), rig)[1] for some in (weighed, trusted))
-    assert near < 1e-3 < far
-
-
 @pytest.mark.parametrize("start", [start_from_planes, start_from_lines, start_from_scene])
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 def test_starts_without_a_guess(start, source):
     rig, obs = camera_case(17, count=15, noise=1.0, source=source)
     assert (miss(start(obs), rig) < [0.05, 0.1]).all()
-
-
-def test_lines_alone_are_enough_to_start():
-    rig, obs = camera_case(18, count=15)
-    bare = rows_of(rows_of(obs, ("plane_", "scene_"), slice(0)), ("placements", "board_", "pattern_pixels"), slice(0))
-    assert (miss(solve_camera(bare), rig) < 1e-9).all()
 
 
 def test_nothing_to_start_from():
@@ -268,10 +222,8 @@ def test_parallel_edges_leave_a_motion_open():
     x, y, _ = obs.crossing_points.T
     points = rig.T_camera_lrf.inv().apply(np.column_stack([0 * x, x, 2 + y]))
     parallel = replace(obs, crossing_lines=lines, crossing_points=points)
-    with pytest.raises(DegenerateGeometry, match="do not determine .*translation along"):
+    with pytest.raises(DegenerateGeometry, match="do not determine .*translation along y"):
         solve_camera(parallel, "line", rig.T_camera_lrf)
-    found = solve_camera(parallel, "line", rig.T_camera_lrf, required=False)
-    assert len(found.unobservable) >= 2 and any("along y" in words for words in found.unobservable)
 
 
 def test_points_on_one_line_leave_a_rotation_open():
@@ -282,19 +234,10 @@ def test_points_on_one_line_leave_a_rotation_open():
         solve_camera(replace(obs, scene_points=points, scene_pixels=q[:, :2] / q[:, 2:]), "bauermann", rig.T_camera_lrf)
 
 
-@pytest.mark.parametrize("kind", ["planes", "lines"])
-def test_outlying_placements_are_found_untold(kind):
+def test_outlying_placements_are_found_untold():
     _, obs = camera_case(23, count=16, noise=1.0, source="platform")
-    poses, lines = obs.board_poses.copy(), obs.crossing_lines.copy()
+    assert find_outlying_placements(obs)[1] == {}
+    poses = obs.board_poses.copy()
     poses[[3, 8], :3, 3] += 0.08 * poses[[3, 8], :3, 2]
-    lines[np.isin(obs.crossing_placement, (4, 9)), 2] += 15.0
-    report = find_outlying_placements(replace(obs, board_poses=poses, crossing_lines=lines), kind)
-    assert set(report.outlying) == {4, 9} and len(report.inliers) == 14
-    assert np.all(report.rms[[3, 8]] > report.limit[[3, 8]])
-
-
-def test_good_placements_are_left_alone():
-    _, obs = camera_case(24, count=16, noise=1.0, source="platform")
-    assert find_outlying_placements(obs, "planes").outlying == ()
-    with pytest.raises(ValueError, match="unknown kind 'edges'"):
-        find_outlying_placements(obs, "edges")
+    inliers, outlying = find_outlying_placements(replace(obs, board_poses=poses))
+    assert set(outlying) == {4, 9} and min(outlying.values()) > 0.05 and len(inliers) == 14

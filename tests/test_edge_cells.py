@@ -89,28 +89,17 @@ def test_reach_and_spot_are_taken_as_given(made):
     np.testing.assert_allclose(cells.radius, (0.01 + 0.004 * cells.range_m) / 2)
 
 
-def test_holes_and_what_hides_the_board_are_left_out(made):
-    rows = slice(70, 80)
-
-    def hide(ranges):
-        board = np.flatnonzero(made.on[75])
-        ranges[rows, board[0] - 8 : board[0] + 12] = 0.8
-        return ranges
-
-    _, cells = cells_of(made, change=hide)
+def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_close_wall_is_not(made):
     first = np.flatnonzero(made.on[75])[0]
-    there = (cells.line >= 70) & (cells.line < 80) & (np.abs(cells.beam - first) < 12)
-    assert not there.any()
 
-
-def test_a_post_close_behind_is_left_out_but_a_close_wall_is_not(made):
-    def post(ranges):
-        ranges[60:75] = np.where(made.on[60:75], ranges[60:75], 1.9)
+    def spoil(ranges):
+        ranges[70:80, first - 8 : first + 12] = 0.8
+        ranges[50:65] = np.where(made.on[50:65], ranges[50:65], 1.9)
         return ranges
 
-    _, cells = cells_of(made, change=post)
-    beside = (cells.line >= 60) & (cells.line < 75) & ~cells.across
-    assert not beside.any()
+    _, cells = cells_of(made, change=spoil)
+    assert not ((cells.line >= 70) & (cells.line < 80) & (np.abs(cells.beam - first) < 12)).any()
+    assert not ((cells.line >= 50) & (cells.line < 65) & ~cells.across).any()
     _, near = cells_of(scene(wall=2.3, sigma=0.004))
     assert len(near) > 500 and not near.background.any()
 

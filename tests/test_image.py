@@ -1,7 +1,7 @@
 """Corners, intrinsics, poses, straight edges and outlines from images whose truth is computed, and from real ones."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,51 +15,31 @@ from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle
 from lrfcal_lib.model.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
-from lrfcal_lib.preprocess.edges_in_image import ImageEdge, correlation_factor, picked_edge, refine_edge
-from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
-from lrfcal_lib.preprocess.pattern_in_image import (
-    PatternFinder,
-    PatternNotFound,
-    grid_noise,
-    pattern_orders,
-    spread_views,
-)
+from lrfcal_lib.preprocess.edges_in_image import correlation_factor, picked_edge, refine_edge
+from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
+from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grid_noise, pattern_orders
 from lrfcal_lib.report.notebook import ROOT
-from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.read import EdgePick, ImageRecord, open_session
 
-MODEL = CameraModel(640, 480, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
+SIZE = 640, 480
+MODEL = CameraModel(*SIZE, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
 PATTERN = Chessboard(6, 4, 0.05)
 # margins outside the inner corners: left 0.13, right 0.12, top 0.11, bottom 0.15; the left edge is not parallel
 CORNERS = np.array([[-0.13, -0.11], [0.37, -0.11], [0.37, 0.30], [-0.125, 0.30]])
 SHEET = Board("sheet", ("top", "right", "bottom", "left"), CORNERS, PATTERN, ("left", "top"))
-UNKNOWN = replace(SHEET, corners=None)
-TRIANGLE = triangle_board()
+UNKNOWN, TRIANGLE = replace(SHEET, corners=None), triangle_board()
 SAMPLES = 4  # rays a pixel along u and v
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
 
-@dataclass(frozen=True)
-class Record:
-    camera: str
-    file: Path
-    placement: int
-    pitch: float = 0.0
-    purpose: str = "board"
-
-
-@dataclass(frozen=True)
-class Pick:
-    camera: str
-    file: Path
-    edge: str
-    ends: np.ndarray
+def record(camera, file, placement, pitch=0.0, purpose="board"):
+    return ImageRecord(camera, Path(file), placement, pitch, 0.0, purpose)
 
 
 @lru_cache(maxsize=4)
 def rays():
     """Normalised directions of all rays of the image, shape (h * SAMPLES, w * SAMPLES, 2)."""
-    u, v = (((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5) for n in (MODEL.width, MODEL.height))
-    uv = np.stack(np.meshgrid(u, v), axis=-1)
+    uv = np.stack(np.meshgrid(*(((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5) for n in SIZE)), axis=-1)
     return (undistort(uv, MODEL) - [MODEL.cx, MODEL.cy]) / [MODEL.fx, MODEL.fy]
 
 
@@ -89,27 +69,31 @@ def face(x, y, board):
 
 def clutter(seed=3):
     """A background full of straight edges: boxes of all grey values and sizes."""
-    rng = np.random.default_rng(seed)
-    out = np.full((MODEL.height, MODEL.width), 160, np.uint8)
+    rng, out = np.random.default_rng(seed), np.full((MODEL.height, MODEL.width), 160, np.uint8)
     for _ in range(90):
         box = cv2.boxPoints((rng.uniform([0, 0], [640, 480]), rng.uniform(20, 120, 2), rng.uniform(0, 90)))
         cv2.fillPoly(out, [np.rint(box).astype(np.int32)], int(rng.uniform(10, 250)))
     return np.kron(out, np.ones((SAMPLES, SAMPLES), np.uint8)).astype(float)
 
 
-def pose_of(roll=0.0, tilt=(0.2, -0.3), at=(0.0, 0.0, 0.9), centre=(0.12, 0.095)):
-    """Board with its centre at `at`, tilted about its own axes, then rolled about the optical axis."""
-    rotation = Rotation.from_rotvec([0, 0, roll]) * Rotation.from_rotvec([tilt[0], tilt[1], 0])
+def pose_of(roll=0.0, tilt=(0.2, -0.3), at=(0.0, 0.0, 0.9), centre=(0.12, 0.095), facing=False):
+    """Board with its centre at `at`, tilted about its own axes, then rolled about the optical axis.
+
+    The x axis is to the right and y down, so that z points away from the camera unless it is `facing` it.
+    """
+    rotation = Rotation.from_rotvec([0, 0, roll]) * Rotation.from_rotvec([*tilt, 0])
+    rotation = rotation * Rotation.from_euler("x", np.pi) if facing else rotation
     return RigidTransform.from_components(np.array(at) - rotation.apply([*centre, 0.0]), rotation)
 
 
+def triangle_pose(roll=0.4, at=(0.02, 0.0, 0.9)):
+    return pose_of(roll, (0.3, -0.35), at, (0.105, 0.127), facing=True)
+
+
 def view_poses(n, seed=0):
-    rng, low, high = (
-        np.random.default_rng(seed),
-        [-0.4, -0.5, -0.5, -0.12, -0.08, 0.75],
-        [0.4, 0.5, 0.5, 0.12, 0.08, 1.2],
-    )
-    return [pose_of(roll, (a, b), at) for roll, a, b, *at in rng.uniform(low, high, (n, 6))]
+    low, high = [-0.4, -0.5, -0.5, -0.12, -0.08, 0.75], [0.4, 0.5, 0.5, 0.12, 0.08, 1.2]
+    drawn = np.random.default_rng(seed).uniform(low, high, (n, 6))
+    return [pose_of(roll, (a, b), at) for roll, a, b, *at in drawn]
 
 
 def pixels_of(poses, sigma=0.0, seed=0, model=MODEL, points=None):
@@ -118,13 +102,9 @@ def pixels_of(poses, sigma=0.0, seed=0, model=MODEL, points=None):
     return exact + np.random.default_rng(seed).normal(0, 1, exact.shape) * sigma
 
 
-def on_board(pose, xy):
-    """Undistorted pixels of points of the board."""
-    return pinhole(pose.apply(np.column_stack([xy, np.zeros(len(xy))])), MODEL)
-
-
-def recorded(pose, xy):
-    return project(pose.apply(np.column_stack([xy, np.zeros(len(xy))])), MODEL)
+def on_board(pose, xy, camera=pinhole):
+    """Pixels of points of the board, undistorted but for `camera=project`."""
+    return camera(pose.apply(np.column_stack([xy, np.zeros(len(xy))])), MODEL)
 
 
 def true_line(name, pose, board=SHEET):
@@ -142,7 +122,7 @@ def small_turn(a, b):
 
 
 def turned(a, b):
-    return (a.rotation * b.rotation.inv()).magnitude()
+    return np.linalg.norm(small_turn(a, b)[:3])
 
 
 def score(pose, covariance, exact):
@@ -160,9 +140,10 @@ def up_to_a_turn(corners, exact):
     return min((corners - p for p in (exact, exact[::-1])), key=lambda off: np.abs(off).max())
 
 
-def seen(picture, board=SHEET, picks=(), record=Record("left", Path("a.png"), 3, 0.1)):
+def seen(picture, board=SHEET, picks=()):
     """The view of a single image."""
-    return survey.survey([record], lambda r: picture, board, {"left": MODEL}, picks).views["left"][0]
+    records = [record("left", "a.png", 3, 0.1)]
+    return survey.survey(records, lambda r: picture, board, {"left": MODEL}, picks).views["left"][0]
 
 
 # --- corners -------------------------------------------------------------------------------------------------------
@@ -172,7 +153,7 @@ def seen(picture, board=SHEET, picks=(), record=Record("left", Path("a.png"), 3,
 @pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (0.6, 0.05), (-1.2, 0.05)])
 def test_corners_are_found_at_subpixel_level(roll, limit):
     pose = pose_of(roll)
-    off = up_to_a_turn(find_pattern(render(pose)), recorded(pose, PATTERN.points()[:, :2]))
+    off = up_to_a_turn(find_pattern(render(pose)), on_board(pose, PATTERN.points()[:, :2], project))
     assert np.sqrt(np.mean(off**2)) < limit
 
 
@@ -186,7 +167,7 @@ def test_white_squares_on_a_dark_board_are_found():
 
 
 def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
-    poses = view_poses(40, seed=2)
+    poses, small = view_poses(40, seed=2), Chessboard(3, 3, 0.05)
     assert max(grid_noise(p, (6, 4)) for p in pixels_of(poses)) < 0.01
     noisy = [grid_noise(p, (6, 4)) for p in pixels_of(poses, 0.2)]
     # 28 of the 48 coordinates go into the homography and the polynomials, of which the lowest terms count twice
@@ -194,17 +175,17 @@ def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
     pulled = pixels_of(poses[:1])[0]
     pulled[8] += [1.0, 0.0]
     assert grid_noise(pulled, (6, 4)) > 0.1
-    small = Chessboard(3, 3, 0.05)
     assert grid_noise(pixels_of(poses[:1], points=small.points())[0], (3, 3)) < 0.05
 
 
 def test_views_that_differ_most_come_first():
     groups = np.repeat(pixels_of(view_poses(5, seed=1)), 6, axis=0)
     views = groups + np.random.default_rng(0).normal(0, 0.1, groups.shape)
-    chosen = spread_views(views, 5)
+    chosen = pattern_in_image.spread_views(views, 5)
     assert sorted(i // 6 for i in chosen) == [0, 1, 2, 3, 4]
     assert np.ptp(views, axis=1).prod(axis=1).argmax() == chosen[0]
-    assert sorted(spread_views(views[:3], 25)) == [0, 1, 2] and spread_views([], 25) == []
+    assert sorted(pattern_in_image.spread_views(views[:3], 25)) == [0, 1, 2]
+    assert pattern_in_image.spread_views([], 25) == []
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
@@ -223,10 +204,14 @@ def test_the_second_detector_helps_where_the_first_fails(broken, monkeypatch):
     assert np.abs(up_to_a_turn(find_pattern(picture), exact)).max() < 0.3
 
 
-@pytest.mark.parametrize("shape", [(480, 640, 3), (1, 1), (1, 5000), (8, 8)])  # OpenCV refuses narrow ones
-def test_no_pattern(shape):
-    with pytest.raises(PatternNotFound, match="6 x 4 inner corners"):
-        find_pattern(np.full(shape, 90, np.uint8))
+@pytest.mark.parametrize(("shape", "kind", "message"), [
+    *[(shape, np.uint8, "6 x 4 inner corners") for shape in ((480, 640, 3), (1, 1), (1, 5000), (8, 8))],
+    *[(shape, np.uint8, "must be uint8") for shape in ((4, 4, 3, 1), (0, 0))],
+    ((4, 4), float, "must be uint8"),
+])  # fmt: skip
+def test_no_pattern_and_no_image(shape, kind, message):  # OpenCV refuses narrow ones
+    with pytest.raises(PatternNotFound if "corners" in message else ValueError, match=message):
+        find_pattern(np.full(shape, 90, kind))
 
 
 def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
@@ -241,22 +226,16 @@ def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
 
 
 @pytest.mark.parametrize("turn", [100, 280])
-@pytest.mark.parametrize("beyond", [-5, 3, 20])
-def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn, beyond):
+def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn):
     pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
     whole = find_pattern(picture, pattern)
-    try:
-        found = find_pattern(np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond]), pattern)
-    except PatternNotFound:
-        assert beyond < 18  # where all squares are seen it is found
-    else:
-        assert np.abs(up_to_a_turn(found, whole)).max() < 0.3
-
-
-@pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 3, 1), np.uint8), np.zeros((0, 0), np.uint8)])
-def test_what_is_no_image(bad):
-    with pytest.raises(ValueError, match="must be uint8"):
-        find_pattern(bad)
+    for beyond in (-5, 3, 20):
+        try:
+            found = find_pattern(np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond]), pattern)
+        except PatternNotFound:
+            assert beyond < 18  # where all squares are seen it is found
+        else:
+            assert np.abs(up_to_a_turn(found, whole)).max() < 0.3
 
 
 @pytest.mark.parametrize("pattern", [PATTERN, Chessboard(5, 5, 0.05, (0.1, 0.2))])
@@ -274,7 +253,7 @@ def test_every_order_of_the_corners_is_a_turn_of_the_board(pattern):
 def test_adjustment_jacobian_is_the_numeric_one():
     mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])[:, :3]
     poses, points = np.stack([p.as_matrix()[:3] for p in view_poses(2)]), PATTERN.points()
-    basis = np.linalg.svd(np.column_stack([np.ones(24), points[:, :2]]))[0][:, 3:]
+    basis = intrinsics.waves(points)
     state = np.stack([MODEL.parameters, MODEL.parameters * 1.05]), mounts, poses, np.linspace(-1e-3, 2e-3, 21)
     pixels, jacobian = intrinsics.predict(state, points, basis)
     analytic = jacobian.reshape(pixels.size, -1)
@@ -286,17 +265,17 @@ def test_adjustment_jacobian_is_the_numeric_one():
 
 def test_intrinsics_without_noise_are_exact():
     poses = view_poses(8)
-    result = estimate_intrinsics(pixels_of(poses), PATTERN, (640, 480))
-    np.testing.assert_allclose(result.model.parameters, MODEL.parameters, atol=2e-5)
-    assert (result.model.width, result.model.height) == (640, 480)
-    assert result.model.rms_px < 1e-5
+    result = estimate_intrinsics(pixels_of(poses), PATTERN, SIZE)
+    model = result.models[0]
+    np.testing.assert_allclose(model.parameters, MODEL.parameters, atol=2e-5)
+    assert (model.width, model.height) == SIZE and model.rms_px < 1e-5
     np.testing.assert_allclose(result.poses.as_matrix(), [true.as_matrix() for true in poses], atol=1e-6)
 
 
 def test_intrinsics_covariance_tells_the_error():
     poses, errors = view_poses(8, seed=2), []
     for seed in range(30):
-        model = estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, (640, 480)).model
+        model = estimate_intrinsics(pixels_of(poses, 0.2, seed), PATTERN, SIZE).models[0]
         errors.append((model.parameters - MODEL.parameters)[:8] / np.sqrt(np.diag(model.covariance))[:8])
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
@@ -304,22 +283,20 @@ def test_intrinsics_covariance_tells_the_error():
 def test_third_radial_term_stays_out_unless_the_images_need_it():
     rng = np.random.default_rng(4)
     poses = [pose_of(0, rng.uniform(-0.4, 0.4, 2), (*rng.uniform(-0.3, 0.3, 2), 0.8)) for _ in range(10)]
-    assert estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, (640, 480)).model.distortion[4] == 0
+    assert estimate_intrinsics(pixels_of(poses, 0.1), PATTERN, SIZE).models[0].distortion[4] == 0
     bent = MODEL.with_parameters([*MODEL.parameters[:8], 1.5])
-    model = estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, (640, 480)).model
+    model = estimate_intrinsics(pixels_of(poses, 0.1, model=bent), PATTERN, SIZE).models[0]
     assert model.distortion[4] == pytest.approx(1.5, abs=4 * np.sqrt(model.covariance[8, 8]))
 
 
 def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
-    points = PATTERN.points()
-    plane = np.column_stack([np.ones(24), points[:, :2]])
-    waves = 0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1])
-    waves -= plane @ np.linalg.lstsq(plane, waves, rcond=None)[0]
-    poses = view_poses(12, seed=5)
+    points, poses = PATTERN.points(), view_poses(12, seed=5)
+    basis = intrinsics.waves(points)
+    waves = basis @ basis.T @ (0.001 * np.sin(40 * points[:, 0]) * np.cos(25 * points[:, 1]))
     bumpy = pixels_of(poses, 0.02, points=points + waves[:, None] * [0, 0, 1])
-    result = estimate_intrinsics(bumpy, PATTERN, (640, 480), relief=True)
+    result = estimate_intrinsics(bumpy, PATTERN, SIZE, relief=True)
     np.testing.assert_allclose(result.relief, waves, atol=2e-4)
-    assert abs(result.model.fx - MODEL.fx) < 4 * np.sqrt(result.model.covariance[0, 0])
+    assert abs(result.models[0].fx - MODEL.fx) < 4 * np.sqrt(result.models[0].covariance[0, 0])
     np.testing.assert_allclose(estimate_relief(bumpy, PATTERN, MODEL).relief, waves, atol=2e-4)
     assert not estimate_relief(pixels_of(poses, 0.05), PATTERN, MODEL).relief.any()
 
@@ -327,20 +304,29 @@ def test_waves_of_the_sheet_are_found_and_only_where_there_are_any():
 def test_glaring_corners_are_left_out():
     pixels = pixels_of(view_poses(8), 0.1)
     pixels[3, 7] += [4.0, -3.0]
-    result = estimate_intrinsics(pixels, PATTERN, (640, 480))
+    result = estimate_intrinsics(pixels, PATTERN, SIZE)
     assert np.isnan(result.residuals[0, 3, 7]).all()
     assert np.isnan(result.residuals[..., 0]).sum() <= 2 and result.rms_px < 0.2
 
 
-def test_too_few_or_parallel_views():
-    with pytest.raises(ValueError, match="at least three views of the pattern, got 2"):
-        estimate_intrinsics(pixels_of(view_poses(2)), PATTERN, (640, 480))
-    parallel = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i in range(4)]
-    with pytest.raises(ValueError, match="parallel to itself.*focal length"):
-        estimate_intrinsics(pixels_of(parallel, 0.01), PATTERN, (640, 480))
-    pose = RigidTransform.concatenate([pose_of()])
-    with pytest.raises(ValueError, match="8 image coordinates cannot determine 15 unknowns"):
-        intrinsics.adjust(pixels_of(pose)[None, :, :4], PATTERN.points()[:4], [MODEL], pose)
+STACKED = RigidTransform.concatenate([pose_of()])
+ONE = pixels_of([pose_of()])[0]
+PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i in range(4)]
+
+
+@pytest.mark.parametrize(("message", "call"), {
+    "at least three views of the pattern, got 2": lambda: estimate_intrinsics([ONE, ONE], PATTERN, SIZE),
+    "parallel to itself.*focal length": lambda: estimate_intrinsics(pixels_of(PARALLEL, 0.01), PATTERN, SIZE),
+    "8 image coordinates cannot determine 15 unknowns":
+        lambda: adjust(ONE[None, None, :4], PATTERN.points()[:4], [MODEL], STACKED),
+    "four or more of the pattern's 24 corners": lambda: board_pose(ONE[:10], PATTERN, MODEL),
+    "four or more": lambda: board_pose(np.where(np.arange(24)[:, None] < 3, ONE, np.nan), PATTERN, MODEL),
+    "two points 0.00 px apart": lambda: picked_edge("top", [3, 4], [3, 4], [0, 1]),
+    "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0),
+}.items())  # fmt: skip
+def test_what_does_not_suffice(message, call):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 # --- pose ----------------------------------------------------------------------------------------------------------
@@ -363,19 +349,11 @@ def test_errors_that_agree_between_neighbours_widen_the_covariance():
     assert np.mean(chi2) < 5
 
 
-def test_pose_needs_corners():
-    pixels = pixels_of([pose_of()])[0]
-    with pytest.raises(ValueError, match="four or more of the pattern's 24 corners"):
-        board_pose(pixels[:10], PATTERN, MODEL)
-    pixels[3:] = np.nan
-    with pytest.raises(ValueError, match="four or more"):
-        board_pose(pixels, PATTERN, MODEL)
-
-
 FAR = pose_of(0.3, (0.14, -0.1), (0.1, 0.0, 3.0))
 
 
-def far_view(pixels, edges=()):
+def far_view(sigma, seed, edges=()):
+    pixels = pixels_of([FAR], sigma, seed)[0]
     pose, covariance, _ = board_pose(pixels, PATTERN, MODEL)
     return BoardView(pixels=pixels, T_camera_board=pose, covariance=covariance, edges=tuple(edges))
 
@@ -393,7 +371,7 @@ def noisy_edges(pose, seed, sigma=0.1):
 def test_corners_and_edges_together_are_better_and_know_how_much():
     chi2, alone, both = [], [], []
     for seed in range(60):
-        view = far_view(pixels_of([FAR], 0.1, seed)[0], noisy_edges(FAR, 100 + seed))
+        view = far_view(0.1, seed, noisy_edges(FAR, 100 + seed))
         pose, covariance = pose_with_edges(view, SHEET, MODEL)
         chi2.append(score(pose, covariance, FAR))
         alone.append(np.abs(small_turn(view.T_camera_board, FAR)))
@@ -405,15 +383,15 @@ def test_corners_and_edges_together_are_better_and_know_how_much():
 
 
 def test_edges_tell_a_pose_from_its_mirror_in_depth():
-    pixels, wrong = pixels_of([FAR], 0.05, 1)[0], mirrored_pose(FAR, PATTERN)
+    wrong = mirrored_pose(FAR, PATTERN)
     assert turned(wrong, FAR) > 0.2
     np.testing.assert_allclose(mirrored_pose(wrong, PATTERN).as_matrix(), FAR.as_matrix(), atol=1e-12)
-    view = BoardView(pixels=pixels, T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
+    view = replace(far_view(0.05, 1), T_camera_board=wrong, covariance=np.diag([1e-4] * 3 + [1e-6] * 3))
     assert turned(pose_with_edges(replace(view, edges=noisy_edges(FAR, 2)), SHEET, MODEL)[0], FAR) < 0.05
 
 
 def test_an_edge_that_contradicts_the_corners_is_left_out():
-    view, edges = far_view(pixels_of([FAR], 0.05, 1)[0]), noisy_edges(FAR, 3, 0.05)
+    view, edges = far_view(0.05, 1), noisy_edges(FAR, 3, 0.05)
     good, _ = pose_with_edges(replace(view, edges=edges[:3]), SHEET, MODEL)
     moved = replace(edges[3], line=edges[3].line + [0, 0, 9.0])
     same, _ = pose_with_edges(replace(view, edges=[*edges[:3], moved]), SHEET, MODEL)
@@ -477,18 +455,6 @@ def test_line_covariance_tells_the_error_over_noise():
     assert np.all(np.abs(np.sqrt(np.mean(scores, axis=0)) - 1) < 0.35)
 
 
-def test_sigma_along_a_line_is_the_spread_of_drawn_lines():
-    normal, along = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
-    centre, covariance = np.array([100.0, 50.0]), np.array([[0.04, 0.0006], [0.0006, 2e-5]])
-    edge = ImageEdge("x", np.r_[normal, -normal @ centre], covariance, centre, np.zeros((2, 2)), 5, 0.1)
-    offset, angle = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20000).T
-    turned = np.stack([np.cos(0.7 + angle), np.sin(0.7 + angle)], axis=1)
-    for s in (-80.0, 0.0, 60.0):
-        # the point of the turned line that lies straight out from centre + s along
-        out = np.sum(turned * (offset[:, None] * normal - s * along), axis=1) / (turned @ normal)
-        assert edge.sigma_at(centre + s * along) == pytest.approx(out.std(), rel=0.03)
-
-
 def test_correlated_residuals_count_less():
     rng, columns = np.random.default_rng(0), np.arange(400)
     drawn = rng.normal(size=(20, 408))
@@ -497,15 +463,12 @@ def test_correlated_residuals_count_less():
     assert white < 1.6 and 6 < smooth < 14
 
 
-def test_edges_that_cannot_be_used_are_listed_with_the_reason():
+def test_what_cannot_be_used_is_listed_with_the_reason():
     view = seen(render(pose_of(at=(0.0, 0.17, 0.8))))
     assert view.reason == "" and [name for name, _ in view.rejected] == ["bottom"]
     assert "cut by the image border" in view.rejected[0][1]
     view = seen(render(pose_of(), background=105.0))
     assert [reason.split(":")[0] for _, reason in view.rejected] == ["no clear edge"] * 4
-
-
-def test_image_of_another_size_or_without_pattern():
     view = view_board(np.zeros((100, 120, 3), np.uint8), SHEET, MODEL)
     assert "120 x 100" in view.reason and "640 x 480" in view.reason
     view = seen(BLANK + np.uint8(80))
@@ -514,11 +477,11 @@ def test_image_of_another_size_or_without_pattern():
 
 def test_picks_override_the_detector():
     pose = pose_of()
-    corners = recorded(pose, CORNERS)
+    corners = on_board(pose, CORNERS, project)
     picks = [
-        Pick("left", Path("a.png"), "top", corners[[1, 0]] + [0.5, 0.5]),
-        Pick("left", Path("b.png"), "right", corners[:2]),
-        Pick("right", Path("a.png"), "left", corners[:2]),
+        EdgePick("left", Path("a.png"), "top", corners[[1, 0]] + [0.5, 0.5]),
+        EdgePick("left", Path("b.png"), "right", corners[:2]),
+        EdgePick("right", Path("a.png"), "left", corners[:2]),
     ]
     view = seen(render(pose), picks=picks)
     assert [e.name for e in view.edges if e.picked] == ["top"]
@@ -529,13 +492,6 @@ def test_picks_override_the_detector():
     assert view.edge("left").picked is False and view.edge("nowhere") is None
     with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
         seen(render(pose), picks=[replace(picks[0], edge="hypotenuse")])
-
-
-def test_edges_that_are_none():
-    with pytest.raises(ValueError, match="two points 0.00 px apart"):
-        picked_edge("top", [3, 4], [3, 4], [0, 1])
-    with pytest.raises(edges_in_image.EdgeNotSeen, match="predicted length is 3 px"):
-        refine_edge(BLANK, MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0)
 
 
 # --- the outline that nobody measured ------------------------------------------------------------------------------
@@ -550,8 +506,8 @@ def session():
         poses["left", i] = turn if i % 3 == 2 else pose
         poses["right", i] = RigidTransform.from_translation([-0.05, 0.0, 0.0]) * poses["left", i]
     pictures = {key: render(pose, background=clutter(50 + key[1]), seed=key[1]) for key, pose in poses.items()}
-    records = [Record(camera, Path(f"/s/{camera}/{i}.png"), i, 0.1 * i) for camera, i in poses]
-    return poses, records, lambda record: pictures.get((record.camera, record.placement), BLANK)
+    records = [record(camera, f"/s/{camera}/{i}.png", i, 0.1 * i) for camera, i in poses]
+    return poses, records, lambda r: pictures.get((r.camera, r.placement), BLANK)
 
 
 @pytest.fixture(scope="module")
@@ -569,9 +525,11 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
     outline, expected = surveyed.outline, replace(SHEET, corners=truth).lengths()
     np.testing.assert_allclose(surveyed.board.corners, truth, atol=8e-4)
     np.testing.assert_allclose(corners_of_lines(outline.lines), surveyed.board.corners, atol=1e-12)
-    assert all(n >= 10 for n in outline.n_views.values()) and np.all(outline.line_sd < 0.002)
+    assert np.all(outline.line_sd < 0.002)
     for name, length in outline.lengths.items():
         assert length == pytest.approx(expected[name], abs=0.001) and outline.length_sd[name] < 0.003
+    alone = survey.measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
+    assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
 
 
 def test_survey_estimates_missing_intrinsics(session):
@@ -590,7 +548,7 @@ def test_survey_of_a_known_board_keeps_its_corners(session):
 
 def test_images_for_the_intrinsics_make_no_views_and_blank_images_say_why(session):
     _, records, read = session
-    records = [replace(records[0], purpose="intrinsics"), *records[1:], Record("left", Path("/s/left/9.png"), 9)]
+    records = [replace(records[0], purpose="intrinsics"), *records[1:], record("left", "/s/left/9.png", 9)]
     views = survey.survey(records, read, UNKNOWN, {"left": MODEL}).views["left"]
     assert {v.placement for v in views} == {1, 2, 3, 4, 5, 6, 9}
     assert "inner corners" in views[-1].reason
@@ -607,39 +565,61 @@ def test_an_outline_that_no_image_shows_leaves_poses(session, monkeypatch):
 
 def at_three_pitches(read, blank=()):
     """Every picture of the left camera as three records, some of them without a board."""
-    records = [
-        Record("left", Path(f"/s/left/{i}_{k}.png"), i, p) for i in range(4) for k, p in enumerate((-0.3, 0.4, 0.1))
-    ]
+    records = [record("left", f"/s/left/{i}_{k}.png", i, p) for i in range(4) for k, p in enumerate((-0.3, 0.4, 0.1))]
     return records, lambda r: BLANK if r.file.stem in blank else read(r)
+
+
+def one_each(records, read, board=SHEET):
+    return survey.survey(records, read, board, {"left": MODEL}, one_per_placement=True).views["left"]
 
 
 def test_one_image_a_placement_is_the_middle_one_that_shows_the_board(session):
     records, read = at_three_pitches(session[2], {"1_2", "2_0", "2_1", "2_2"})
-    found = survey.survey(records, read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
+    found = one_each(records, read)
     assert [v.file for v in found] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png"]
     assert [v.reason == "" for v in found] == [True, True, False, True]
     assert len(survey.survey(records[:6], read, SHEET, {"left": MODEL}).views["left"]) == 6
-    unknown = [replace(r, pitch=np.nan) for r in records[:3]]
-    found = survey.survey(unknown, read, SHEET, {"left": MODEL}, one_per_placement=True).views["left"]
-    assert [v.file for v in found] == ["0_0.png"]
+    assert [v.file for v in one_each([replace(r, pitch=np.nan) for r in records[:3]], read)] == ["0_0.png"]
 
 
 def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
     picture = render(triangle_pose(), TRIANGLE)
     records, read = at_three_pitches(lambda r: picture, {"1_2"})
     records += [replace(r, placement=-1, file=Path(f"/s/left/x{i}.png")) for i, r in enumerate(records[:2])]
-    shown = survey.survey(records, read, TRIANGLE, {"left": MODEL}, one_per_placement=True).views["left"]
+    shown = one_each(records, read, TRIANGLE)
     assert [v.file for v in shown] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png", "x0.png", "x1.png"]
     assert all(v.reason == "" for v in shown)
+
+
+def test_further_images_of_a_placement_are_turned_as_its_first_one_was(session, surveyed):
+    """Views of the first survey are taken over, with what it measured, and none is looked at twice."""
+    _, records, read = session
+    more = [replace(r, file=Path(f"/s/{r.camera}/later{r.placement}.png")) for r in records]
+    asked, views = [], {c: {v.placement: v for v in own} for c, own in surveyed.views.items()}
+    views["right"][2] = replace(views["right"][2], pixels=None, T_camera_board=None, reason="no chessboard")
+    images = SimpleNamespace(
+        images=lambda purpose: records + more, picks=(), read_image=lambda r: asked.append(r) or read(r)
+    )
+    found = survey.all_views(
+        SimpleNamespace(
+            session=images, board=surveyed.board, views=views, models=surveyed.models, relief=surveyed.relief
+        )
+    )
+    assert [len(own) for own in found.values()] == [14, 14] and asked == [r for r in more if r != more[5]]
+    for camera, own in found.items():
+        for v, again in zip(own[:7], own[7:], strict=True):
+            assert v == views[camera][v.placement] and again.file == f"later{v.placement}.png"
+            assert again.reason == v.reason
+            assert v.reason or turned(v.T_camera_board, again.T_camera_board) < 0.01
 
 
 def test_intrinsics_use_a_spread_of_the_images(monkeypatch):
     pixels, used = pixels_of(view_poses(40)), []
 
-    def finder(record):
-        if record.placement == 0:
+    def finder(r):
+        if r.placement == 0:
             raise PatternNotFound("no board")
-        return pixels[record.placement]
+        return pixels[r.placement]
 
     def estimate(corners, *_):
         used.append([int(np.flatnonzero((pixels == own).all(axis=(1, 2)))[0]) for own in corners])
@@ -648,7 +628,7 @@ def test_intrinsics_use_a_spread_of_the_images(monkeypatch):
     monkeypatch.setattr(survey, "PatternFinder", lambda pattern: finder)
     monkeypatch.setattr(survey, "estimate_intrinsics", estimate)
     for own in (20, 0):
-        records = [Record("left", Path("a"), i, purpose="intrinsics" if i < own else "board") for i in range(40)]
+        records = [record("left", "a", i, purpose="intrinsics" if i < own else "board") for i in range(40)]
         with pytest.raises(ValueError, match="camera 'left': enough"):
             survey.survey(records, lambda r: SimpleNamespace(shape=BLANK.shape, **vars(r)), SHEET, {"left": None})
     assert len(used[0]) == survey.VIEWS_FOR_INTRINSICS and set(range(1, 20)) <= set(used[0])
@@ -666,23 +646,9 @@ def test_surveys_that_cannot_work(session, surveyed):
     ):
         with pytest.raises(ValueError, match=message):
             survey.survey(records[:count], see, board, models)
-    views = {c: [replace(v, edges=v.edges[:1]) for v in g] for c, g in surveyed.views.items()}
+    views = [replace(v, edges=v.edges[:1]) for group in surveyed.views.values() for v in group]
     with pytest.raises(ValueError, match="edge '.*' of board 'sheet' was found in none of 14 images"):
         survey.measure_outline(views, UNKNOWN, surveyed.models)
-
-
-def test_one_view_makes_an_outline_without_spread(surveyed):
-    outline = survey.measure_outline({"left": surveyed.views["left"][:1]}, UNKNOWN, surveyed.models)
-    assert np.isnan([*outline.line_sd, *outline.length_sd.values()]).all()
-
-
-def test_stereo_check_recovers_the_mounting(surveyed):
-    models, (left, right) = [surveyed.models[c] for c in ("left", "right")], surveyed.views.values()
-    transform, covariance, result = survey.stereo_check(left, right, PATTERN, models)
-    np.testing.assert_allclose(transform.translation, [-0.05, 0, 0], atol=5e-4)
-    assert transform.rotation.magnitude() < 2e-3 and covariance.shape == (6, 6) and result.rms_px < 0.2
-    with pytest.raises(ValueError, match="no placement shows the pattern to both cameras"):
-        survey.stereo_check(left[:2], right[3:], PATTERN, models)
 
 
 def shown(pixels):
@@ -690,55 +656,48 @@ def shown(pixels):
     return [SimpleNamespace(placement=i, pixels=own) for i, own in enumerate(pixels)]
 
 
-def test_stereo_covariance_tells_the_error():
+def test_stereo_check_recovers_the_mounting_and_its_covariance_tells_the_error():
     poses, mount, chi2 = view_poses(6, seed=8), pose_of(0.02, (0.01, -0.02), (-0.12, 0.002, 0.004), (0, 0)), []
     for seed in range(30):
         first = shown(pixels_of(poses, 0.2, 2 * seed))
         second = shown(pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1))
         chi2.append(score(*survey.stereo_check(first, second, PATTERN, [MODEL, MODEL])[:2], mount))
     assert 0.6 < np.mean(chi2) < 1.5
+    with pytest.raises(ValueError, match="no placement shows the pattern to both cameras"):
+        survey.stereo_check(first[:2], second[3:], PATTERN, [MODEL, MODEL])
 
 
 # --- boards without pattern ----------------------------------------------------------------------------------------
 
 
-def triangle_pose(roll=0.4, tilt=(0.3, -0.35), at=(0.02, 0.0, 0.9)):
-    # z of the board faces the camera
-    ahead = Rotation.from_rotvec([0, 0, roll]) * Rotation.from_rotvec([tilt[0], tilt[1], 0])
-    rotation = ahead * Rotation.from_euler("x", np.pi)
-    return RigidTransform.from_components(np.array(at) - rotation.apply([0.105, 0.127, 0.0]), rotation)
+def nearest(view, pose):
+    """Of the poses that explain an image the one that is right."""
+    return min([view, *view.alternatives], key=lambda v: turned(v.T_camera_board, pose))
 
 
 @pytest.mark.parametrize("roll", [0.4, 2.0, -1.5])
-def test_a_plain_triangle_is_found_and_a_guess_tells_its_corners(roll):
+def test_a_plain_triangle_is_found_in_all_its_poses_with_the_names_of_its_edges(roll):
     pose = triangle_pose(roll)
-    guess = RigidTransform.from_components(pose.translation, Rotation.from_rotvec([0.1, -0.1, 0.1]) * pose.rotation)
-    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, guess=guess)
+    found = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
+    view, corners = nearest(found, pose), on_board(pose, TRIANGLE.corners)
     assert view.reason == "" and len(view.edges) == 3 and worst_edge(view, pose, TRIANGLE) < 0.05
-    corners = corners_of_lines([e.line for e in view.edges])
-    np.testing.assert_allclose(corners, on_board(pose, TRIANGLE.corners), atol=0.05)
+    np.testing.assert_allclose(corners_of_lines([e.line for e in view.edges]), corners, atol=0.05)
     assert turned(view.T_camera_board, pose) < 0.01 and score(view.T_camera_board, view.covariance, pose) < 5
-
-
-def test_other_poses_of_a_triangle_are_reported():
-    pose = triangle_pose()
-    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)
-    everything = [view.T_camera_board, *view.alternatives]
-    assert len(everything) >= 3 and min(turned(p, pose) for p in everything) < 0.01
-    exact = np.sort(on_board(pose, TRIANGLE.corners), axis=0)
-    for other in everything:
-        np.testing.assert_allclose(np.sort(on_board(other, TRIANGLE.corners), axis=0), exact, atol=0.1)
+    assert len(found.alternatives) >= 2
+    for other in (found, *found.alternatives):
+        there = on_board(other.T_camera_board, TRIANGLE.corners)
+        np.testing.assert_allclose(np.sort(there, axis=0), np.sort(corners, axis=0), atol=0.1)
 
 
 def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector():
     pose = triangle_pose()
-    corners = recorded(pose, TRIANGLE.corners)
+    corners = on_board(pose, TRIANGLE.corners, project)
     picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
     view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": picks["bc"]})
     assert view.edge("bc").picked and worst_edge(view, pose, TRIANGLE) < 0.1
-    view = view_board(BLANK, TRIANGLE, MODEL, picks=picks, guess=pose)
+    view = view_board(BLANK, TRIANGLE, MODEL, picks=picks)
     assert view.reason == "" and all(e.picked for e in view.edges)
-    np.testing.assert_allclose(view.T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
 
 def test_a_plain_quadrilateral_is_over_determined():
@@ -761,7 +720,7 @@ def test_plain_boards_that_cannot_be_used():
         assert message in view_board(picture, board, MODEL).reason
 
 
-# --- a simulated session -------------------------------------------------------------------------------------------
+# --- a simulated session, and real recordings ----------------------------------------------------------------------
 
 
 def test_poses_in_a_simulated_session_are_as_good_as_they_say():
@@ -781,53 +740,41 @@ def test_poses_in_a_simulated_session_are_as_good_as_they_say():
     assert 0.2 < np.mean(chi2) < 2.0
 
 
-# --- real recordings -----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def lms400(real_data):
-    folder = real_data / "lms400_zed"
-    records = [Record(c, folder / f"{c}_{i:02d}.png", i) for c in ("left", "right") for i in range(1, 21)]
-    board = Board("cardboard", ("top", "right", "bottom", "left"), None, Chessboard(8, 6, 0.0775), ("left", "top"))
-    return survey.survey(records, lambda r: cv2.imread(str(r.file)), board, {"left": None, "right": None})
-
-
 def test_real_cameras_edges_and_outline(lms400):
-    for camera, model in lms400.models.items():
+    found = lms400.prepared
+    for camera, model in found.models.items():
+        views = found.views[camera].values()
         assert model.rms_px < 0.32
-        names = [e.name for v in lms400.views[camera] for e in v.edges]
+        names = [e.name for v in views for e in v.edges]
         assert len(names) >= 70 and len(names) - names.count("bottom") >= 58
-        assert all(reason.startswith(("cut by", "no clear")) for v in lms400.views[camera] for _, reason in v.rejected)
-    for name, length in lms400.outline.lengths.items():
+        assert all(reason.startswith(("cut by", "no clear")) for v in views for _, reason in v.rejected)
+    for name, length in found.outline.lengths.items():
         assert length == pytest.approx(0.858, abs=0.004), name
-        assert lms400.outline.length_sd[name] < 0.007
-    assert np.all(lms400.outline.line_sd < 0.0035)
-
-
-def test_real_cameras_see_the_same_edges(lms400):
-    ends = lms400.board.corners
-    middles = np.column_stack([(ends + np.roll(ends, -1, axis=0)) / 2, np.ones(len(ends))])
-    for name, middle in zip(lms400.board.edges, middles, strict=True):
-        offsets = {camera: {} for camera in lms400.views}
-        for v in (v for group in lms400.views.values() for v in group if v.edge(name)):
-            offsets[v.camera][v.placement] = (
-                edges_in_image.board_line(v, v.edge(name), lms400.models[v.camera]) @ middle
-            )
-        left, right = offsets.values()
+        assert found.outline.length_sd[name] < 0.007
+    assert np.all(found.outline.line_sd < 0.0035)
+    ends = found.board.corners
+    for name, middle in zip(found.board.edges, (ends + np.roll(ends, -1, axis=0)) / 2, strict=True):
+        offsets = []  # of the edge where it is seen, by placement
+        for camera, views in found.views.items():
+            shown = {p: v.edge(name) for p, v in views.items() if v.edge(name)}
+            lines = {p: edges_in_image.board_line(views[p], e, found.models[camera]) for p, e in shown.items()}
+            offsets.append({p: line_distance(middle, line) for p, line in lines.items()})
+        left, right = offsets
         assert np.median([abs(left[p] - right[p]) for p in left.keys() & right.keys()]) < 0.001, name
 
 
 def test_real_stereo(lms400):
-    given = *lms400.views.values(), lms400.board.pattern, list(lms400.models.values())
-    transform, covariance, _ = survey.stereo_check(*given, relief=lms400.relief)
+    found = lms400.prepared
+    given = *(list(v.values()) for v in found.views.values()), found.board.pattern, list(found.models.values())
+    transform, covariance, _ = survey.stereo_check(*given, relief=found.relief)
     # shape-free bundle of an independent analysis, with its own uncertainty
     assert np.linalg.norm(transform.translation) == pytest.approx(0.1200, abs=0.0006)
     np.testing.assert_allclose(np.rad2deg(transform.rotation.as_rotvec()), [0.457, 0.479, -0.025], atol=0.12)
     assert np.all(np.sqrt(np.diag(covariance)) < 1e-3)
-    refined, covariance, _ = survey.stereo_check(*given, relief=lms400.relief, refine=True)
-    found = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
+    refined, covariance, _ = survey.stereo_check(*given, relief=found.relief, refine=True)
+    off = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
     sigma = np.sqrt(np.diag(covariance)) * np.repeat([np.rad2deg(1), 1000], 3)
-    off = found - [0.457, 0.479, -0.025, -120.0, -0.3, -0.8]
+    off -= [0.457, 0.479, -0.025, -120.0, -0.3, -0.8]
     assert np.all(np.abs(off) < 3 * np.hypot(sigma, [0.017, 0.038, 0.007, 0.36, 0.14, 0.90]))
 
 
@@ -837,9 +784,9 @@ def test_opencv_stereo_pairs(real_data):
     for camera, rms in (("left", 0.4087), ("right", 0.4586)):
         files = [folder / f"{camera}{i:02d}.jpg" for i in range(1, 15) if i != 10]
         corners.append([find_pattern(cv2.imread(str(file)), pattern) for file in files])
-        result = estimate_intrinsics(corners[-1], pattern, (640, 480))
+        result = estimate_intrinsics(corners[-1], pattern, SIZE)
         assert result.rms_px < rms
-        models.append(result.model)
+        models += result.models
     assert models[0].fx == pytest.approx(535.9, abs=4)
     transform, _, result = survey.stereo_check(*map(shown, corners), pattern, models, refine=True)
     assert result.rms_px < 0.4478

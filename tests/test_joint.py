@@ -7,18 +7,16 @@ import pytest
 from joint_draws import MOUNTS, draw, none, rng, scores
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.monte_carlo import bound, state_errors
+from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.fit.least_squares import whiten
-from lrfcal_lib.fit.residuals import SENSOR, JointState, Unknowns, gather, move_state, named_blocks
+from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, move_state, named_blocks
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_difference,
-    pose_array,
     pose_transform,
     transform_difference,
 )
-from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.solvers.joint import in_stated_gauge, solve_joint, total_cost
+from lrfcal_lib.solvers.joint import solve_joint, total_cost
 
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
 PLAIN = ("range_offset", "edge_log_odds", "edge_log_softness")
@@ -32,51 +30,16 @@ def apart(a, b):
 # derivatives
 
 
-def random_pose(rng, spread=0.3, at=(0, 1.5, 0)):
-    turn = Rotation.from_rotvec(rng.normal(0, spread, 3))
-    return RigidTransform.from_components(np.array(at) + rng.normal(0, 0.2, 3), turn)
+EVERY = Unknowns(2, 3, sensor=SENSOR, sweep="offset_stretch", sides=True)
 
 
-def random_problem(rng, placements=3):
-    """Observations and a state that do not fit each other, every group at odd places, one camera on either mount."""
-
-    def rows(n):
-        return {"bearing": rng.uniform(1.2, 1.9, n), "pitch": rng.uniform(-0.2, 0.2, n)} | place(n)
-
-    def place(n):
-        return {"placement": rng.integers(0, placements, n)}
-
-    roots = rng.normal(size=(9, 6, 6))
-    groups = {
-        "face": rows(20) | {"range": rng.uniform(1, 2, 20), "sigma": np.full(20, 0.01)},
-        "beam": rows(25)
-        | {"hit": rng.random(25) < 0.5, "edge": rng.integers(0, 3, 25)}
-        | {"radius": np.full(25, 0.3), "background": rng.normal(0, 0.5, 25), "step": np.full(25, 0.5)},
-        "view": {"camera": rng.integers(0, 2, 9), "pitch": rng.uniform(-0.2, 0.2, 9)}
-        | {"pose": np.stack([random_pose(rng, 0.1, (0, 0, 1.5)).as_matrix() for _ in range(9)])}
-        | {"covariance": roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(6)}
-        | place(9),
-    }
-    flat = {f"{name}_{key}": value for name, group in groups.items() for key, value in group.items()}
-    obs = JointObservations(
-        placements=np.arange(1, placements + 1), direction=np.resize([1, -1], placements),
-        middle=rng.normal(0, 0.1, placements), edges=("ab", "bc", "ca"), cameras=("left", "right"),
-        corners=np.array([[0, 0], [0.315, 0], [0, 0.38]]), mounts=("head", "platform"), **flat,
-    )  # fmt: skip
-    facing = RigidTransform.from_rotation(Rotation.from_euler("x", 90, degrees=True))
-    state = JointState(
-        pose_array(random_pose(rng, 0.2, (0, 0, 0.1))),
-        np.stack([pose_array(random_pose(rng, 0.2)) for _ in range(2)]),
-        np.array([0.01, 0.3, np.log(0.4), 0.02, 0.01]),
-        rng.normal(0, 0.01, 3),
-        np.stack([pose_array(random_pose(rng) * facing) for _ in range(placements)]),
-        rng.normal(0, 0.02, (placements, 2)),
-        rng.normal(0, 0.2, (placements, 3)),
-    )
-    return obs, state
-
-
-EVERY = Unknowns(2, 3, sensor=SENSOR, size=True, sweep="offset_stretch", sides=True)
+def random_problem(rng, mount="head"):
+    """Some rows of drawn observations, and a state that does not fit them."""
+    obs, truth, _ = draw(rng, 3, mount=mount)
+    places = {name: getattr(obs, f"{name}_placement") for name in ("face", "beam", "view")}
+    obs = obs.keep(**{name: rng.random(len(place)) < max(0.1, 9 / len(place)) for name, place in places.items()})
+    step = rng.normal(0, 0.03, EVERY.shared), rng.normal(0, 0.03, (3, EVERY.own))
+    return obs, move_state(truth, step, EVERY)
 
 
 def moved(state, column, amount):
@@ -92,10 +55,10 @@ def moved(state, column, amount):
 @pytest.mark.parametrize(
     ("name", "lapse"), [("face", 0), ("beam", 0), ("beam", 0.05), ("view", 0), ("sweep", 0), ("side", 0)]
 )
-@pytest.mark.parametrize("seed", [1, 2])
-def test_derivatives_of_every_block(name, lapse, seed):
+@MOUNTS
+def test_derivatives_of_every_block(name, lapse, mount):
     """Gradient of each placement's cost, and for least squares the Jacobian itself, against differences."""
-    obs, state = random_problem(rng(seed))
+    obs, state = random_problem(rng(1), mount)
     data = replace(gather(obs), lapse=lapse)
 
     def block(s):
@@ -182,45 +145,12 @@ def test_exact_observations_give_the_truth():
 
 
 @MOUNTS
-def test_sharp_edges_tie_down_the_rest(mount):
-    """Without noise only the beams' spacing leaves anything open, and that within its own prediction."""
-    obs, truth, _ = draw(rng(), 8, mount=mount, see_noise=0.0)
-    sharp = solve_joint(replace(obs, beam_step=0 * obs.beam_step), required=False)  # every reading counts in full
-    error = np.abs(state_errors(sharp.state, truth, sharp.unknowns))
-    assert error[:4].max() < (1e-3 if mount == "head" else 8e-3)
-    found = solve_joint(obs, required=False)  # with the floor of the softness: no farther off than it says
-    assert np.abs(scores(found, truth))[:4].max() < 2
-
-
-@MOUNTS
 def test_errors_are_as_predicted(mount):
     """Forty unknown numbers of two draws: none beyond 4.5 standard deviations, and not all too small."""
     draws = [draw(rng(seed), mount=mount) for seed in (5, 6)]
     z = np.concatenate([scores(solve_joint(obs), truth) for obs, truth, _ in draws])
     assert np.abs(z).max() < 4.5
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8
-
-
-def test_the_stated_covariance_agrees_with_the_bound_at_the_truth():
-    obs, truth, _ = draw(rng(), 12)
-    found = solve_joint(obs)
-    limit = np.sqrt(np.diag(bound(obs, truth, found.unknowns)))
-    assert np.allclose(found.solution.sigma[:-2], limit[:-2], rtol=0.15)
-
-
-def test_more_placements_shrink_errors_and_bounds():
-    """Three times the data: 0.58 of the standard deviation, in the bound and in the errors of five draws."""
-    errors, bounds = {}, {}
-    for count in (6, 18):
-        kept = []
-        for seed in range(5):
-            obs, truth, _ = draw(rng(seed), count)
-            found = solve_joint(obs)
-            kept.append(scores(found, truth) * found.solution.sigma)
-        errors[count] = np.sqrt(np.mean(np.square(kept), axis=0))[:16]
-        bounds[count] = np.sqrt(np.diag(bound(obs, truth, found.unknowns)))[:16]
-    assert 0.3 < np.median(bounds[18] / bounds[6]) < 0.7
-    assert np.median(errors[18] / errors[6]) < 0.85
 
 
 @MOUNTS
@@ -255,18 +185,6 @@ def test_pitch_errors_of_sweeps_are_recovered():
     assert costs[1] > 1.2 * costs[0]
 
 
-def test_stretched_sweeps_on_the_head():
-    """Cameras that pitch along see a stretch, never an offset."""
-    obs, truth, _ = draw(rng(), 12)
-    stretch = rng(8).normal(0, 0.02, 12)
-    spoilt = with_recorded_pitch(obs, lambda true, p: obs.middle[p] + (true - obs.middle[p]) / (1 + stretch[p]))
-    found, plain = solve_joint(spoilt, sweep="offset_stretch"), solve_joint(spoilt)
-    sweeps = np.array([found.sweeps[n] for n in obs.placements])
-    assert np.corrcoef(sweeps[:, 1], stretch)[0, 1] > 0.95
-    assert np.abs(sweeps[:, 0]).max() < 1e-6
-    assert np.median(list(found.misfit.values())) < 1.2 < 2 < np.median(list(plain.misfit.values()))
-
-
 def test_the_direction_of_the_sweep_is_recovered():
     lag, sensor = np.radians(0.4), (*PLAIN, "pitch_by_direction")
     obs, truth, _ = draw(rng(), 12, mount="platform")
@@ -277,25 +195,7 @@ def test_the_direction_of_the_sweep_is_recovered():
         solve_joint(draw(rng(), 8)[0], sensor=sensor)  # cameras on the head lag alike
 
 
-@MOUNTS
-def test_size_of_the_board_is_recovered(mount):
-    """A board stated 4 mm too narrow: its slanted side lies outside, by as much as it leans."""
-    obs, truth, rig = draw(rng(), 20, mount=mount)
-    found = solve_joint(replace(obs, corners=obs.corners * [0.311 / 0.315, 1.0]), size=True)
-    sigma = np.sqrt(np.diag(found.covariance("size_")))
-    assert np.all(sigma < 0.003)
-    grown = np.array([0.0, 0.004 * rig.board.lines()[1, 0] / 2, 0.0])
-    moved = np.array([found.size[name] for name in rig.board.edges]) - grown
-    assert np.all(np.abs(moved) < 4.5 * sigma + 0.0015)
-
-
 # subsets of the data
-
-
-def test_one_camera():
-    obs, truth, _ = draw(rng(), cameras=("left",))
-    found = solve_joint(obs)
-    assert list(found.transforms) == ["left"] and np.abs(scores(found, truth)).max() < 4.5
 
 
 def test_no_camera_leaves_the_platform_step():
@@ -312,6 +212,7 @@ def test_single_shots_do_not_show_the_axis():
         solve_joint(obs, sensor=PLAIN[:2])
     found = solve_joint(obs, required=False, sensor=PLAIN[:2])
     assert sum("axis" in words for words in found.unobservable) == 4
+    assert not np.any(found.solution.sigma[:4] < 0.5)  # what the data do not show has no small sigma
     cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
     assert np.abs(scores(found, truth)[cameras]).max() < 4.5
 
@@ -322,11 +223,6 @@ def test_single_shots_with_a_known_axis(mount):
     found = solve_joint(obs, pose_transform(truth.head), axis=False, sensor=PLAIN[:2])
     assert np.allclose(found.state.head, truth.head, atol=1e-9)
     assert np.abs(scores(found, truth)).max() < 4.5
-
-
-def test_one_image_a_placement_is_weaker():
-    strong, weak = (solve_joint(draw(rng(), see_images=n)[0]).solution.sigma[0] for n in (3, 1))
-    assert weak > 3 * strong
 
 
 def test_without_edges_their_bias_is_named():
@@ -394,11 +290,3 @@ def test_observations_are_checked(field, change, words):
         replace(obs, **{field: change(getattr(obs, field))})
     with pytest.raises(DegenerateGeometry, match="no placement"):
         solve_joint(obs.select([]))
-
-
-def test_gauge_change_keeps_the_cost():
-    obs, state = random_problem(rng(9))
-    data = gather(obs)
-    other = in_stated_gauge(state, obs)
-    plain = Unknowns(2, 3)
-    assert np.isclose(total_cost(state, data, plain), total_cost(other, data, plain), rtol=1e-12)

@@ -51,17 +51,6 @@ def test_parallel_boards_are_named(mount, lean):
 
 
 @MOUNTS
-def test_one_distance_costs_certainty_not_truth(mount):
-    """All boards 1.5 m away: hard to tell the cameras' turn from their place, and the sigma says so."""
-    near, truth, _ = draw(rng(), 12, mount=mount, distances=(1.5, 1.5))
-    far, *_ = draw(rng(), 12, mount=mount)
-    found, spread = solve_joint(near), solve_joint(far)
-    assert found.converged and worst(found, truth) < 4.5
-    cameras = [i for i, name in enumerate(found.solution.names) if name.startswith(("left", "right"))]
-    assert np.max(found.solution.sigma[cameras] / spread.solution.sigma[cameras]) > 2
-
-
-@MOUNTS
 def test_a_degree_of_pitch_costs_certainty_not_truth(mount):
     step = np.radians(0.25)
     narrow, truth, _ = draw(rng(), 12, mount=mount, see_span=np.radians(1.0), pitch_step=step)
@@ -130,9 +119,8 @@ def test_sound_recordings_need_no_warning(mount):
 
 def mis_stated(obs, kind, factor):
     """Observations whose stated standard deviations are wrong by a factor."""
-    if kind == "face":
-        return replace(obs, face_sigma=obs.face_sigma * factor)
-    return replace(obs, view_covariance=obs.view_covariance * factor**2)
+    field, power = {"face": ("face_sigma", 1), "view": ("view_covariance", 2)}[kind]
+    return replace(obs, **{field: getattr(obs, field) * factor**power})
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -140,14 +128,6 @@ def test_too_few_placements_are_named(count):
     obs, *_ = draw(rng(), count)
     with pytest.raises(DegenerateGeometry, match=f"{count} placements .* at least 3 needed"):
         solve_joint(obs)
-
-
-def test_what_is_unobservable_has_no_small_sigma():
-    """Numbers that the data do not show must not come with a standard deviation as if they did."""
-    obs, *_ = draw(rng(), see_span=0.0)
-    found = solve_joint(obs, required=False)
-    assert len(found.unobservable) >= 4
-    assert not np.any(found.solution.sigma[:4] < 0.5)
 
 
 @MOUNTS

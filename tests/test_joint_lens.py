@@ -65,8 +65,3 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
     large = predicted > 0.03 * known.solution.sigma[columns]
     assert large.any()
     np.testing.assert_allclose(np.abs(change[large]), predicted[large], rtol=0.15)
-
-
-def test_exact_intrinsics_add_nothing():
-    obs, _, _ = draw(np.random.default_rng(5), 8)
-    assert not solve_joint(obs).lens.any()

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case
+from synthetic import camera_case, numeric
 
 from lrfcal_lib.evaluate.monte_carlo import observations, shots_table, solve_shots, start_near
 from lrfcal_lib.fit.residuals import sight_normals
-from lrfcal_lib.model.geometry import pose_array, transform_difference
+from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.simulate.draw import ShotSetup, draw_shots
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.lines import edge_bias, freeze_intervals, interval_block, move_biased
@@ -41,9 +41,8 @@ def test_better_than_any_rule_for_the_edge_point_when_the_bias_is_unknown(tables
 
 
 def test_better_than_planes(tables):
-    ratio = {c: pooled(tables, c, "zhang_pless") / pooled(tables, c, "line_ml")
-             for c in ("rotation_rms_deg", "translation_rms_mm")}  # fmt: skip
-    assert ratio["rotation_rms_deg"] > 3 and ratio["translation_rms_mm"] > 2
+    for column, factor in (("rotation_rms_deg", 3), ("translation_rms_mm", 2)):
+        assert pooled(tables, column, "zhang_pless") > factor * pooled(tables, column, "line_ml")
 
 
 def test_the_bias_is_found_and_its_uncertainty_is_not_played_down(tables):
@@ -59,17 +58,15 @@ def test_score_is_the_derivative_of_the_cost():
     sight, lengths = sight_normals(obs.crossing_lines, obs.model)
     frozen = (obs, sight, *freeze_intervals(state, obs, sight, lengths, 0.2))
     block = interval_block(state, *frozen)
-    gradient = block.jacobian.T @ block.residuals
-    for k, step in enumerate(1e-6 * np.eye(7)):
-        cost = [np.sum(interval_block(move_biased(state, s), *frozen).cost) for s in (step, -step)]
-        assert gradient[k] == pytest.approx((cost[0] - cost[1]) / 2e-6, rel=1e-4, abs=1e-2)
+    cost = numeric(lambda s: np.sum(interval_block(move_biased(state, s), *frozen).cost), 7)
+    np.testing.assert_allclose(block.jacobian.T @ block.residuals, cost, rtol=1e-4, atol=1e-2)
 
 
 def test_many_trials_equal_single_ones():
     setup = ShotSetup(bias=0.3)
     shots = draw_shots(setup, np.random.default_rng(5), 3)
     T0 = start_near(shots, np.random.default_rng(6))
-    for method in ("line_ml", "zhang_pless"):
+    for method in ("line", "line_ml", "zhang_pless"):
         batch = solve_camera(observations(shots, setup), method, T0)
         for i in range(3):
             one = {name: values[i : i + 1] for name, values in shots.items()}
@@ -88,31 +85,11 @@ def test_the_start_does_not_matter():
     np.testing.assert_allclose(pose, np.broadcast_to(np.median(pose, axis=0), pose.shape), atol=1e-6)
 
 
-def test_without_a_start_value():
-    rig, obs = camera_case(9, noise=1.0)
-    found, near = (solve_camera(obs, "line_ml", T0).transform for T0 in (None, rig.T_camera_lrf))
-    assert max(transform_difference(found, near)) < 1e-7
-
-
 def test_bias_in_metres_follows_the_radius():
     found = solve_camera(camera_case(10, noise=1.0)[1], "line_ml")
     shift, sigma = edge_bias(found, 0.02)
     assert (shift, sigma) == pytest.approx(tuple(0.02 * v for v in edge_bias(found)))
     assert edge_bias(found, background=-1.0)[0] > edge_bias(found)[0]
-
-
-def test_drawn_readings_end_where_the_bias_says():
-    setup = ShotSetup(bias=0.4, softness=0.0, sigma_range=0.0)
-    shots = draw_shots(setup, np.random.default_rng(12), 4, placements=5)
-    found = observations(shots, setup)
-    assert np.isfinite(shots["ranges"]).sum(axis=-1).min() >= 8
-    pose = shots["T_camera_lrf"]
-    p = found.crossing_points @ np.swapaxes(pose[..., :3], -1, -2) + pose[:, None, :, 3]
-    normal = found.crossing_lines @ setup.model.matrix
-    outside = np.sum(p * normal, axis=-1) / np.linalg.norm(normal, axis=-1)
-    half = np.linalg.norm(found.crossing_half_step, axis=-1)
-    slack = 0.1 * half + 3 * setup.sigma_px * p[..., 2] / 1000
-    assert (np.abs(outside - 0.4 * found.crossing_radius) < half + slack).all()
 
 
 def test_boards_that_cannot_be_drawn_are_refused():

@@ -8,15 +8,6 @@ from joint_draws import MOUNTS, draw, rng
 
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, named_blocks
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, pose_transform
-
-
-@MOUNTS
-def test_exact_observations_leave_no_residual(mount):
-    obs, truth, _ = draw(rng(0), 6, mount=mount, see_noise=0.0, stretch=0.02)
-    blocks = named_blocks(truth, gather(obs), Unknowns(2, 3))
-    assert np.abs(whiten(blocks["face"], False)[0]).max() < 1e-9
-    assert np.abs(whiten(blocks["view"], False)[0]).max() < 1e-6
 
 
 @MOUNTS
@@ -47,19 +38,6 @@ def test_beams_flip_where_the_bias_says(bias):
     assert abs(hit[used].sum() - expected) < 4 * spread + 1
     certain = np.where(hit, chance[True], chance[False])[used]
     assert np.mean(certain > 0.5) > 0.95
-
-
-def test_faces_lie_on_the_board():
-    obs, truth, rig = draw(rng(0), 5, see_noise=0.0)
-    p_lrf = polar_to_points(obs.face_range - rig.range_offset, obs.face_bearing)
-    p = lrf_to_platform(p_lrf, obs.face_pitch, rig.T_head_lrf)
-    assert len(np.unique(obs.face_placement)) == 5
-    pose = truth.boards[obs.face_placement]
-    turned = (pose_transform(truth.head) * rig.T_head_lrf.inv()).apply(p)  # the truth is in the estimate's gauge
-    on_board = np.einsum("nji,nj->ni", pose[:, :, :3], turned - pose[:, :, 3])
-    assert np.abs(on_board[:, 2]).max() < 1e-9
-    inside = on_board[:, :2] @ rig.board.lines()[:, :2].T + rig.board.lines()[:, 2]
-    assert inside.max() < 0.5 * np.max(obs.beam_radius) + 1e-6
 
 
 def test_single_shots_and_images():

@@ -78,7 +78,7 @@ def near(degrees, tolerance=0.6):
 def halted(device):
     """Whether it stands, as soon as it has reacted; limits are too far away to be what stopped it."""
     device.clock.machine.sleep(0.1)
-    return not device.head.tilt.moving(device.clock.now())
+    return not device.head.moving(device.clock.now())
 
 
 def later(device, action, degrees=None):
@@ -305,7 +305,7 @@ def test_sweep_at_the_slowest_line(opened):
     device, head = opened(HeadSettings(settle_s=0.1), baudrate=2400, speeds=(2.0, 60.0), settle=0.1)
     head.start_sweep(30 * DEGREE)
     times, pitches, measured = zip(*head.finish_sweep(20), strict=True)
-    wrong = np.abs(device.head.tilt.motor(device.clock.device(times)) - pitches)
+    wrong = np.abs(device.head.motor(device.clock.device(times)) - pitches)
     assert sum(measured) >= 5 and pitches[-1] == near(30, 1.0)
     assert wrong.max() < 1.0 * DEGREE  # 30 deg/s and half of the query's 60 ms
 
@@ -349,7 +349,7 @@ def test_whatever_ends_a_move_stops_the_head(opened, monkeypatch, error):
 
     def fail(_):
         device.clock.machine.sleep(0.2)
-        moved.append(device.head.tilt.moving(device.clock.now()))
+        moved.append(device.head.moving(device.clock.now()))
         if moved[-1]:
             raise error
 
@@ -398,7 +398,7 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
 
         def becomes(moving):
             end = time.monotonic() + 30  # a guard against hanging; to its limit it takes much longer
-            while device.head.tilt.moving(device.clock.now()) != moving and time.monotonic() < end:
+            while device.head.moving(device.clock.now()) != moving and time.monotonic() < end:
                 time.sleep(0.01)
             return time.monotonic() < end
 

@@ -7,7 +7,7 @@ import scipy.io
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.model.camera import CameraModel, line_through
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.solvers import find_outlying_placements, solve_camera
+from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.lines import start_from_lines
 
 
@@ -53,9 +53,3 @@ def test_weighted_and_spatial_variants_stay_near(obs):
     some = obs.select(range(20))
     assert rms_px(some, solve_camera(some)) < 4.1
     assert rms_px(some, solve_camera(some, "wasielewski_strauss")) < 4.1
-
-
-def test_frame_21_is_flagged(obs):
-    report = find_outlying_placements(obs, "lines")
-    assert report.outlying == (21,)
-    assert report.rms[21] == report.rms.max()

@@ -62,7 +62,7 @@ class Program:
         finally:
             self.run.kill()
         time.sleep(0.2)
-        assert not self.rig.world.head.tilt.moving(self.rig.clock.now()) and "Traceback" not in err
+        assert not self.rig.world.head.moving(self.rig.clock.now()) and "Traceback" not in err
         return self.run.returncode, out, err.strip()
 
 

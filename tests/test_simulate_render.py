@@ -1,32 +1,25 @@
 """Rendered images: corners where the camera model puts them, and settings that cannot be."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.simulate import scene
 from lrfcal_lib.simulate.rig import printed_triangle
-from lrfcal_lib.simulate.scene import (
-    Exposure,
-    Imager,
-    Lights,
-    Thing,
-    World,
-    chessboard,
-    furnished_room,
-    plain,
-    polygon,
-    rectangle,
-)
+from lrfcal_lib.simulate.scene import Exposure, Imager, Lights, Thing, World, chessboard, plain, polygon
 
+HERE = RigidTransform.identity()
 LENS = CameraModel(512, 384, 800.0, 798.0, 258.0, 189.0, np.array([-0.21, 0.09, 0.0006, -0.0004, 0.0]))
 CLEAN = Exposure(read_noise=0.0, shot_noise=0.0, samples=5)
 LIGHT = Lights(np.array([[0.3, -1.0, -0.5]]), np.array([0.6]), 0.5)
 
 
 def sheet(size, albedo, by):
-    return Thing(rectangle(size, size), plain((albedo,) * 3), RigidTransform.from_translation(by))
+    return Thing(scene.rectangle(size, size), (plain, (albedo,) * 3), RigidTransform.from_translation(by))
 
 
 def board_pose(distance, turn, roll):
@@ -35,14 +28,14 @@ def board_pose(distance, turn, roll):
 
 
 def looking_at(board, pose):
-    front = Thing(polygon(board.corners), chessboard(board, 0.07, 0.75, 0.65), pose)
+    front = Thing(polygon(board.corners), (chessboard, board, 0.07, 0.75, 0.65), pose)
     return World([front, sheet(9, 0.5, [0, 0, 4.0])], LIGHT)
 
 
 @pytest.mark.parametrize(("distance", "turn", "roll"), [(0.9, 0, -135), (1.2, 30, 20), (1.6, -25, 100)])
 def test_chessboard_corners_reproject(distance, turn, roll):
     board, pose = printed_triangle(), board_pose(distance, turn, roll)
-    image = Imager(LENS, CLEAN).render(looking_at(board, pose), RigidTransform.identity(), np.random.default_rng(0))
+    image = Imager(LENS, CLEAN).render(looking_at(board, pose), HERE, np.random.default_rng(0))
     true = project(pose.apply(board.pattern.points()), LENS)
     window = max(2, int(0.3 * np.linalg.norm(true[1] - true[0])))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
@@ -55,8 +48,7 @@ def test_chessboard_corners_reproject(distance, turn, roll):
 def test_the_share_of_a_pixel_that_an_edge_covers():
     """Along a straight slanted edge the light changes exactly where the edge is, through the whole lens model."""
     board, pose = printed_triangle(), board_pose(1.0, 0, 8)
-    imager = Imager(LENS, CLEAN)
-    light = imager.light(looking_at(board, pose), RigidTransform.identity(), np.random.default_rng(0))[..., 1]
+    light = Imager(LENS, CLEAN).light(looking_at(board, pose), HERE, np.random.default_rng(0))[..., 1]
     ends = project(pose.apply([[0.03, 0.0, 0.0], [0.28, 0.0, 0.0]]), LENS)
     columns = np.arange(int(ends[:, 0].min()) + 2, int(ends[:, 0].max()) - 2)
     along = np.linspace(0.03, 0.28, 2000)
@@ -72,9 +64,8 @@ def test_the_share_of_a_pixel_that_an_edge_covers():
 
 
 def test_the_same_seed_makes_the_same_picture():
-    world, pose = looking_at(printed_triangle(), board_pose(1.0, 10, 0)), RigidTransform.identity()
-    imager = Imager(LENS)
-    first, again, other = (imager.render(world, pose, np.random.default_rng(s)) for s in (3, 3, 4))
+    world, imager = looking_at(printed_triangle(), board_pose(1.0, 10, 0)), Imager(LENS)
+    first, again, other = (imager.render(world, HERE, np.random.default_rng(s)) for s in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert np.any(first != other)
 
@@ -82,13 +73,12 @@ def test_the_same_seed_makes_the_same_picture():
 def test_automatic_exposure_and_noise():
     world = World([sheet(9, 0.5, [0, 0, 2.0])], Lights(np.zeros((0, 3)), np.zeros(0), 1.0))
     exposure = Exposure(vignetting=0.0, bright=200.0, gain=(10.0, 1000.0), read_noise=1.0, shot_noise=0.01)
-    image = Imager(LENS, exposure).render(world, RigidTransform.identity(), np.random.default_rng(0))
-    assert np.mean(image) == pytest.approx(200, abs=0.1)
-    assert np.std(image.astype(float)) == pytest.approx(np.sqrt(1 + 2 + 1 / 12), rel=0.02)
-    dark = Imager(LENS, Exposure(vignetting=0.0, bright=200.0, gain=(10.0, 100.0)))
-    assert np.mean(dark.render(world, RigidTransform.identity(), np.random.default_rng(0))) == pytest.approx(
-        50, abs=0.1
+    image, dark = (
+        Imager(LENS, e).render(world, HERE, np.random.default_rng(0)).astype(float)
+        for e in (exposure, replace(exposure, gain=(10.0, 100.0)))
     )
+    assert np.mean(image) == pytest.approx(200, abs=0.1) and np.mean(dark) == pytest.approx(50, abs=0.1)
+    assert np.std(image) == pytest.approx(np.sqrt(1 + 2 + 1 / 12), rel=0.02)
 
 
 def test_a_light_casts_shadows():
@@ -102,7 +92,7 @@ def test_a_light_casts_shadows():
 
 
 def test_a_camera_looks_out_of_the_window():
-    world = furnished_room()
+    world = scene.furnished_room()
     up = np.array([[3.1, 3.1, 0.3]]) / np.linalg.norm([3.1, 3.1, 0.3])
     hits = world.cast(np.zeros((1, 3)), up)
     assert np.isinf(hits.distance[0]) and world.radiance(np.zeros((1, 3)), up, hits).min() > 0.9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case, camera_observations, near_lines, random_board_poses, random_rig
+from synthetic import CORNERS, camera_case, camera_observations, numeric, random_board_poses, random_rig
 
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m
 from lrfcal_lib.model.camera import project
@@ -14,8 +14,6 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array,
 from lrfcal_lib.solvers import find_outlying_placements, planes, solve_camera
 from lrfcal_lib.solvers.planes import (
     board_whitener,
-    closed_form,
-    common_plane,
     compress,
     correct_and_compress,
     plane_block,
@@ -31,10 +29,9 @@ def test_closed_form_is_exact_on_exact_data(source):
     rig, obs = camera_case(1, source=source)
     sets = plane_sets(obs)
     triangles = compress(sets, 1.0)
-    assert common_plane(triangles)[1] == (source == "lrf")
-    found = pose_transform(closed_form(triangles, sets.boards, source == "platform"))
-    angle, distance = transform_difference(found, rig.T_camera_lrf)
-    assert angle < 1e-9 and distance < 1e-9
+    assert planes.common_plane(triangles)[1] == (source == "lrf")
+    found = pose_transform(planes.closed_form(triangles, sets.boards, source == "platform"))
+    assert max(transform_difference(found, rig.T_camera_lrf)) < 1e-9
 
 
 @pytest.mark.parametrize("count", [3, 4])
@@ -50,10 +47,8 @@ def test_compression_keeps_every_sum_of_squares():
     triangles = compress(sets, 1.0)
     for _ in range(5):
         T = rig.T_camera_lrf * RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
-        full = np.sum(plane_residuals_m(obs, T) ** 2)
-        assert np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2) == pytest.approx(
-            full, rel=1e-12
-        )
+        found = np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2)
+        assert found == pytest.approx(np.sum(plane_residuals_m(obs, T) ** 2), rel=1e-12)
 
 
 def test_plane_jacobians_against_numeric_ones():
@@ -61,13 +56,10 @@ def test_plane_jacobians_against_numeric_ones():
     sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
     triangles = compress(sets, 100.0)
     _, by_pose, by_board = plane_terms(pose, triangles, sets.boards)
-    for k, step in enumerate(1e-6 * np.eye(6)):
-        high, low = (plane_terms(move_pose(pose, s), triangles, sets.boards)[0] for s in (step, -step))
-        np.testing.assert_allclose(by_pose[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_pose).max())
-        high, low = (
-            plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0] for s in (step, -step)
-        )
-        np.testing.assert_allclose(by_board[..., k], (high - low) / 2e-6, atol=1e-6 * np.abs(by_board).max())
+    expected = numeric(lambda s: plane_terms(move_pose(pose, s), triangles, sets.boards)[0], 6)
+    np.testing.assert_allclose(by_pose, expected, atol=1e-6 * np.abs(by_pose).max())
+    expected = numeric(lambda s: plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0], 6)
+    np.testing.assert_allclose(by_board, expected, atol=1e-6 * np.abs(by_board).max())
 
 
 def test_correlated_weighting_equals_the_full_covariance():
@@ -90,38 +82,6 @@ def test_correlated_weighting_equals_the_full_covariance():
     assert compressed == pytest.approx(expected, rel=1e-3)
 
 
-def test_plain_least_squares_agrees_with_scipy():
-    rig, obs = camera_case(7, noise=1.0, source="platform")
-    start = pose_array(rig.T_camera_lrf)
-    theirs = scipy.optimize.least_squares(
-        lambda d: plane_residuals_m(obs, pose_transform(move_pose(start, d))),
-        np.zeros(6),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-    )
-    ours = solve_camera(obs, "zhang_pless", weighted=False)
-    np.testing.assert_allclose(pose_array(ours.transform), move_pose(start, theirs.x), atol=1e-7)
-    assert ours.n_observations == len(obs.plane_points)
-
-
-def test_predicted_covariance_in_many_trials():
-    rig, obs = camera_case(10, count=20, source="platform")
-    rng, trials = np.random.default_rng(11), 300
-    root = np.linalg.cholesky(obs.plane_covariance)
-    points = obs.plane_points + (root @ rng.normal(size=(trials, *obs.plane_points.shape, 1)))[..., 0]
-    moves = rng.normal(size=(trials, 20, 6)) * np.sqrt(np.diag(obs.board_covariance[0]))
-    poses = np.tile(obs.board_poses, (trials, 1, 1, 1))
-    poses[..., :3, :] = move_pose(poses[..., :3, :], moves)
-    many = replace(obs, plane_points=points, board_poses=poses)
-    found = solve_camera(many, "zhang_pless", rig.T_camera_lrf)
-    turn = found.transform.rotation * rig.T_camera_lrf.rotation.inv()
-    e = np.concatenate([turn.as_rotvec(), found.transform.translation - rig.T_camera_lrf.translation], axis=1)
-    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(found.covariance), e) / 6
-    assert 0.85 < nees.mean() < 1.15
-    assert np.abs(e.mean(axis=0) / (e.std(axis=0) / np.sqrt(trials))).max() < 4.5
-
-
 def test_robust_loss_resists_bad_board_poses():
     rig, obs = camera_case(12, count=16, noise=1.0)
     poses = obs.board_poses.copy()
@@ -130,7 +90,7 @@ def test_robust_loss_resists_bad_board_poses():
     plain = transform_difference(solve_camera(spoiled, "zhang_pless").transform, rig.T_camera_lrf)[1]
     robust = transform_difference(solve_camera(spoiled, "zhang_pless", loss="cauchy").transform, rig.T_camera_lrf)[1]
     assert robust < 0.03 < plain
-    assert set(find_outlying_placements(spoiled).outlying) == {3, 8}
+    assert set(find_outlying_placements(spoiled)[1]) == {3, 8}
 
 
 def test_joint_refinement_repairs_the_intrinsics():
@@ -224,21 +184,20 @@ def test_too_few_placements_are_refused():
 @pytest.mark.parametrize("seed", [1, 4])
 def test_single_lines_near_by_are_no_sweeps(seed):
     """36 lines at 0.4 to 0.9 m: 4 mm of noise are 4 % of their length, yet they leave the scan plane nowhere."""
-    rng = np.random.default_rng(100)
-    rig, obs = near_lines(np.random.default_rng(seed), 36)
+    rng, poses, corners = np.random.default_rng(seed), [], 0.5 * CORNERS
+    rig = random_rig(rng)
+    T = RigidTransform.from_rotation(Rotation.from_rotvec(rng.uniform(-1, 1, 3))) * rig.T_camera_lrf
+    for _ in range(36):
+        turn = Rotation.from_rotvec(rng.uniform(-0.35, 0.35, 3)) * Rotation.from_euler("x", 180, degrees=True)
+        centre = np.array([rng.uniform(-0.3, 0.3), 1.0, rng.uniform(-0.1, 0.1)]) * rng.uniform(0.4, 0.9)
+        poses.append(RigidTransform.from_components(T.apply(centre) - turn.apply([*corners.mean(axis=0), 0.0]), turn))
+    rig, rng = replace(rig, T_camera_lrf=T), np.random.default_rng(100)
+    obs = camera_observations(rng, rig, poses, corners=corners, noise=1.0, sigma=(0.004, 1e-3), pattern=False)
     halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(40)]
     for some in (obs, *halves):
         found, right = solve_camera(some, "zhang_pless"), solve_camera(some, "zhang_pless", rig.T_camera_lrf)
         assert transform_difference(found.transform, right.transform)[0] < 1e-6
-    assert len(find_outlying_placements(obs).inliers) == 36
-
-
-def test_lines_in_another_common_plane_of_the_source():
-    """Single shots of a head that was pitched and shifted, in the frame of its base."""
-    rig, obs = camera_case(22)
-    moved = replace(obs, plane_points=OFF.apply(obs.plane_points))
-    found = solve_camera(moved, "zhang_pless")
-    assert transform_difference(found.transform * OFF, rig.T_camera_lrf)[1] < 1e-9
+    assert len(find_outlying_placements(obs)[0]) == 36
 
 
 @pytest.mark.parametrize("source", ["lrf", "platform"])
@@ -251,11 +210,3 @@ def test_weights_never_hold_a_bad_start(seed, source):
     found = [solve_camera(obs, "zhang_pless", rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False)]
     rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in found]
     assert rms[0] < 1.3 * rms[1]
-
-
-@pytest.mark.parametrize(("count", "spread"), [(12, 1e-4), (2, 0.6)])
-def test_what_is_not_required_needs_no_start_value(count, spread):
-    _, obs = camera_case(17, spread=spread, source="platform")
-    few = obs.select(range(1, count + 1))
-    found = solve_camera(few, "zhang_pless", required=False)
-    assert found.unobservable and np.abs(plane_residuals_m(few, found.transform)).max() < 1e-3

@@ -1,5 +1,7 @@
 """Devices in virtual time: no time passes but what a test waits for, so that every run is the same and instant."""
 
+import numpy as np
+
 from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.emulators.head import EmulatedHead
 from lrfcal_lib.emulators.line import Clock
@@ -9,9 +11,18 @@ from lrfcal_lib.session.lms2xx_codec import Configuration, split_stream
 INDEXED = Configuration().changed(unit="mm", realtime_indices=True)
 
 
+class Source:
+    """Scans that are a cheap function of the mirror's turn: no two in a row alike, every range within 8 m."""
+
+    def scan(self, turn, quarters, times):
+        reasons = np.where((quarters + turn) % 97 == 0, 1 + turn % 2 * 3, 0)
+        return 1.0 + (quarters * 13 + turn * 37) % 6000 / 1000, reasons, np.full(2, np.nan)
+
+
 def lms(source=None, host=None, **options):
     """An emulated LMS2xx on a virtual host of its own, with its port."""
-    return EmulatedLms(source, path="lrf", clock=Clock(machine=host or VirtualHost()), **options).start()
+    clock = Clock(machine=host or VirtualHost())
+    return EmulatedLms(source or Source(), path="lrf", clock=clock, **options).start()
 
 
 def head(host=None, **options):
@@ -41,12 +52,16 @@ class Bench:
     now = property(lambda self: self.device.clock.now())
     heard = property(lambda self: bytes(byte for _, byte in self.out))
 
-    def send(self, raw, wait=1.0):
-        """What comes back within a while."""
+    def ask(self, raw):
+        """Send a request (bytes, or hexadecimal digits); what came before is forgotten."""
         self.port.baudrate = self.rate or self.device.baudrate
         self.port.reset_input_buffer()
         self.out.clear()
         self.port.write(bytes.fromhex(raw) if isinstance(raw, str) else raw)
+
+    def send(self, raw, wait=1.0):
+        """What comes back within a while."""
+        self.ask(raw)
         return self.run(wait)
 
     def run(self, wait):
@@ -55,12 +70,10 @@ class Bench:
         self.port.reset_input_buffer()
         return self.heard
 
-    def ask(self, raw, code, wait=1.0, tries=3):
-        """Send until a reply of that code comes, within a time each; one byte is read at a time."""
+    def reply(self, raw, code, wait=1.0, tries=3):
+        """Ask until a reply of that code comes, within a time each; one byte is read at a time."""
         for _ in range(tries):
-            self.port.baudrate = self.rate or self.device.baudrate
-            self.port.reset_input_buffer()
-            self.port.write(bytes.fromhex(raw) if isinstance(raw, str) else raw)
+            self.ask(raw)
             end = self.now + wait
             while self.now < end:
                 found = self.read(end - self.now)

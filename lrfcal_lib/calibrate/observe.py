@@ -10,15 +10,14 @@ from scipy.optimize import linear_sum_assignment
 from lrfcal_lib.calibrate.outline import as_recorded, cells_of, named_sides, outline_of, platform_of
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_source, tilt
-from lrfcal_lib.model.observations import CameraObservations, JointObservations
-from lrfcal_lib.preprocess import survey
+from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
-from lrfcal_lib.solvers.platform import PlatformObservations
 
 ONE_SCAN = "one_scan"
 CROSSINGS_PER_EDGE = 24  # neighbouring scan lines repeat each other's errors; a line in space needs few points
@@ -37,7 +36,7 @@ BEAMS |= {"hit": np.zeros(0, bool), "edge": WHOLE, "placement": WHOLE}
 VIEWS = {"camera": WHOLE, "pitch": NUMBER, "pose": np.zeros((0, 4, 4)), "covariance": np.zeros((0, 6, 6))}
 VIEWS |= {"placement": WHOLE, "lens": np.zeros((0, 6, 9))}
 EDGES = {"points": np.zeros((0, 3)), "covariance": np.zeros((0, 3, 3)), "pitch": NUMBER}
-EDGES |= {"placement": WHOLE, "edge": WHOLE}
+EDGES |= {"placement": WHOLE}
 
 
 def stack(prefix, parts, nothing=()):
@@ -46,7 +45,10 @@ def stack(prefix, parts, nothing=()):
     return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE):
+def observe(
+    prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
+    faces=FACE_POINTS,
+):
     """Pair what the LRF and one camera saw of the board.
 
     Parameters
@@ -61,8 +63,8 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
     correct : callable
         ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
-    crossings : int
-        Kept of each edge of a placement, evenly spread.
+    crossings, faces : int
+        Kept of each edge and of the face of a placement, evenly spread.
 
     Returns
     -------
@@ -83,10 +85,10 @@ def observe(prepared, camera, variant="half_step", T_head_lrf=None, correct=as_r
             continue
         turn = source_of(prepared, camera, placement, T_head_lrf, correct)
         if placement in posed:
-            points, pitch, covariance = face_points(scan, FACE_POINTS)
+            points, pitch, covariance = face_points(scan, faces)
             R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
             points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-            planes.append({"points": points, "covariance": covariance, "placement": number})
+            planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
         crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
     return CameraObservations(
         camera=camera,
@@ -146,6 +148,7 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         R, error = _rotation(turn, pitch), moved[:, :, None] * moved[:, None, :]  # of the recorded pitch
         yield {
             "points": turn(p_lrf, pitch),
+            "pitch": pitch,
             "covariance": R @ found.covariance[rows] @ R.swapaxes(-1, -2) + error,
             "noise": R @ found.noise[rows] @ R.swapaxes(-1, -2) + error,
             "half_step": (R @ found.half_step[rows][..., None])[..., 0],
@@ -198,11 +201,11 @@ def platform_observations(prepared, variant="half_step"):
         for number, (found, side) in enumerate(_perpendicular(prepared.edges[variant][placement], swept), 1):
             rows = thin(np.flatnonzero(found.side == side), PLATFORM_POINTS)
             points = {key: getattr(found, key)[rows] for key in ("points", "covariance", "pitch")}
-            edges.append(points | {"placement": np.full(len(rows), placement), "edge": np.full(len(rows), number)})
+            edges.append(points | {"placement": np.full(len(rows), placement), "number": np.full(len(rows), number)})
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
-    return PlatformObservations(**stack("", edges, EDGES), **stack("face_", faces))
+    return PlatformObservations(**stack("edge_", edges, EDGES | {"number": WHOLE}), **stack("face_", faces, EDGES))
 
 
 def _perpendicular(along, swept):
@@ -254,14 +257,13 @@ def rough_poses(prepared):
     for camera in prepared.views:
         obs = observe(prepared, camera)
         try:
-            judged = find_outlying_placements(obs, "planes")
-            rough[camera] = solve_camera(obs.select(judged.inliers), "zhang_pless").transform
+            inliers, outlying = find_outlying_placements(obs)
+            rough[camera] = solve_camera(obs.select(inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
             problems[f"camera {camera}"] = str(error)
             continue
-        for placement in judged.outlying:
-            miss = 1000 * judged.rms[judged.placements == placement][0]
-            problems[placement] = f"camera {camera}: its plane is {miss:.0f} mm rms off the scan; left out"
+        for placement, miss in outlying.items():
+            problems[placement] = f"camera {camera}: its plane is {1000 * miss:.0f} mm rms off the scan; left out"
     return rough, problems
 
 
@@ -291,20 +293,6 @@ def _angle_to_line(points, line):
     angle = float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
     length = np.ptp(points @ direction)
     return angle, float(np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / length))
-
-
-def all_views(prepared):
-    """The board in all images of a session, by camera, with the intrinsics and outline that are known by now.
-
-    Images of no placement are left out. Where every placement has one image these are the prepared views.
-    """
-    session = prepared.session
-    records = [r for r in session.images(purpose="board") if r.placement >= 0 and r.camera in prepared.views]
-    known = sum(len(found) for found in prepared.views.values())
-    if len(records) <= known or prepared.board.pattern is None:
-        return {camera: list(found.values()) for camera, found in prepared.views.items()}
-    options = {"picks": session.picks, "settled": prepared.views}  # sides of scans bear the names of that turn
-    return survey.survey(records, session.read_image, prepared.board, prepared.models, **options).views
 
 
 def observe_joint(prepared, views=None):

@@ -262,7 +262,7 @@ def side_block(rays, lines, middle, model):
     shift, _ = edge_shift(model.sensor["edge_log_odds"], rays["radius"], rays["background"])
     softness, radius = np.exp(model.sensor["edge_log_softness"]), np.where(rays["used"], rays["radius"], 1.0)
     sigma, _ = flip_sigma(softness, radius, rays["step"])
-    cost, score, information, _ = beam_terms(shift - u, sigma, rays["hit"], LAPSE)
+    cost, score, information = beam_terms(shift - u, sigma, rays["hit"], LAPSE)
     turned = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
     J = np.stack([factor, -factor * np.sum(turned * (rays["at"] - middle[:, None]), axis=-1)], axis=-1)
     root = np.sqrt(information) * rays["used"]

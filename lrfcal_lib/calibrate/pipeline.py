@@ -10,18 +10,17 @@ import numpy as np
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
-from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded, platform_of
+from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded
 from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
-from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import stereo_check
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
-from lrfcal_lib.solvers.pitch import SweepPoints, estimate_pitch_errors
+from lrfcal_lib.solvers.pitch import estimate_pitch_errors
 from lrfcal_lib.solvers.platform import solve_platform, solve_projected
 
 LAPSE = 0.01  # share of beams about an edge that something else than the edge decides
@@ -190,14 +189,10 @@ def find_pitch_errors(prepared):
     fixed = [c for c in prepared.views if session.cameras[c].mount == "platform"]
     if not fixed or not scans:
         return None
-    faces = [face_points(scan, PITCH_POINTS)[:2] for scan in scans.values()]
-    points, pitch = (np.concatenate(parts) for parts in zip(*faces, strict=True))
-    number = np.repeat(list(scans), [len(pitch) for _, pitch in faces])
     direction = {placement: session.sweep_direction(placement) for placement in scans}
     middle = {placement: float(np.mean(scan.sweep.pitch)) for placement, scan in scans.items()}
-    sweeps = SweepPoints(points, pitch, number, platform_of(prepared), direction, middle)
     with suppress(DegenerateGeometry):
-        return estimate_pitch_errors(sweeps, {c: observe(prepared, c) for c in fixed})
+        return estimate_pitch_errors({c: observe(prepared, c, faces=PITCH_POINTS) for c in fixed}, direction, middle)
 
 
 def pitch_noise(errors):

@@ -1,14 +1,12 @@
 """A Pelco-D pan-tilt head, as good or as bad as heads are; how it moves is known at every instant."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 
 import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import ANSWER, DOWN, SYNC, UP, encode_extended
+from lrfcal_lib.drivers.pelco_d import ANSWER, DOWN, FASTEST, SYNC, UP, encode_extended
 from lrfcal_lib.emulators.line import Clock, SerialDevice
 from lrfcal_lib.simulate.rig import Platform
 
@@ -24,109 +22,85 @@ FEEDBACK = ("full", "partial", "none")
 REPLIES = ("extended", "general", "five", "single", "none")
 
 
-class Axis:
-    """A motor that runs at constant speed to where it is told, or until it is stopped; angles are radians.
-
-    `pieces` are rows (instant from which it holds, from, to, rad/s). One thread writes them, any may look: a look sees
-    the table of before or of after.
-    """
-
-    def __init__(self, start, limits):
-        self.limits, self.pieces = limits, np.array([(-np.inf, start, start, 0.0)])
-
-    def run(self, instant, goal, speed):
-        """Run to an angle, at most to a limit, from an instant on."""
-        now, goal = float(self.motor(instant)), float(np.clip(goal, *self.limits))
-        self.pieces = noted(self.pieces, instant, now, goal, abs(speed) * np.sign(goal - now))
-
-    def stop(self, instant):
-        """Stop where it is; what rests already goes on resting."""
-        if self.moving(instant):
-            self.run(instant, float(self.motor(instant)), 0.0)
-
-    def motor(self, instant):
-        """Angle of the motor at one instant or many."""
-        instant = np.asarray(instant, float)
-        begun, first, last, speed = held(self.pieces, instant)
-        way = np.where(speed == 0, 0.0, speed * np.where(np.isfinite(begun), instant - begun, 0.0))
-        return np.where(speed >= 0, np.minimum(first + way, np.maximum(first, last)), np.maximum(first + way, last))
-
-    def resting(self, instant):
-        """Seconds since the motor came to rest, negative while it runs; and the speed it had."""
-        begun, first, last, speed = held(self.pieces, instant)
-        if speed != 0:
-            return float(instant - begun - abs((last - first) / speed)), float(speed)
-        return float(instant - begun), float(held(self.pieces, instant, back=1)[-1])
-
-    def moving(self, instant):
-        """Whether the motor runs, or is about to."""
-        return self.resting(instant)[0] < 0 or self.pieces[-1, 0] > instant
-
-
-def noted(table, instant, *row):
-    """Rows (instant, ...) with one more that holds from an instant on; it replaces rows of the future."""
-    return np.vstack([table[table[:, 0] <= instant][-KEPT:], (instant, *row)])
-
-
-def held(table, instant, back=0):
-    """Columns of the rows that hold at instants, or of those before."""
-    row = np.searchsorted(table[:, 0], instant, side="right") - 1 - back
-    return np.moveaxis(table[np.maximum(row, 0)], -1, 0)
-
-
 class Head:
     """Tilt of a head and the pitch that the sensors on it have; a Platform tells how well it is made.
 
-    The pitch at the start is in radians.
+    Its motor runs at constant speed to where it is told, or until it is stopped. The pitch at the start is in radians.
     """
 
     def __init__(self, platform=None, seed=0, pitch=0.0):
         self.platform, self.rng = platform or Platform(), np.random.default_rng([seed, 2])
-        self.tilt = Axis(pitch, self.platform.limits)
-        # where the head was within its play when each command came, before the motor may have turned back
-        self._heads = np.array([(-np.inf, (1 + self.platform.stretch) * pitch)])
+        self.limits = self.platform.limits
+        # rows: instant from which it holds, motor from, to, rad/s, and where the head was within its play when the
+        # command came. One thread writes them, any may look: a look sees the table of before or of after.
+        self._pieces = np.array([(-np.inf, pitch, pitch, 0.0, (1 + self.platform.stretch) * pitch)])
 
     def move(self, instant, goal, speed):
-        """Tilt towards an angle at a speed, radians; the motor reacts a little later."""
-        instant += REACT_S
-        self._heads = noted(self._heads, instant, self._dragged(instant))
-        self.tilt.run(instant, goal, speed)
+        """Tilt towards an angle, at most to a limit, at a speed, radians; the motor reacts a little later."""
+        self._run(instant + REACT_S, goal, speed)
+
+    def _run(self, instant, goal, speed):
+        now, goal = float(self.motor(instant)), float(np.clip(goal, *self.limits))
+        piece = instant, now, goal, abs(speed) * np.sign(goal - now), float(self._dragged(instant))
+        self._pieces = np.vstack([self._pieces[self._pieces[:, 0] <= instant][-KEPT:], piece])
 
     def go(self, instant, goal, speed):
         """Tilt to an angle, missed by the noise of the platform."""
         self.move(instant, goal + self.platform.noise * self.rng.standard_normal(), speed)
 
     def stop(self, instant):
-        """Stop tilting."""
-        instant += REACT_S
-        self._heads = noted(self._heads, instant, self._dragged(instant))
-        self.tilt.stop(instant)
+        """Stop tilting; what rests already goes on resting."""
+        if self.moving(instant + REACT_S):
+            self._run(instant + REACT_S, self.motor(instant + REACT_S), 0.0)
+
+    def motor(self, instant):
+        """Angle of the motor at one instant or many."""
+        begun, first, last, speed, _ = self._held(instant)
+        way = np.where(speed == 0, 0.0, speed * np.where(np.isfinite(begun), instant - begun, 0.0))
+        return np.clip(first + way, np.minimum(first, last), np.maximum(first, last))
+
+    def resting(self, instant):
+        """Seconds since the motor came to rest, negative while it runs; and the speed it had."""
+        begun, first, last, speed, _ = self._held(instant)
+        if speed != 0:
+            return float(instant - begun - abs((last - first) / speed)), float(speed)
+        return float(instant - begun), float(self._held(instant, back=1)[3])
+
+    def moving(self, instant):
+        """Whether the motor runs, or is about to."""
+        return self.resting(instant)[0] < 0 or self._pieces[-1, 0] > instant
+
+    def settled(self, instant):
+        """Whether the head is at rest, its wobble included."""
+        return not self.moving(instant) and self.resting(instant)[0] >= self.platform.settle
 
     def pitch(self, instant):
         """True pitch at one instant or many, radians; after a stop it wobbles until it has settled."""
         instant, settle = np.asarray(instant, float), self.platform.settle
-        since, speed = self.tilt.resting(float(np.max(instant)))
+        since, speed = self.resting(float(np.max(instant)))
         if not 0 < since < settle + np.ptp(instant) or not settle:
             return self._dragged(instant) + 0.0
         after = np.clip(since - (np.max(instant) - instant), 0, None)
         swing = WOBBLE * speed * np.exp(-5 * after / settle) * np.sin(2 * np.pi * WOBBLE_HZ * after)
         return self._dragged(instant) + np.where(after < settle, swing, 0.0)
 
+    def measured(self, instant):
+        """What the encoder says, radians; it sits on the motor and is late."""
+        angle, step = self.motor(instant - self.platform.latency), self.platform.encoder_step
+        return float(np.rint(angle / step) * step if step else angle)
+
+    def _held(self, instant, back=0):
+        """Columns of the pieces of motion that hold at instants, or of those before."""
+        pieces = self._pieces
+        row = np.searchsorted(pieces[:, 0], instant, side="right") - 1 - back
+        return np.moveaxis(pieces[np.maximum(row, 0)], -1, 0)
+
     def _dragged(self, instant):
         """The gear drags the head along only when it has run through its play: within a piece of motion, which goes
         one way, the head stays where it was until the motor is half the play ahead of it.
         """
-        half, motor = self.platform.backlash / 2, (1 + self.platform.stretch) * self.tilt.motor(instant)
-        return np.clip(held(self._heads, instant)[1], motor - half, motor + half)
-
-    def measured(self, instant):
-        """What the encoder says, radians; it sits on the motor and is late."""
-        angle, step = self.tilt.motor(instant - self.platform.latency), self.platform.encoder_step
-        return float(np.rint(angle / step) * step if step else angle)
-
-    def settled(self, instant):
-        """Whether the head is at rest, its wobble included."""
-        return not self.tilt.moving(instant) and self.tilt.resting(instant)[0] >= self.platform.settle
+        half, motor = self.platform.backlash / 2, (1 + self.platform.stretch) * self.motor(instant)
+        return np.clip(self._held(instant)[4], motor - half, motor + half)
 
 
 class EmulatedHead(SerialDevice):
@@ -199,15 +173,14 @@ class EmulatedHead(SerialDevice):
                 self._stop(at)
             elif not self.faults.hit("stall"):
                 self._absolute_until = -math.inf
-                speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, 0x3F) / 0x3F
+                speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, FASTEST) / FASTEST
                 head.move(at, way * math.tau, speed)
         elif frame.command2 == pelco_d.SET_TILT and self.feedback == "full" and frame.value < pelco_d.TURN:
             if at >= self._absolute_until and not self.faults.hit("stall"):  # a second absolute move is lost
-                goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.tilt.limits))
-                self._absolute_until = at + abs(goal - float(head.tilt.motor(at))) / self.go_speed
+                goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.limits))
+                self._absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
                 head.go(at, goal, self.go_speed)
-        body = bytes([frame.address, frame.command1, frame.command2, frame.data1, frame.data2])
-        answers = {"general": bytes([SYNC, self.address, 0, sum(body) % 256]), "single": b"\x01"}
+        answers = {"general": bytes([SYNC, self.address, 0, sum(vars(frame).values()) % 256]), "single": b"\x01"}
         if self.reply_kind in answers:
             self.reply("confirm", answers[self.reply_kind], at + TURN_AROUND_S)
 
@@ -217,7 +190,7 @@ class EmulatedHead(SerialDevice):
 
     def _tell(self, opcode, at):
         """Answer a query, unless the head is too busy or does not know how."""
-        busy = at < self._absolute_until or (self.feedback == "partial" and self.head.tilt.moving(at))
+        busy = at < self._absolute_until or (self.feedback == "partial" and self.head.moving(at))
         if self.reply_kind == "none" or busy or self.faults.hit("mute"):
             return
         tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at)) if opcode == pelco_d.QUERY_TILT else 0

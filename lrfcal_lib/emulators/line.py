@@ -4,8 +4,6 @@ The port is a pseudo-terminal served by a thread, whose rate is read at the mast
 on a real line; or, on a VirtualHost, a buffer in memory, and the device goes on while the driver waits.
 """
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import itertools
@@ -63,19 +61,12 @@ class Fault(NamedTuple):
     change: object = None
 
 
-def _drop(d, i, _):
-    return d[:i] + d[i + 1 :]
-
-
-def _flip(d, i, rng):
-    return d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]
-
-
 BOTH, LMS, HEAD = ("lrf", "head"), ("lrf",), ("head",)
 FAULTS = {
     # on the bytes of a reply
-    "drop": Fault(BOTH, "a byte of a reply is lost", _drop),
-    "flip": Fault(BOTH, "a bit of a reply is inverted", _flip),
+    "drop": Fault(BOTH, "a byte of a reply is lost", lambda d, i, _: d[:i] + d[i + 1 :]),
+    "flip": Fault(BOTH, "a bit of a reply is inverted",
+                  lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
     "duplicate": Fault(BOTH, "a byte of a reply comes twice", lambda d, i, _: d[: i + 1] + d[i:]),
     "insert": Fault(BOTH, "a byte appears within a reply", lambda d, i, rng: d[: i + 1] + rng.bytes(1) + d[i + 1 :]),
     "swap": Fault(BOTH, "two neighbouring, different bytes of a reply change places",
@@ -98,9 +89,9 @@ FAULTS = {
     "twice": Fault(BOTH, "a reply is sent twice"),
     "stale": Fault(BOTH, "the previous reply of the same kind is sent in place of the present one"),
     # on the line
-    "request_drop": Fault(BOTH, "a byte that the host sends is lost", _drop),
-    "request_flip": Fault(BOTH, "a bit that the host sends is inverted", _flip),
-    "deaf": Fault(BOTH, "what the host sends does not arrive", lambda *_: b""),
+    "request_drop": Fault(BOTH, "a byte that the host sends is lost"),
+    "request_flip": Fault(BOTH, "a bit that the host sends is inverted"),
+    "deaf": Fault(BOTH, "what the host sends does not arrive"),
     "echo": Fault(BOTH, "what the host sends comes back to it first, as on two-wire RS-485"),
     "unplug": Fault(BOTH, "the port vanishes and comes back at the same path (after 0.5 s unless told otherwise)"),
     # in the laser range finder
@@ -119,8 +110,8 @@ FAULTS = {
     "slip": Fault(HEAD, "the head runs on for 0.3 s after a stop"),
     "jump": Fault(HEAD, "a position reply with a sound checksum is wrong by 10 deg"),
 }  # fmt: skip
-REQUEST = ("request_drop", "request_flip", "deaf")
-REPLY = tuple(name for name, fault in FAULTS.items() if fault.change and name not in REQUEST)
+REPLY = {name: fault.change for name, fault in FAULTS.items() if fault.change}
+REQUEST = {"request_drop": REPLY["drop"], "request_flip": REPLY["flip"], "deaf": lambda *_: b""}
 
 
 class Faults:
@@ -145,8 +136,8 @@ class Faults:
             raise ValueError(f"no fault '{name}' of device '{self.device}'; there are {known}")
         with self._lock:
             if name == "unplug":
-                self.away_s = AWAY_S if seconds is None else seconds
-            if name == "unplug" or seconds is None:
+                self.away_s, seconds = AWAY_S if seconds is None else seconds, None
+            if seconds is None:
                 self._times[name] += count
             else:
                 self._until[name] = self._now() + seconds
@@ -172,11 +163,11 @@ class Faults:
             self.counts.update([name] * bool(hit))
             return hit
 
-    def mangle(self, data, names=REPLY):
+    def mangle(self, data, changes=REPLY):
         """Bytes as they are after those of the faults that hit them; each changes something where it can."""
-        for name in names:
+        for name, change in changes.items():
             if data and self.hit(name):
-                tries = (FAULTS[name].change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
+                tries = (change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
                 data = next((changed for changed in tries if changed != data), data)
         return data
 
@@ -245,14 +236,11 @@ class SerialDevice:
         self.port.start()
         return self
 
-    def close(self):
+    def close(self, *_):
         """Remove the port."""
         self.port.close()
 
-    __enter__ = start
-
-    def __exit__(self, *_):
-        self.close()
+    __enter__, __exit__ = start, close
 
     def at(self, instant, action, tag=None):
         """Call ``action(instant)`` when its time has come."""

@@ -1,7 +1,5 @@
 """A SICK LMS2xx: the commands that our driver, sicktoolbox and CARMEN send, their times, its mirror and its streams."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections import deque
@@ -13,6 +11,7 @@ import numpy as np
 from lrfcal_lib.emulators.line import Clock, SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import UNITS, Configuration, encode_telegram
+from lrfcal_lib.simulate.beam import MIRROR_TURN, VARIANTS
 
 LOG = logging.getLogger(__name__)
 ACK, NAK = b"\x06", b"\x15"
@@ -26,10 +25,8 @@ GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 BURST = 508  # bytes that leave in one turn of the mirror at 500000 Bd
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 LATE_S = 1.0, 0.1  # a stream that lags so far leaves scans out: no host can know how late they are; once it did
-TURN_S = 1 / 75.08  # of the mirror, as 148 us for a ninetieth tells
 POWERED_S = 60.0  # how long ago it was switched on
 KEPT = 20000  # scans and requests on record
-VARIANTS = ((100, 100), (100, 50), (100, 25), (180, 100), (180, 50))  # degrees, 1/100 degree
 BAUD_WORD = {rate: word for word, rate in codec.BAUD.items()}
 BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
 INSTALLATION, DIAGNOSIS, STREAM, REQUEST, INTERLACED = 0x00, 0x10, 0x24, 0x25, 0x2A  # operating modes
@@ -52,20 +49,6 @@ class ScanRecord:
     partial: int  # 0 to 3 for the quarters of interlaced scans, -1 for whole ones
     words: np.ndarray  # (B,) of uint16, all values of the scan, as the device counts them
     telegram: bytes  # before any fault
-
-
-class SyntheticSource:
-    """Scans that are a cheap function of the mirror's turn: no two in a row alike, every range within 8 m."""
-
-    def scan(self, turn, quarters, times):
-        """Readings of a scan: of the mirror's first turn, bearings (B,) in quarters of a degree, seconds of every beam.
-
-        Ranges (B,) in metres, index into `REASONS` (B,; 0 for a range), and the pitch (2,) of the head at the earliest
-        and the latest beam, NaN here.
-        """
-        ranges = 1.0 + (quarters * 13 + turn * 37) % 6000 / 1000
-        reasons = np.where((quarters + turn) % 97 == 0, 1 + turn % 2 * 3, 0)
-        return ranges, reasons, np.full(2, np.nan)
 
 
 @dataclass
@@ -116,16 +99,15 @@ class Memory:
 
 
 class EmulatedLms(SerialDevice):
-    """An LMS2xx, which looks at a source of scans such as :class:`SyntheticSource`, the default.
+    """An LMS2xx, which looks at a source of scans.
 
     Parameters
     ----------
-    source : object, optional
+    source : object
+        Has ``scan(turn, quarters, times)``, see :meth:`.world.EmulatedWorld.scan`.
     path : path-like
         Of the port to appear.
     seed : int
-    time_scale : float
-        Seconds of the device in a second of the host; ignored where a clock is given.
     clock : Clock, optional
     boot_s : float
         From a restart to the power-on string; a real device takes up to 60 s.
@@ -144,16 +126,15 @@ class EmulatedLms(SerialDevice):
         Scans counted since power-on.
     left_out : int
         Times that a stream left scans out, as this machine is too slow to cast them in time: a moving head needs
-        some 20 ms of its processor for a scan, and `time_scale` shortens the time between two.
+        some 20 ms of its processor for a scan, and a clock that runs fast shortens the time between two.
     """
 
     baudrate = property(lambda self: self.memory.baudrate, doc="Of the device now.")
     streaming = property(lambda self: self.memory.mode in (STREAM, INTERLACED), doc="Whether scans come by themselves.")
 
-    def __init__(self, source=None, *, path, seed=0, time_scale=1.0, clock=None, boot_s=2.0, baudrates=(*BAUD_WORD,),
-                 **settings):  # fmt: skip
-        super().__init__("lrf", path, clock or Clock(time_scale), seed)
-        self.memory, self.source = Memory(**settings), source or SyntheticSource()
+    def __init__(self, source, *, path, seed=0, clock=None, boot_s=2.0, baudrates=(*BAUD_WORD,), **settings):
+        super().__init__("lrf", path, clock or Clock(), seed)
+        self.memory, self.source = Memory(**settings), source
         self.boot_s, self.baudrates, self.rng = boot_s, baudrates, np.random.default_rng([seed, 1])
         self.scans, self.requests, self.telegrams, self.left_out = deque(maxlen=KEPT), deque(maxlen=KEPT), 0, 0
         self._buffer, self._turn, self._partial, self._number, self._effect = b"", 0, 0, 0, None
@@ -228,7 +209,7 @@ class EmulatedLms(SerialDevice):
             if BAUD_COMMAND[mode] not in self.baudrates:
                 return self._answer(at, 0xA0, FAULT)
             return self._answer(at, 0xA0, DONE, lambda _: setattr(memory, "baudrate", BAUD_COMMAND[mode]))
-        if (mode, len(data)) not in {(INSTALLATION, 9), *((m, 1) for m in (DIAGNOSIS, STREAM, REQUEST, INTERLACED))}:
+        if len(data) != {INSTALLATION: 9, DIAGNOSIS: 1, STREAM: 1, REQUEST: 1, INTERLACED: 1}.get(mode):
             return self._answer(at, 0x92)
         if mode == INSTALLATION and data[1:] != memory.password:
             return self._answer(at, 0xA0, WRONG)
@@ -288,25 +269,20 @@ class EmulatedLms(SerialDevice):
 
     # ------------------------------------------------------------------------------------------- scans
 
-    @property
-    def _turns(self):
-        """Turns of the mirror for a scan of the stream."""
-        return 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1]
-
     def _turn_of(self, instant, turns, rounded):
         """First turn of the scan that is being measured (math.floor), or of the next one (math.ceil)."""
-        return rounded((instant - self._zero) / TURN_S / turns) * turns
+        return rounded((instant - self._zero) / MIRROR_TURN / turns) * turns
 
     def _measure(self, turn, partial, send, tag):
         """Send the scan that begins at a turn at its end; it is cast a little ahead, which may take a while."""
         angle, step = self.memory.variant
         turns = 1 if partial >= 0 else 100 // step
-        end = self._zero + (turn + turns) * TURN_S
+        end = self._zero + (turn + turns) * MIRROR_TURN
 
         def ahead(_):
             """Cast the scan, and send it at its end."""
             quarters = codec.scan_quarters(181 - (partial > 0) if partial >= 0 else angle * 100 // step + 1, partial)
-            times = self._zero + (turn + np.arange(len(quarters)) % turns + quarters / 1440) * TURN_S
+            times = self._zero + (turn + np.arange(len(quarters)) % turns + quarters / 1440) * MIRROR_TURN
             ranges, reasons, pitch = self.source.scan(turn, quarters, times)
             c, times = self.memory.configuration, self.clock.host(times)
             words = codec.encode_values(ranges, unit=c.unit, mode=c.measuring_mode, reasons=reasons)
@@ -322,12 +298,15 @@ class EmulatedLms(SerialDevice):
                            indices=indices if c.realtime_indices else None)  # fmt: skip
         self.scans.append(replace(scan, number=self._number, telegram_index=self.telegrams % 256, telegram=raw))
         self.telegrams, self._number = self.telegrams + 1, self._number + 1
-        self.reply(codec.SCAN, raw, at, then, BURST if self.memory.baudrate == 500000 else None, TURN_S)
+        self.reply(codec.SCAN, raw, at, then, BURST if self.memory.baudrate == 500000 else None, MIRROR_TURN)
+
+    _turns = property(lambda self: 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1],
+                      doc="Turns of the mirror for a scan of the stream.")  # fmt: skip
 
     def _plan(self):
         """Measure the next scan of the stream; of one that lags, some are left out: the indices show the gap."""
         turns = self._turns
-        late = self.clock.now() - self._zero - (self._turn + turns) * TURN_S
+        late = self.clock.now() - self._zero - (self._turn + turns) * MIRROR_TURN
         if late > LATE_S[self.left_out > 0]:
             if not self.left_out:
                 LOG.warning("%s: this machine casts scans too slowly for time_scale %g: %.1f s of them are left out; "
@@ -349,5 +328,5 @@ class EmulatedLms(SerialDevice):
         else:
             self._emit(scan, at)
         size = 2 * len(scan.words) + 10 + 2 * self.memory.configuration.realtime_indices
-        self._turn += math.ceil(size * self.byte_s / (self._turns * TURN_S)) * self._turns
+        self._turn += math.ceil(size * self.byte_s / (self._turns * MIRROR_TURN)) * self._turns
         self._plan()

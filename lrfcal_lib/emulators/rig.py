@@ -4,8 +4,6 @@ A line to the socket is a command with its arguments, ``place 3``; in JSON ``{"c
 Every line is answered by one line of JSON, ``{"ok": true, ...}`` or ``{"ok": false, "error": "..."}``.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json
@@ -24,13 +22,11 @@ from lrfcal_lib.drivers.rig import host_clock
 from lrfcal_lib.emulators.head import FEEDBACK, REPLIES, EmulatedHead
 from lrfcal_lib.emulators.line import FAULTS, Clock
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
-from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
+from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, Serving, scaled
 from lrfcal_lib.session import stated
-from lrfcal_lib.simulate.beam import LARGEST_WORD
 from lrfcal_lib.simulate.rig import PLACES, SETUPS, pairs, random, sim_quick
 
 SILENCE_S = 600.0  # that says nothing about an emulated camera: it sends no image while the head moves
-FIRMWARE = {"LMS200": "V02.19 ", "LMS211": "X01.27 ", "LMS221": "X01.27 "}
 LONGEST_LINE = 4096
 LOOK_S = 0.5
 PRACTICE = "practice"
@@ -89,17 +85,18 @@ class EmulatedRig:
         own = None if folder else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(folder or self._closing.enter_context(own))
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.world = EmulatedWorld(setup, self.clock, seed, placements)
-        shared, kind = {"clock": self.clock, "seed": seed}, rig.beam.name.split("-")[0]
-        model = model or f"{kind};302063;{FIRMWARE[kind]}"
-        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", model=model, **shared)
+        self.world, shared = EmulatedWorld(setup, self.clock, seed, placements), {"clock": self.clock, "seed": seed}
+        self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared, **({"model": model} if model else {}))
         self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
         self.faults, self.scans = {"lrf": self.lrf.faults, "head": self.pan_tilt.faults}, self.lrf.scans
         self.control = str(self.folder / "control")
+        control = _ControlServer(self.control, type("Handler", (_Obedient,), {"rig": self}))
         self.camera_server = CameraServer(self.world, self.setup, seed=seed, rest_s=rest_s) if cameras else None
         self.camera_urls = self.camera_server.urls if cameras else {}
-        self._parts = [self.lrf, self.pan_tilt, *([self.camera_server] if cameras else []),
-                       ControlSocket(self.control, self)]  # fmt: skip
+        self._closing.callback(Path(self.control).unlink, missing_ok=True)
+        self._parts = [self.lrf, self.pan_tilt, *([self.camera_server] if cameras else []), Serving(control)]
+        for part in self._parts:
+            self._closing.callback(part.close)
 
     def start(self):
         """Let all devices appear."""
@@ -107,16 +104,11 @@ class EmulatedRig:
             part.start()
         return self
 
-    def close(self):
+    def close(self, *_):
         """Remove all devices, and the folder where it was made here."""
-        with self._closing:
-            for part in reversed(self._parts):
-                part.close()
+        self._closing.close()
 
-    __enter__ = start
-
-    def __exit__(self, *_):
-        self.close()
+    __enter__, __exit__ = start, close
 
     def pitch(self, time_s=None):
         """True pitch now, or at instants of the host's clock (time.time()), radians."""
@@ -143,10 +135,8 @@ class EmulatedRig:
         for p in self.world.placements.values():
             board = p.T_platform_board is not None
             step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
-            first, last = np.degrees(p.sweep).round(4).tolist()
-            images = np.degrees(p.image_pitch).round(4).tolist()
-            each.append({"number": p.number, "board": board, "pitch_deg": [first, last, step],
-                         "image_pitch_deg": images})  # fmt: skip
+            sweep, images = (np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch))
+            each.append({"number": p.number, "board": board, "pitch_deg": [*sweep, step], "image_pitch_deg": images})
         boards = [p for p in each if p["board"]] or each
         ends = np.array([p["pitch_deg"][:2] for p in boards])
         return {
@@ -161,29 +151,22 @@ class EmulatedRig:
     def rig_file(self):
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
         rig, setup, head = self.setup.rig, self.setup, self.pan_tilt
-        beam, bearings, limits = rig.beam, rig.beam.bearings(), np.degrees(rig.platform.limits).round(6).tolist()
-        lrf = stated.LrfInfo(
-            f"{beam.name} (emulated)", (float(bearings[0]), float(bearings[-1])), math.radians(beam.resolution / 100),
-            beam.sigma_range, range_resolution=beam.unit, max_range=LARGEST_WORD * beam.unit,
-            spot_exit=beam.spot_exit, spot_divergence=beam.divergence,
-        )  # fmt: skip
-        cameras = [c for c in rig.cameras if c.name in self.camera_urls]
-        infos = [stated.CameraInfo(c.name, c.mount, c.model.width, c.model.height, None, c.guess) for c in cameras]
+        cameras = {c.name: c for c in rig.camera_infos()} if self.camera_urls else {}
         return {
             "schema": stated.SCHEMA, "name": f"{setup.name}_emulated", "licence": "CC-BY-4.0", "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
             "board": stated.board_to_json(rig.board),
-            "rig": {"lrf": stated.lrf_to_json(lrf),
+            "rig": {"lrf": stated.lrf_to_json(rig.beam.info("emulated")),
                     "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
-                    "cameras": {c.name: stated.camera_to_json(c) for c in infos}},
+                    "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()}},
             "devices": {
-                "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False,
-                        "variant": [beam.field_of_view, beam.resolution / 100],
-                        "unit": "mm" if beam.unit < 0.005 else "cm"},
+                "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False, "unit": rig.beam.unit_name,
+                        "variant": [rig.beam.field_of_view, rig.beam.resolution / 100]},
                 "head": {"port": head.path, "address": head.address, "baudrate": head.baudrate,
-                         "feedback": head.reply_kind != "none", "pitch_limits_deg": limits},
-                "cameras": {c.name: {"source": self.camera_urls[c.name], "silence_s": SILENCE_S,
-                                     "size": [c.width, c.height]} for c in infos},
+                         "feedback": head.reply_kind != "none",
+                         "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist()},
+                "cameras": {name: {"source": self.camera_urls[name], "silence_s": SILENCE_S,
+                                   "size": [c.width, c.height]} for name, c in cameras.items()},
                 "control": self.control,
             },
             "plan": self.plan(),
@@ -234,33 +217,17 @@ def obey(rig, line):
         return {"ok": False, "error": f"{error}"}
 
 
-class ControlSocket(socketserver.ThreadingUnixStreamServer):
-    """Serves the commands on a Unix socket."""
-
+class _ControlServer(socketserver.ThreadingUnixStreamServer):
     daemon_threads, block_on_close = True, False
-
-    def __init__(self, path, rig):
-        super().__init__(path, _Obedient)
-        self.rig, self._serving = rig, threading.Thread(target=self.serve_forever, args=(0.2,), daemon=True)
-
-    def start(self):
-        """Serve in a thread."""
-        self._serving.start()
-
-    def close(self):
-        """Remove the socket."""
-        if self._serving.is_alive():
-            self.shutdown()
-        self.server_close()
-        Path(self.server_address).unlink(missing_ok=True)
 
 
 class _Obedient(socketserver.StreamRequestHandler):
+    """Serves the commands to a program."""
+
     def handle(self):
         with contextlib.suppress(ConnectionError):
             while line := self.rfile.readline(LONGEST_LINE):
-                answer = obey(self.server.rig, line.decode(errors="replace"))
-                self.wfile.write(json.dumps(answer).encode() + b"\n")
+                self.wfile.write(json.dumps(obey(self.rig, line.decode(errors="replace"))).encode() + b"\n")
 
 
 def practice_setup():

@@ -4,8 +4,6 @@ A process of its own draws the images, so that the serial devices keep their tim
 while it does none is sent, and one that was begun before a move is not sent after it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging
@@ -14,7 +12,7 @@ import os
 import signal
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -27,14 +25,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.session.stated import board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.simulate import beam as lrf
-from lrfcal_lib.simulate.record import VIEWS, world_of
-from lrfcal_lib.simulate.rig import held_close, placements_of, random, room_placement
+from lrfcal_lib.simulate.record import close_views, world_of
+from lrfcal_lib.simulate.rig import placements_of
 from lrfcal_lib.simulate.scene import Imager
 
 LOG = logging.getLogger(__name__)
-DAZZLED, NOT_VALID, WEAK = 2, 1, 4  # index into lms2xx.REASONS
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
 QUALITY = 97  # of JPEG
@@ -53,19 +50,15 @@ class Place:
 class EmulatedWorld:
     """The world of a simulated setup at the present; the source of the scans of :class:`EmulatedLms`.
 
-    `placements` are where the board can be put; by default those of the setup, with the sweep of the room last.
+    `placements` are where the board can be put; by default those of the setup.
     """
 
     place = property(lambda self: self._scene[0], doc="Where the board is.")
 
     def __init__(self, setup, clock, seed=0, placements=None):
-        self.setup, self.clock = setup, clock
-        if placements is None:
-            bare = room_placement(setup)
-            placements = [*placements_of(setup), *([] if bare is None else [bare])]
-        self.placements = {p.number: p for p in placements}
-        self.head = Head(setup.rig.platform, seed)
-        self._rng, self._still, self._close = np.random.default_rng([seed, 3]), (None, None), {}
+        self.setup, self.clock, self.head = setup, clock, Head(setup.rig.platform, seed)
+        self.placements = {p.number: p for p in placements or placements_of(setup)}
+        self._rng, self._still = np.random.default_rng([seed, 3]), (None, None)
         self.put(None)
 
     def put(self, number):
@@ -78,48 +71,48 @@ class EmulatedWorld:
 
     def hold_close(self, camera, view):
         """Hold the board close to a camera, in one of the views for its intrinsics, counted from 0 (ValueError)."""
-        rig, names, count = self.setup.rig, [c.name for c in self.setup.rig.cameras], self.setup.intrinsics_views
+        names, count = [c.name for c in self.setup.rig.cameras], self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
             raise ValueError(f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of {', '.join(names)}")
-        if camera not in self._close:  # as the simulator takes them, the head at pitch 0
-            number = names.index(camera)
-            poses = held_close(rig, rig.cameras[number], count, random(self.setup, VIEWS, number))
-            still = rig.camera_pose(rig.cameras[number], 0.0).inv()
-            self._close[camera] = [still * pose for pose in poses]
-        self._set(Place(("close", camera, view), self._close[camera][view], stand=False))
+        pose = close_views(self.setup, names.index(camera))[view]
+        self._set(Place(("close", camera, view), pose, stand=False))
 
     def _set(self, place):
         self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
 
     def scan(self, turn, quarters, times):
-        """Readings of the laser range finder; see :meth:`SyntheticSource.scan`."""
-        (place, world), rig, beam = self._scene, self.setup.rig, self.setup.rig.beam
+        """Readings of a scan of the laser range finder.
+
+        Parameters
+        ----------
+        turn : int
+            Of the mirror, the first of the scan.
+        quarters : ndarray of int, shape (B,)
+            Bearings in quarters of a degree.
+        times : ndarray, shape (B,)
+            Of every beam, seconds of the devices.
+
+        Returns
+        -------
+        ranges, reasons : ndarray, shape (B,)
+            Metres; index into `REASONS`, 0 for a range.
+        pitch : ndarray, shape (2,)
+            Of the head at the earliest and the latest beam, radians.
+        """
+        (place, world), rig = self._scene, self.setup.rig
         pitch, key = np.broadcast_to(self.head.pitch(times), times.shape), None
         if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
             key = place.key, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
         if key is None or self._still[0] != key:
-            self._still = key, lrf.ideal_readings(beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
-        reading, total, dazzled = self._still[1]
-        ranges = reading + beam.systematic + beam.sigma_range * self._rng.standard_normal(len(reading))
-        reasons = np.where(np.isfinite(reading), 0, np.where(total > 0, WEAK, NOT_VALID))
-        ends = pitch[[np.argmin(times), np.argmax(times)]]
-        return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons), ends
+            self._still = key, lrf.ideal_readings(rig.beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
+        return *lrf.measured(rig.beam, *self._still[1], self._rng), pitch[[np.argmin(times), np.argmax(times)]]
 
     def truth(self):
         """What only the simulator knows, as JSON."""
-        rig, cameras = self.setup.rig, {}
-        for c in rig.cameras:
-            key = "T_camera_lrf" if c.mount == "head" else "T_camera_platform"
-            cameras[c.name] = {key: transform_to_json(c.mounting), "intrinsics": model_to_json(c.model)}
-        return {
-            "setup": self.setup.name,
-            "T_head_lrf": transform_to_json(rig.T_head_lrf),
-            "cameras": cameras,
-            "board": board_to_json(rig.board),
-            "boards": {n: transform_to_json(p.T_platform_board) for n, p in self.placements.items()},
-            "place": list(self.place.key),
-            "pitch_deg": math.degrees(float(self.head.pitch(self.clock.now()))),
-        }
+        boards = {n: transform_to_json(p.T_platform_board) for n, p in self.placements.items()}
+        pitch = math.degrees(float(self.head.pitch(self.clock.now())))
+        about = {"boards": boards, "place": list(self.place.key), "pitch_deg": pitch}
+        return {"setup": self.setup.name} | self.setup.rig.truth() | about
 
 
 def scaled(rig, width):
@@ -134,6 +127,20 @@ def scaled(rig, width):
         changed |= {"cx": (m.cx + 0.5) * scale - 0.5, "cy": (m.cy + 0.5) * scale - 0.5}
         cameras.append(replace(camera, model=replace(m, **changed)))
     return replace(rig, cameras=tuple(cameras))
+
+
+class Serving:
+    """A server of `socketserver` in a thread of its own."""
+
+    def __init__(self, server):
+        self.server, self._thread = server, threading.Thread(target=server.serve_forever, args=(0.2,), daemon=True)
+        self.start = self._thread.start
+
+    def close(self):
+        """End it, started or not."""
+        if self._thread.is_alive():
+            self.server.shutdown()
+        self.server.server_close()
 
 
 _drawing = None  # in the drawing process: the setup, its cameras' imagers, worlds by place
@@ -177,15 +184,17 @@ class CameraServer:
         What ended the drawing process; there are no more images.
     """
 
+    serving = property(lambda self: not self.quit.is_set() and self.error is None, doc="Whether images are to come.")
+
     def __init__(self, world, setup, *, seed=0, rest_s=0.5):
         self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
         self.names = [camera.name for camera in setup.rig.cameras]
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
         self.quit = threading.Event()
         self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (setup,))
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
-        self._serving = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
-        self.urls = {name: f"http://127.0.0.1:{self._server.server_address[1]}/{name}.mjpg" for name in self.names}
+        server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
+        self._serving = Serving(server)
+        self.urls = {name: f"http://127.0.0.1:{server.server_port}/{name}.mjpg" for name in self.names}
 
     def start(self):
         """Serve, and draw the first images ahead."""
@@ -196,15 +205,8 @@ class CameraServer:
     def close(self):
         """End the server and the drawing process."""
         self.quit.set()
-        if self._serving.is_alive():
-            self._server.shutdown()
-        self._server.server_close()
+        self._serving.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-    @property
-    def serving(self):
-        """Whether there are images to come."""
-        return not self.quit.is_set() and self.error is None
 
     def image(self, name, timeout=1.0):
         """What a camera's image shows (a key), and the image of the rig as it stands now, a JPEG file.
@@ -212,37 +214,16 @@ class CameraServer:
         (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
         """
         end = time.monotonic() + timeout
-        while self.serving:
-            key = self._key(name)
-            data = self._drawn(key)
-            if data is not None and self._key(name) == key:
-                return key, data
-            if time.monotonic() > end:
-                break
-            self.quit.wait(LOOK_S)
-        return None, None
-
-    def _key(self, name):
-        """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
-        head, now = self.world.head, self.world.clock.now()
-        if not head.settled(now) or head.tilt.resting(now)[0] < self.rest_s + head.platform.settle:
-            return None
-        return name, self.world.place, round(float(head.pitch(now)), 7)
-
-    def _drawn(self, key):
-        """JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
-        if key is None:
-            return None
         try:
-            with self._lock:
-                before, image = self._images.get(key[0], (None, None))
-                if before != key:
-                    if image is not None:
-                        image.cancel()
-                    index = self.names.index(key[0])
-                    image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
-                    self._images[key[0]] = key, image
-            return image.result() if image.done() else None
+            while self.serving and time.monotonic() < end:
+                key = self._key(name)
+                if key is None:
+                    self.quit.wait(LOOK_S)
+                    continue
+                with contextlib.suppress(TimeoutError, CancelledError):
+                    data = self._drawn(key).result(LOOK_S)
+                    if self._key(name) == key:
+                        return key, data
         except BrokenProcessPool as error:
             if self.serving:
                 LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
@@ -251,31 +232,42 @@ class CameraServer:
         except RuntimeError:  # a pool that was shut down is no news
             if self.serving:
                 raise
+        return None, None
+
+    def _key(self, name):
+        """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
+        head, now = self.world.head, self.world.clock.now()
+        if not head.settled(now) or head.resting(now)[0] < self.rest_s + head.platform.settle:
+            return None
+        return name, self.world.place, round(float(head.pitch(now)), 7)
+
+    def _drawn(self, key):
+        """Future JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
+        with self._lock:
+            before, image = self._images.get(key[0], (None, None))
+            if before != key:
+                if image is not None:
+                    image.cancel()
+                index = self.names.index(key[0])
+                image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
+                self._images[key[0]] = key, image
+        return image
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Sends images as a stream, NAME.mjpg, or one of them, NAME.jpg."""
+    """Sends the images of a camera as a stream, NAME.mjpg."""
 
     def do_GET(self):
         """Answer a request, see :mod:`http.server`."""
-        name, _, kind = self.path.strip("/").rpartition(".")
-        cameras, single = self.cameras, kind == "jpg"
-        if name not in cameras.names or kind not in ("mjpg", "jpg"):
+        cameras, name = self.cameras, self.path.strip("/").removesuffix(".mjpg")
+        if name not in cameras.names:
             return self.send_error(404, f"cameras are {', '.join(cameras.urls.values())}")
-        headers = {"Content-Type": "multipart/x-mixed-replace; boundary=frame", "Cache-Control": "no-cache"}
-        if single:
-            _, data = cameras.image(name, timeout=20.0)
-            if data is None:
-                return self.send_error(503, "the head moves")
-            headers = {"Content-Type": "image/jpeg", "Content-Length": len(data)}
         with contextlib.suppress(ConnectionError, TimeoutError):
             self.send_response(200)
-            for header in headers.items():
-                self.send_header(*header)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.send_header("Cache-Control", "no-cache")
             self.end_headers()
-            if single:
-                self.wfile.write(data)
-            while cameras.serving and not single:
+            while cameras.serving:
                 _, data = cameras.image(name)
                 if data is None:
                     self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import eliminate, whiten
-from lrfcal_lib.fit.residuals import named_blocks
+from lrfcal_lib.fit.residuals import gather, named_blocks
 from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
-from lrfcal_lib.solvers.joint import gathered
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
@@ -103,7 +102,7 @@ def weigh(solution, admitted_offset):
         Of the range finder's maker, metres.
     """
     state, unknowns, obs = solution.state, solution.unknowns, solution.observations
-    before, c = named_blocks(state, gathered(obs, solution.data), unknowns), solution.unknowns.shared
+    before, c = named_blocks(state, gather(obs, **solution.data.levels), unknowns), solution.unknowns.shared
     prior, pull = np.zeros((2, c + 1))
     if "range_offset" in unknowns.sensor:
         where = unknowns.columns["range_offset"]
@@ -111,7 +110,7 @@ def weigh(solution, admitted_offset):
         pull[where] = prior[where] * solution.sensor["range_offset"]
     found = []
     for kind, alternative in ALTERNATIVES.items():
-        after = named_blocks(state, gathered(alternative.change(obs, STEP), solution.data), unknowns)
+        after = named_blocks(state, gather(alternative.change(obs, STEP), **solution.data.levels), unknowns)
         hessian = gradient = 0.0
         for name, block in before.items():
             r, J = whiten(block)

@@ -26,7 +26,7 @@ LIMITS = (0.005, 0.995)  # of what chance alone does
 FEWEST_TRIALS = 10
 GROUPS = {  # unknowns by name: what they are together, the unit of that and the factor to it
     r"axis_.*": ("axis direction", "deg", np.degrees(1.0)), r"offset_.*": ("axis offset", "mm", 1000.0),
-    r"size_.*": ("board size", "mm", 1000.0), r"range_offset": ("range offset", "mm", 1000.0),
+    r"range_offset": ("range offset", "mm", 1000.0),
     r"edge_log_odds": ("edge bias", "log odds", 1.0), r"edge_log_softness": ("edge softness", "log", 1.0),
     r"pitch_scale": ("pitch scale", "%", 100.0), r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
     r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)), r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
@@ -84,9 +84,9 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
     """
     poses = np.array([pose_array(cameras[name]) for name in obs.cameras]).reshape(-1, 3, 4)
     sensor = np.array([range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0])
-    count, edges, boards = len(boards), len(obs.edges), np.stack([pose_array(T) for T in boards])
-    own = boards, np.zeros((count, 2)), np.zeros((count, edges))
-    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, np.zeros(edges), *own), obs)
+    count, boards = len(boards), np.stack([pose_array(T) for T in boards])
+    own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges)))
+    return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
 
 def monte_carlo(draw, solve, seeds):
@@ -129,8 +129,8 @@ def state_errors(state, truth, unknowns):
     """Increments of the shared unknowns that take the truth to an estimate (JointStates in one gauge), shape (c,)."""
     both = (np.concatenate([s.head[None], s.cameras]) for s in (state, truth))
     poses = pose_errors(*both)
-    sensor, size = state.sensor - truth.sensor, state.size - truth.size
-    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor, size])[unknowns.mask]
+    sensor = state.sensor - truth.sensor
+    return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[unknowns.mask]
 
 
 def pose_errors(poses, true):
@@ -161,7 +161,7 @@ def bound(obs, truth, unknowns):
     scale = 1 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     if values[0] < 1e-11:
-        names = unknowns.names(obs.cameras, obs.edges)
+        names = unknowns.names(obs.cameras)
         open_ = ", ".join(names[i] for i in np.flatnonzero(np.abs(vectors[:, 0]) > 0.3))
         raise DegenerateGeometry(f"no bound: the data leave {open_} open")
     return (vectors / values) @ vectors.T * scale[:, None] * scale

@@ -16,7 +16,6 @@ from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import edge_shift, flip_sigma, named_blocks
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.solvers.joint import UNSEEN, WORDS
 
@@ -41,10 +40,8 @@ LARGE, MOST = 0.5, 3  # of a direction, components above this share of the large
 
 
 def outline(solution):
-    """Corners of the board, shape (e, 3), metres; with the sizes that were estimated."""
-    lines = solution.observations.lines()
-    lines[:, 2] -= solution.state.size
-    return np.column_stack([corners_of_lines(lines), np.zeros(len(lines))])
+    """Corners of the board, shape (e, 3), metres."""
+    return np.column_stack([solution.observations.corners, np.zeros(len(solution.observations.corners))])
 
 
 def board_grid(solution, distances, bearings, elevations, turns, leans):
@@ -292,10 +289,10 @@ def scales_of(solution, names):
 def observability(solution):
     """Directions of the scaled information of a JointSolution, the least known first: list of Direction.
 
-    Softness of the edges and sizes of the board are eliminated.
+    The softness of the edges is eliminated.
     """
     names = np.array(solution.solution.names)
-    index = [i for i, n in enumerate(names) if n != "edge_log_softness" and not n.startswith("size_")]
+    index = [i for i, n in enumerate(names) if n != "edge_log_softness"]
     scales = scales_of(solution, names[index])
     H = marginal(information(solution).sum(axis=0), index) * scales[:, None] * scales
     values, vectors = np.linalg.eigh(H)

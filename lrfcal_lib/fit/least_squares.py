@@ -22,7 +22,7 @@ from scipy.stats import chi2 as chi2_distribution
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
-HUBER, CAUCHY = 1.345, 2.385  # 95 % efficiency for normal errors
+CAUCHY = 2.385  # 95 % efficiency for normal errors
 RANK = 1e-13  # eigenvalues of scaled normal equations below this share of the largest are rounding errors
 
 
@@ -73,15 +73,11 @@ def whiten(block, jacobian=True):
 
 
 def robust(z, loss):
-    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale: huber, cauchy or None."""
-    z = np.abs(z)
-    if loss is None:
-        return z**2, np.ones_like(z)
-    if loss == "huber":
-        return np.where(z <= HUBER, z**2, HUBER * (2 * z - HUBER)), HUBER / np.maximum(z, HUBER)
-    if loss == "cauchy":
-        return CAUCHY**2 * np.log1p((z / CAUCHY) ** 2), 1.0 / (1.0 + (z / CAUCHY) ** 2)
-    raise ValueError(f"unknown loss {loss!r}: use None, 'huber' or 'cauchy'")
+    """Value (``z^2`` near zero) and weight of a loss at residuals in units of the scale."""
+    if loss != "cauchy":
+        raise ValueError(f"unknown loss {loss!r}: use None or 'cauchy'")
+    square = (z / CAUCHY) ** 2
+    return CAUCHY**2 * np.log1p(square), 1.0 / (1.0 + square)
 
 
 @lru_cache(maxsize=4096)
@@ -112,10 +108,9 @@ def _blocks(evaluate, state):
     return [found] if isinstance(found, Block) else list(found)
 
 
-def _linearise(blocks, loss, scale, axes):
+def linearise(blocks, loss, scale, axes):
     """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the robust weights."""
-    hessian = gradient = cost = 0.0
-    roots = []
+    hessian, gradient, cost, roots = 0.0, 0.0, 0.0, []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
         roots.append(np.sqrt(weights))
@@ -129,10 +124,8 @@ def _linearise(blocks, loss, scale, axes):
 
 def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
-    each = (
-        0.5 * (root * whiten(block, jacobian=False)[0]) ** 2 if block.cost is None else block.cost
-        for block, root in zip(blocks, roots, strict=True)
-    )
+    pairs = zip(blocks, roots, strict=True)
+    each = (0.5 * (root * whiten(b, False)[0]) ** 2 if b.cost is None else b.cost for b, root in pairs)
     return sum(np.sum(cost, axis=axes) for cost in each)
 
 
@@ -187,7 +180,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         ``(state, step) -> state``; with `shared` the step is the pair (common (c,), own (p, l)).
     shared : int, optional
         Number of unknowns common to all entries of the leading axis.
-    loss : {None, 'huber', 'cauchy'}
+    loss : {None, 'cauchy'}
     scale : float or 'auto'
         Unit of the loss in standard deviations; 'auto' takes it from the median of the residuals in every iteration.
     max_iterations : int
@@ -200,7 +193,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
     """
     axes = -1 if shared is None else (-2, -1)
     blocks = _blocks(evaluate, state)
-    hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+    hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
     history, converged = [cost], np.zeros(np.shape(cost), bool)
     damping, iteration = np.full(np.shape(cost), 1e-7), 0
     while iteration < max_iterations and not np.all(converged):
@@ -222,7 +215,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         kept = np.where(gain > 0.8, 0.1, 1.0) * damping
         worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
         damping = np.clip(np.where(accepted & (gain > 0.5), kept, worse), 1e-12, 1e14)
-        hessian, gradient, cost, roots = _linearise(blocks, loss, scale, axes)
+        hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
         history.append(cost)
     return state, (bool(converged) if converged.ndim == 0 else converged), iteration, np.array(history)
 
@@ -245,41 +238,17 @@ def solve(
     loss=None, scale=1.0, max_iterations=60, tolerance=1e-8, required=True, n_observations=None, limit=1.0,
     chi2_rest=0.0, earlier=(),
 ):  # fmt: skip
-    """Minimise, then report covariances and what was not observed.
+    """Minimise (see :func:`minimise`), then report covariances and what was not observed: a Solution.
 
-    Parameters
-    ----------
-    evaluate, start, retract, shared, loss, scale, max_iterations, tolerance
-        See :func:`minimise`.
-    names : sequence of str
-        Of the unknowns reported (with `shared`, the shared ones).
-    method : str
-    read : callable
-        ``state -> (transform or None, parameters)``.
-    scales, limit : array_like and float, optional
-        See :func:`null_space`; ones by default.
-    words : callable, optional
-        ``direction (k,) -> str``; the names with the largest components by default.
-    groups : array_like, optional
-        Placement of every residual, or of every few in a row, for `covariance_placements` (with `shared` the leading
-        axis is the placement).
-    freedom, n_observations : optional
-        Degrees of freedom of chi-square, and number of observations; by default those of the residuals.
-    required : bool
-        Raise when something stays unobservable (single problems only).
-    chi2_rest, earlier
-        Chi-square that no unknown can change (compressed away), and cost histories of earlier rounds.
+    `names` are those of the unknowns reported (with `shared`, the shared ones), `read` makes ``(transform or None,
+    parameters)`` of a state, `scales` and `limit` are those of :func:`null_space`, `words` puts a direction (k,) into
+    words (the names with its largest components by default). `groups` tell the placement of every residual, or of every
+    few in a row, for `covariance_placements`; with `shared` the leading axis is the placement. `freedom` and
+    `n_observations` are by default those of the residuals; `chi2_rest` is chi-square that no unknown can change
+    (compressed away), `earlier` are cost histories of earlier rounds.
 
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    DegenerateGeometry
-        Naming the unobservable motions, when `required`.
-    ValueError
-        When residuals at the start are not finite.
+    Raises DegenerateGeometry naming unobservable motions when `required` (single problems only), and ValueError when
+    residuals at the start are not finite.
     """
     axes = -1 if shared is None else (-2, -1)
     if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
@@ -330,19 +299,9 @@ def _by_placement(r, J, weights, groups, shared):
 def null_space(hessian, scales, limit=1.0):
     """Directions that normal equations (k, k) of whitened residuals do not determine.
 
-    Parameters
-    ----------
-    scales : array_like, shape (k,)
-        What counts as a change by one: 1 rad, 1 m, 1000 px, ...
-    limit : float
-        A direction is also unobservable when its standard deviation exceeds this many scales.
-
-    Returns
-    -------
-    directions : ndarray, shape (m, k)
-        Increments, largest component 1, the worst first; m = 0 when everything is observable.
-    values : ndarray, shape (k,)
-        Singular values of the scaled, whitened Jacobian, ascending: reciprocal standard deviations.
+    `scales` (k,) are what counts as a change by one: 1 rad, 1 m, 1000 px; a direction is also unobservable when its
+    standard deviation exceeds `limit` scales. Returned are increments (m, k), largest component 1, the worst first, and
+    the singular values (k,) of the scaled, whitened Jacobian, ascending: reciprocal standard deviations.
     """
     scales = np.asarray(scales, float)
     values, vectors = np.linalg.eigh(hessian * scales[:, None] * scales)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,24 +10,9 @@ from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import line_distance, line_through, project, undistort
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    axis_of,
-    cross,
-    gradient_by_pose,
-    hat,
-    head_from_axis,
-    log_rotation,
-    move_pose,
-    moved_noise,
-    noise_correction,
-    pose_array,
-    pose_parameters,
-    pose_transform,
-    rotate_points,
-    tilt,
-)
+from lrfcal_lib.model.geometry import cross, gradient_by_pose, hat, move_pose, pose_transform, rotate_points, tilt
 
 
 def line_block(pose, obs):
@@ -44,16 +29,16 @@ def line_block(pose, obs):
     slope = (a * x + b * y) / z
     residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
     gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
-    shift = moved_noise(pose, gradient, obs.crossing_covariance)
+    shift = geometry.moved_noise(pose, gradient, obs.crossing_covariance)
     variance = np.sum(shift * gradient, axis=-1) + obs.crossing_line_sigma**2
     jacobian = gradient_by_pose(rotated, gradient)
-    corrected = jacobian - noise_correction(rotated, q, gradient, shift, residuals / variance)
+    corrected = jacobian - geometry.noise_correction(rotated, q, gradient, shift, residuals / variance)
     return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
 
 
 def read_pose(pose):
     """Transform and parameters of a pose state."""
-    return pose_transform(pose), pose_parameters(pose)
+    return pose_transform(pose), geometry.pose_parameters(pose)
 
 
 def edge_residuals_px(obs, transform, model=None):
@@ -82,7 +67,7 @@ def edge_residuals_px(obs, transform, model=None):
         moved = line_through(*(undistort(project(ray, obs.model), model) for ray in rays))
         moved *= np.sign(np.sum(moved[:, :2] * lines[:, :2], axis=1))[:, None]
         obs = replace(obs, crossing_lines=moved, model=model)
-    return line_block(pose_array(transform), obs).residuals
+    return line_block(geometry.pose_array(transform), obs).residuals
 
 
 def plane_residuals_m(obs, transform, board_poses=None):
@@ -156,21 +141,11 @@ def flip_sigma(softness, radius, step):
 def beam_terms(margin, sigma, hit, lapse=0.0):
     """Negative log likelihood of single beams near an edge, a probit: ``P(hit) = Phi(margin / sigma)``.
 
-    Parameters
-    ----------
-    margin, sigma : array_like
-        How far inside the place where readings flip the beam's centre lies (shift - distance from the edge), and the
-        standard deviation of that place, metres.
-    hit : ndarray of bool
-        Whether the board was read.
-    lapse : float
-        Share of beams that say nothing (something hid or bent the edge there); their pull fades with distance.
-
-    Returns
-    -------
-    cost, score, information, by_log_sigma : ndarray
-        Negative log likelihood, its derivative by the margin, the observed information on the margin (never negative;
-        with `lapse` that of the majorising function of an EM step), and the cost's derivative by ``ln sigma``.
+    `margin` and `sigma` (metres) are how far inside the place where readings flip the beam's centre lies (shift -
+    distance from the edge), and the standard deviation of that place; `hit` tells whether the board was read, `lapse`
+    is the share of beams that say nothing (something hid or bent the edge there): their pull fades with distance.
+    Returned are cost, score (its derivative by the margin) and the observed information on the margin, never negative;
+    with `lapse` that of the majorising function of an EM step.
     """
     sign = np.where(hit, 1.0, -1.0)
     z = sign * np.asarray(margin, float) / sigma
@@ -180,7 +155,7 @@ def beam_terms(margin, sigma, hit, lapse=0.0):
     if lapse:
         cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
         weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
-    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2, weight * mills * z
+    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2
 
 
 def interval_terms(inner, outer, sigma):
@@ -188,7 +163,7 @@ def interval_terms(inner, outer, sigma):
 
     A uniform distribution over the interval, blurred; `inner` and `outer` are the margins (see :func:`beam_terms`) of
     the last beam on the board and the first one off it. Returned are cost, score and observed information by a shift
-    of both margins, and the derivative of the cost by ``ln sigma``, as by :func:`beam_terms`.
+    of both margins, as by :func:`beam_terms`.
     """
     a, b = np.asarray(outer, float) / sigma, np.asarray(inner, float) / sigma
     flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
@@ -199,7 +174,7 @@ def interval_terms(inner, outer, sigma):
     ratio = pb - pa
     curvature = ratio**2 + (b * pb - a * pa)
     score = np.where(flip, 1.0, -1.0) * ratio / sigma
-    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2, b * pb - a * pa
+    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2
 
 
 SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the beam has no range noise across it
@@ -222,8 +197,6 @@ class JointState:
         ``T_platform_board``.
     sensor : ndarray, shape (5,)
         In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
-    size : ndarray, shape (e,)
-        By how much each edge lies outside the stated one, metres.
     sweeps : ndarray, shape (p, 2)
         Offset (radians) and stretch of the recorded pitch of each sweep.
     sides : ndarray, shape (p, e)
@@ -233,7 +206,6 @@ class JointState:
     head: np.ndarray
     cameras: np.ndarray
     sensor: np.ndarray
-    size: np.ndarray
     boards: np.ndarray
     sweeps: np.ndarray
     sides: np.ndarray
@@ -252,7 +224,6 @@ class Unknowns:
     edges: int
     axis: bool = True
     sensor: tuple = ("range_offset", "edge_log_odds", "edge_log_softness")
-    size: bool = False
     sweep: str = "none"
     poses: bool = True
     sides: bool = False
@@ -260,15 +231,15 @@ class Unknowns:
     @property
     def mask(self):
         """Of the full set of shared columns, those that are unknown."""
-        poses, size = [self.poses] * 6 * self.cameras, [self.size] * self.edges
-        return np.array([self.axis] * 4 + poses + [name in self.sensor for name in SENSOR] + size)
+        sensor = [name in self.sensor for name in SENSOR]
+        return np.array([self.axis] * 4 + [self.poses] * 6 * self.cameras + sensor)
 
     @cached_property
     def columns(self):
         """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's own."""
         widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
-        widths |= {name: int(name in self.sensor) for name in SENSOR} | {"size": self.edges * self.size, "board": 6}
-        widths |= {"sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
+        widths |= {name: int(name in self.sensor) for name in SENSOR}
+        widths |= {"board": 6, "sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
         ends = np.cumsum(list(widths.values())).tolist()
         return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
 
@@ -282,10 +253,9 @@ class Unknowns:
         """Number of unknowns of one placement."""
         return self.columns["sides"].stop - self.shared
 
-    def names(self, cameras, edges):
+    def names(self, cameras):
         """Names of the shared unknowns."""
-        poses = [f"{c}_{n}" for c in cameras for n in POSE_NAMES]
-        every = [*AXIS_NAMES, *poses, *SENSOR, *(f"size_{e}" for e in edges)]
+        every = [*AXIS_NAMES, *(f"{c}_{n}" for c in cameras for n in geometry.POSE_NAMES), *SENSOR]
         return tuple(np.array(every)[self.mask].tolist())
 
 
@@ -320,6 +290,11 @@ class JointData:
     side_sigma: float = 0.35
     prior: PlatformPrior | None = None
 
+    @property
+    def levels(self):
+        """Noise levels and prior: all that has a default."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.default is not MISSING}
+
 
 def pad(group, count, width=1):
     """Arrays of a group (with `placement`, an index below `count`) sorted into rectangles (count, n, ...).
@@ -337,20 +312,18 @@ def pad(group, count, width=1):
     return out
 
 
-def gather(obs):
-    """JointObservations as padded arrays, a JointData."""
+def gather(obs, **levels):
+    """JointObservations as padded arrays, a JointData, with noise levels other than those stated."""
     count = len(obs.placements)
     face, beam, view = (pad(obs.group(name), count) for name in ("face", "beam", "view"))
     for group in (face, beam):
-        b = group["bearing"]
-        group["ray"] = np.stack([np.cos(b), np.sin(b), 0 * b], axis=-1)
+        group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
     view["covariance"] = np.where(view["used"][..., None, None], view["covariance"], np.eye(6))
     view["whitener"] = np.linalg.inv(np.linalg.cholesky(view["covariance"])) * view["used"][..., None, None]
     view["pose"] = np.where(view["used"][..., None, None], view["pose"], np.eye(4))
     on_head = np.array([m == "head" for m in obs.mounts], bool)
-    return JointData(
-        face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, view_scale=np.ones(len(obs.cameras))
-    )
+    levels = {"view_scale": np.ones(len(obs.cameras))} | levels
+    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, **levels)
 
 
 def true_pitch(state, data, pitch):
@@ -415,44 +388,39 @@ def edge_distance(state, data, group, ray):
     """Signed distance u (p, n) of rays from their edges, positive outside, and what it hangs on, (p, n, 3).
 
     The gradients by_o, by_d, by_t by origin, direction, and the edge's direction (that by the edge's point is
-    ``-by_o``), then a, t, n: point (relative to the board's origin), direction and outward normal of the edge, platform
-    frame.
+    ``-by_o``), then a, t: point (relative to the board's origin) and direction of the edge, platform frame.
     """
     o, d = ray[:2]
     rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
     line = data.lines[group["edge"]]
-    shift = -(line[..., 2] - state.size[group["edge"]])[..., None]
-    zero = np.zeros(line.shape[:2] + (1,))
-    normal = np.concatenate([line[..., :2], zero], axis=-1)
-    along = np.stack([-line[..., 1], line[..., 0], zero[..., 0]], axis=-1)
-    a, t, n = ((shift * normal) @ rotation, along @ rotation, normal @ rotation)
+    normal = np.concatenate([line[..., :2], 0 * line[..., :1]], axis=-1)
+    along = np.stack([-line[..., 1], line[..., 0], 0 * line[..., 0]], axis=-1)
+    a, t, n = ((-line[..., 2:] * normal) @ rotation, along @ rotation, normal @ rotation)
     away = o - a - state.boards[:, None, :, 3]
     m = cross(d, t)
     length = np.linalg.norm(m, axis=-1, keepdims=True)
     c = m / length * np.where(np.sum(m * n, axis=-1, keepdims=True) < 0, -1.0, 1.0)
     u = np.sum(c * away, axis=-1)
     g = (away * np.sign(np.sum(c * m, axis=-1, keepdims=True)) - u[..., None] * m / length) / length
-    return u, c, cross(t, g), cross(g, d), a, t, n
+    return u, c, cross(t, g), cross(g, d), a, t
 
 
 def beam_block(state, data, unknowns):
     """Negative log likelihoods of beams near the edges."""
     group = data.beam
     ray = rays(state, data, group)
-    u, by_o, by_d, by_t, a, t, n = edge_distance(state, data, group, ray)
+    u, by_o, by_d, by_t, a, t = edge_distance(state, data, group, ray)
     own = np.take_along_axis(state.sides, group["edge"], axis=1)
     shift, slope = edge_shift(state.sensor[1], group["radius"], group["background"] + own)
     radius = np.where(group["used"], group["radius"], 1.0)
     sigma, share_soft = flip_sigma(np.exp(state.sensor[2]), radius, group["step"])
     margin = shift - u
-    cost, score, information, _ = beam_terms(margin, sigma, group["hit"], data.lapse)
+    cost, score, information = beam_terms(margin, sigma, group["hit"], data.lapse)
     head, parts = ray_columns(-by_o, -by_d, ray)
     board = np.concatenate([cross(t, -by_t) + cross(a, by_o), by_o], axis=-1)
-    size, sides = np.zeros((2,) + u.shape + (unknowns.edges,))
-    np.put_along_axis(size, group["edge"][..., None], np.sum(by_o * n, axis=-1)[..., None], axis=-1)
-    np.put_along_axis(sides, group["edge"][..., None], slope[..., None], axis=-1)
+    sides = slope[..., None] * (group["edge"][..., None] == np.arange(unknowns.edges))
     sensor = {"edge_log_odds": slope[..., None], "edge_log_softness": (-margin * share_soft)[..., None]}
-    J = assemble(unknowns, axis=head, parts=parts, board=board, size=size, sides=sides, **sensor)
+    J = assemble(unknowns, axis=head, parts=parts, board=board, sides=sides, **sensor)
     share = data.beam_share * group["used"]
     root = np.sqrt(information)
     alive = root * sigma > 1e-7
@@ -481,7 +449,7 @@ def view_block(state, data, unknowns):
     B = A @ np.swapaxes(tilt(np.eye(3), -pitch[..., None]), -1, -2)
     y = tilt(board[..., 3], -pitch)
     t = (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
-    w = log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
+    w = geometry.log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
     left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
 
@@ -492,9 +460,8 @@ def view_block(state, data, unknowns):
     turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
     by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
     own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
-    cameras = np.zeros(A.shape[:2] + (6, unknowns.cameras, 6))
-    np.put_along_axis(cameras, view["camera"][..., None, None, None], own[..., None, :], axis=-2)
-    cameras = cameras.reshape(cameras.shape[:3] + (-1,))
+    mine = view["camera"][..., None] == np.arange(unknowns.cameras)
+    cameras = (own[..., None, :] * mine[:, :, None, :, None]).reshape(A.shape[:2] + (6, -1))
     J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
     p, v = pitch.shape
     return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
@@ -511,11 +478,9 @@ def view_whitener(data, by_pitch):
 
 
 def own_jacobian(unknowns, p, name):
-    """Jacobian of the own unknowns of p placements by themselves."""
-    where = unknowns.columns[name]
-    J = np.zeros((p, where.stop - where.start, unknowns.shared + unknowns.own))
-    J[..., where] = np.eye(where.stop - where.start)
-    return J
+    """Jacobian of unknowns that all p placements have (or share) by themselves."""
+    rows = np.eye(unknowns.shared + unknowns.own)[unknowns.columns[name]]
+    return np.broadcast_to(rows, (p, *rows.shape))
 
 
 def sweep_block(state, data, unknowns):
@@ -548,15 +513,13 @@ def prior_block(state, data, unknowns):
 
 def usual_block(state, unknowns, name):
     """A weak expectation of one of `USUAL`, for data that do not show it; every placement holds a part."""
-    (usual, spread), number, p = USUAL[name], SENSOR.index(name), len(state.boards)
-    J = np.zeros((p, 1, unknowns.shared + unknowns.own))
-    J[..., unknowns.columns[name]] = 1.0
-    away = (state.sensor[number] - usual) / (spread * np.sqrt(p))
+    (usual, spread), value, one = USUAL[name], state.sensor[SENSOR.index(name)], np.ones((len(state.boards), 1))
+    scale = spread * np.sqrt(len(one))
     # where the floor of `flip_sigma` takes over, the beams' gradient by ln softness falls with the softness squared:
     # without this curvature steps overshoot twofold
-    bend = np.sqrt(1 + 2 * max(usual - state.sensor[number], 0.0)) if name == "edge_log_softness" else 1.0
-    cost = np.full((p, 1), 0.5 * away**2)
-    return Block(np.full((p, 1), away / bend), J * bend / (spread * np.sqrt(p)), np.ones((p, 1)), cost=cost)
+    bend = np.sqrt(1 + 2 * max(usual - value, 0.0)) if name == "edge_log_softness" else 1.0
+    away, J = (value - usual) / scale, own_jacobian(unknowns, len(one), name)
+    return Block(away / bend * one, J * bend / scale, one, cost=0.5 * away**2 * one)
 
 
 def joint_blocks(state, data, unknowns):
@@ -583,9 +546,7 @@ def move_state(state, step, unknowns):
     full = np.zeros(len(unknowns.mask))
     full[unknowns.mask] = step[0]
     c = len(state.cameras)
-    head = np.zeros(6)
-    head[AXIS_COLUMNS] = full[:4]
-    sensor = state.sensor + full[4 + 6 * c : 9 + 6 * c]
+    sensor = state.sensor + full[4 + 6 * c :]
     sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
     sensor[2] = np.clip(sensor[2], np.log(1e-3), np.log(10.0))
     count = SWEEPS[unknowns.sweep]
@@ -593,10 +554,9 @@ def move_state(state, step, unknowns):
     sweeps[:, :count] += step[1][:, 6 : 6 + count]
     return replace(
         state,
-        head=move_pose(state.head, head),
+        head=move_head(state.head, full[:4]),
         cameras=move_pose(state.cameras, full[4 : 4 + 6 * c].reshape(c, 6)) if c else state.cameras,
         sensor=sensor,
-        size=state.size + full[9 + 6 * c :],
         boards=move_pose(state.boards, step[1][:, :6]),
         sweeps=sweeps,
         sides=state.sides + step[1][:, 6 + count :] if unknowns.sides else state.sides,
@@ -605,7 +565,7 @@ def move_state(state, step, unknowns):
 
 def chart_parameters(head):
     """The axis of ``T_head_lrf`` (3, 4): angles out of and within the scan plane, and minus y, z of its foot, (4,)."""
-    axis = axis_of(pose_transform(head))
+    axis = geometry.axis_of(pose_transform(head))
     x, y, z = axis.direction
     return np.r_[np.arctan2(z, x), np.arctan2(-y, x), -axis.foot[1:]]
 
@@ -615,7 +575,7 @@ def prior_terms(head, prior):
 
     The direction is compared by ``R0 R^T e_x``, the offset by the foot points, both in the prior's head frame.
     """
-    reference = pose_array(head_from_axis(axis_of(prior.T_head_lrf)))
+    reference = geometry.pose_array(geometry.head_from_axis(geometry.axis_of(prior.T_head_lrf)))
     turn = reference[:, :3] @ head[:, :3].T
     along, arm = turn[:, 0], np.array([0.0, head[1, 3], head[2, 3]])
     r = np.r_[along[2], -along[1], (turn @ arm)[1:] - reference[1:, 3]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -27,8 +27,22 @@ def check_finite(record, whose="", missing=()):
                 )
 
 
+def rows(*shape, of, each=0.0):
+    """A field of arrays with a row for each member of a group; `each` row is this by default, None: its number."""
+    return field(default=None, metadata={"shape": shape, "of": of, "each": each})
+
+
 class _Groups:
     """Arrays in groups of equal length; the first word of a field's name tells its group."""
+
+    def fill(self, **counts):
+        """Give every array that is missing its default, for so many members of each group."""
+        for f in fields(self):
+            if f.metadata and getattr(self, f.name) is None:
+                shape, of, each = f.metadata.values()
+                n = counts.get(of, 0)
+                value = np.arange(n) if each is None else np.broadcast_to(each, (n, *shape)).copy()
+                object.__setattr__(self, f.name, value)
 
     def group(self, name):
         """Fields of one group of observations: dict of arrays without the group's prefix."""
@@ -65,6 +79,8 @@ class CameraObservations(_Groups):
         Standard deviation of the image line at the crossing, pixels; 0.5 by default.
     crossing_placement, crossing_edge : ndarray of int and of str, shape (n,)
         Every row has a placement of its own by default, as of the other groups.
+    crossing_pitch, plane_pitch : ndarray, shapes (n,), (m,)
+        Recorded pitch of the points, radians; only its errors (:mod:`lrfcal_lib.solvers.pitch`) need it.
     crossing_across : ndarray of bool, shape (n,)
         Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
         the recorded pitch. The paper uses none of these.
@@ -120,51 +136,41 @@ class CameraObservations(_Groups):
     model: CameraModel
     camera: str = "camera"
     source: str = "lrf"
-    crossing_points: np.ndarray | None = None
-    crossing_covariance: np.ndarray | None = None
-    crossing_lines: np.ndarray | None = None
-    crossing_line_sigma: np.ndarray | None = None
-    crossing_placement: np.ndarray | None = None
-    crossing_edge: np.ndarray | None = None
-    crossing_across: np.ndarray | None = None
-    crossing_half_step: np.ndarray | None = None
-    crossing_noise: np.ndarray | None = None
-    crossing_radius: np.ndarray | None = None
-    crossing_background: np.ndarray | None = None
-    plane_points: np.ndarray | None = None
-    plane_covariance: np.ndarray | None = None
-    plane_placement: np.ndarray | None = None
-    placements: np.ndarray | None = None
-    board_poses: np.ndarray | None = None
-    board_covariance: np.ndarray | None = None
-    pattern_points: np.ndarray | None = None
-    pattern_pixels: np.ndarray | None = None
+    crossing_points: np.ndarray = rows(3, of="crossing")
+    crossing_covariance: np.ndarray = rows(3, 3, of="crossing", each=ROUGH_NOISE)
+    crossing_lines: np.ndarray = rows(3, of="nothing")
+    crossing_line_sigma: np.ndarray = rows(of="crossing", each=0.5)
+    crossing_placement: np.ndarray = rows(of="crossing", each=None)
+    crossing_edge: np.ndarray = rows(of="crossing", each="")
+    crossing_pitch: np.ndarray = rows(of="crossing")
+    crossing_across: np.ndarray = rows(of="crossing", each=False)
+    crossing_half_step: np.ndarray = rows(3, of="crossing")
+    crossing_noise: np.ndarray = rows(3, 3, of="crossing")
+    crossing_radius: np.ndarray = rows(of="crossing", each=0.005)
+    crossing_background: np.ndarray = rows(of="crossing")
+    plane_points: np.ndarray = rows(3, of="plane")
+    plane_covariance: np.ndarray = rows(3, 3, of="plane", each=ROUGH_NOISE)
+    plane_placement: np.ndarray = rows(of="plane", each=None)
+    plane_pitch: np.ndarray = rows(of="plane")
+    placements: np.ndarray = rows(of="board", each=None)
+    board_poses: np.ndarray = rows(4, 4, of="board")
+    board_covariance: np.ndarray = rows(6, 6, of="board")
+    pattern_points: np.ndarray = rows(3, of="pattern")
+    pattern_pixels: np.ndarray = None
     pattern_sigma_px: float = 0.2
-    scene_points: np.ndarray | None = None
-    scene_covariance: np.ndarray | None = None
-    scene_pixels: np.ndarray | None = None
-    scene_sigma_px: np.ndarray | None = None
-    scene_placement: np.ndarray | None = None
+    scene_points: np.ndarray = rows(3, of="scene")
+    scene_covariance: np.ndarray = rows(3, 3, of="scene", each=ROUGH_NOISE)
+    scene_pixels: np.ndarray = rows(2, of="nothing")
+    scene_sigma_px: np.ndarray = rows(of="scene", each=0.5)
+    scene_placement: np.ndarray = rows(of="scene", each=None)
 
     def __post_init__(self):
-        points = (self.crossing_points, self.plane_points, self.scene_points, self.pattern_points)
-        n, m, q, k = (0 if rows is None else rows.shape[-2] for rows in points)
-        p = 0 if self.board_poses is None else self.board_poses.shape[-3]
-        zeros = {
-            "crossing_lines": (0, 3), "crossing_half_step": (n, 3), "crossing_noise": (n, 3, 3),
-            "crossing_background": n, "board_poses": (0, 4, 4), "board_covariance": (p, 6, 6),
-            "pattern_points": (0, 3), "scene_pixels": (0, 2),
-        }  # fmt: skip
-        defaults = {name: np.zeros(shape) for name, shape in zeros.items()}
-        defaults |= {"crossing_edge": np.full(n, ""), "crossing_across": np.zeros(n, bool), "placements": np.arange(p)}
-        defaults |= {"crossing_line_sigma": np.full(n, 0.5), "scene_sigma_px": np.full(q, 0.5)}
-        defaults |= {"crossing_radius": np.full(n, 0.005), "pattern_pixels": np.full((p, k, 2), np.nan)}
-        for group, count in (("crossing", n), ("plane", m), ("scene", q)):
-            defaults[f"{group}_points"] = np.zeros((0, 3))
-            defaults[f"{group}_covariance"] = np.tile(ROUGH_NOISE, (count, 1, 1))
-            defaults[f"{group}_placement"] = np.arange(count)
-        for name in (name for name in defaults if getattr(self, name) is None):
-            object.__setattr__(self, name, defaults[name])
+        points = {group: getattr(self, f"{group}_points") for group in ("crossing", "plane", "pattern", "scene")}
+        counts = {group: 0 if p is None else p.shape[-2] for group, p in points.items()}
+        self.fill(board=0 if self.board_poses is None else self.board_poses.shape[-3], **counts)
+        if self.pattern_pixels is None:
+            unseen = np.full((self.board_poses.shape[-3], counts["pattern"], 2), np.nan)
+            object.__setattr__(self, "pattern_pixels", unseen)
         check_finite(self, f" of camera '{self.camera}'", missing=("pattern_pixels",))
 
     @property
@@ -173,15 +179,12 @@ class CameraObservations(_Groups):
         parts = (self.crossing_placement, self.plane_placement, self.placements, self.scene_placement)
         return np.unique(np.concatenate(parts))
 
-    def posed_faces(self):
-        """Placements with a board pose and points on the board, sorted."""
-        return np.intersect1d(self.placements, self.plane_placement)
-
     def require(self, kind, least):
         """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for what they leave open."""
+        faces = np.intersect1d(self.placements, self.plane_placement)
         found, what = {
             "crossing": (self.crossing_placement, "crossings of scan lines with edges"),
-            "plane": (self.posed_faces(), "placements with a board pose and points on the board"),
+            "plane": (faces, "placements with a board pose and points on the board"),
             "scene": (self.scene_placement, "scene points"),
         }[kind]
         if len(found) < least:
@@ -201,6 +204,39 @@ class CameraObservations(_Groups):
         out = self.keep(**{group: np.isin(getattr(self, f"{group}_placement"), wanted) for group in groups})
         known, boards = np.isin(self.placements, wanted), ("board_poses", "board_covariance", "pattern_pixels")
         return replace(out, placements=self.placements[known], **{name: getattr(self, name)[known] for name in boards})
+
+
+@dataclass(frozen=True)
+class PlatformObservations(_Groups):
+    """Edge points and face points of boards swept by the pitching LRF.
+
+    Attributes
+    ----------
+    edge_points, face_points : ndarray, shapes (n, 3), (m, 3)
+        LRF frame, metres; those of faces may be missing.
+    edge_covariance, face_covariance : ndarray, shapes (n, 3, 3), (m, 3, 3)
+    edge_pitch, face_pitch : ndarray, shapes (n,), (m,)
+        Recorded pitch of their scan lines, radians.
+    edge_placement, face_placement : ndarray of int, shapes (n,), (m,)
+    edge_number : ndarray of int, shape (n,)
+        1 or 2: the two perpendicular edges of equations (7) to (14).
+    """
+
+    edge_points: np.ndarray
+    edge_covariance: np.ndarray
+    edge_pitch: np.ndarray
+    edge_placement: np.ndarray
+    edge_number: np.ndarray
+    face_points: np.ndarray
+    face_covariance: np.ndarray
+    face_pitch: np.ndarray
+    face_placement: np.ndarray
+
+    def __post_init__(self):
+        check_finite(self)
+        if not np.isin(self.edge_number, (1, 2)).all():
+            found = np.unique(self.edge_number)
+            raise ValueError(f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}")
 
 
 GROUPS = ("face", "beam", "view")
@@ -276,14 +312,11 @@ class JointObservations(_Groups):
     cameras: tuple
     mounts: tuple
     T_head_lrf: RigidTransform | None = None
-    view_lens: np.ndarray | None = None
-    lens_covariance: np.ndarray | None = None
+    view_lens: np.ndarray = rows(6, 9, of="view")
+    lens_covariance: np.ndarray = rows(9, 9, of="camera")
 
     def __post_init__(self):
-        if self.view_lens is None:
-            object.__setattr__(self, "view_lens", np.zeros((len(self.view_camera), 6, 9)))
-        if self.lens_covariance is None:
-            object.__setattr__(self, "lens_covariance", np.zeros((len(self.cameras), 9, 9)))
+        self.fill(view=len(self.view_camera), camera=len(self.cameras))
         check_finite(self)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")
@@ -298,20 +331,15 @@ class JointObservations(_Groups):
 
     def select(self, placements):
         """The observations of some placements (numbers) only."""
-        kept = np.flatnonzero(np.isin(self.placements, np.asarray(list(placements))))
-        new = np.full(len(self.placements), -1)
-        new[kept] = np.arange(len(kept))
-        rows = {name: new[getattr(self, f"{name}_placement")] >= 0 for name in GROUPS}
-        out = self.keep(**rows)
-        moved = {f"{name}_placement": new[getattr(out, f"{name}_placement")] for name in GROUPS}
-        cut = {key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")}
-        return replace(out, **moved, **cut)
+        kept = np.flatnonzero(np.isin(self.placements, list(placements)))
+        out = self.keep(**{name: np.isin(getattr(self, f"{name}_placement"), kept) for name in GROUPS})
+        moved = {f"{name}_placement": np.searchsorted(kept, getattr(out, f"{name}_placement")) for name in GROUPS}
+        return replace(out, **moved, **{key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")})
 
     def with_cameras(self, names):
         """The observations of some cameras only."""
         kept = [i for i, name in enumerate(self.cameras) if name in names]
         out = self.keep(view=np.isin(self.view_camera, kept))
-        camera = np.searchsorted(kept, out.view_camera) if kept else out.view_camera
         chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
-        chosen["lens_covariance"] = self.lens_covariance[kept]
-        return replace(out, view_camera=camera, **chosen)
+        camera = np.searchsorted(kept, out.view_camera)
+        return replace(out, view_camera=camera, lens_covariance=self.lens_covariance[kept], **chosen)

@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import ConvexHull, Delaunay, QhullError
+from scipy.spatial import ConvexHull, Delaunay
+from scipy.spatial.transform import RigidTransform
 from scipy.stats import f as f_distribution
 
-from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import gradient_by_pose, lrf_to_platform, move_pose, pose_array, rotate_points
+from lrfcal_lib.model.geometry import lrf_to_platform
 from lrfcal_lib.preprocess.board_in_scan import face_points, plane_axes
-from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.intrinsics import adjust, raised_points
 
 MOST_POINTS = 12000  # a placement; more of them only cost time, since parts of the board count
 MARGIN = 0.02  # of a scan line and of a column, left out at either end: mixed pixels
@@ -98,14 +98,18 @@ class Face:
 
     `flat` (n, 2) in metres; `height` (n,) over the plane, away from the LRF, and its derivative by the range; `around`
     (n,) is 0 within the pattern, 1 around it, nan in between (all 0 for one material, or an unknown place of the
-    pattern); `outline` (k, 2) are the corners of the area that was scanned.
+    pattern).
     """
 
     flat: np.ndarray
     height: np.ndarray
     by_range: np.ndarray
     around: np.ndarray
-    outline: np.ndarray
+
+    def columns(self, flat):
+        """Columns of a plane and a quadratic surface about the middle of the face at points of it, shape (n, 6)."""
+        x, y = (flat - (self.flat.min(axis=0) + self.flat.max(axis=0)) / 2).T
+        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def board_bends(prepared, to_board=None):
@@ -145,22 +149,12 @@ def face_of(scan, board=None, to_board=None):
     In board coordinates with `to_board` (see :func:`board_bends`), else in arbitrary ones of the plane.
     """
     p_lrf, pitch, _ = face_points(scan, MOST_POINTS, MARGIN)
-    points = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf)
-    origin = lrf_to_platform(np.zeros_like(p_lrf), pitch, scan.T_head_lrf)
+    points, origin = (lrf_to_platform(p, pitch, scan.T_head_lrf) for p in (p_lrf, np.zeros_like(p_lrf)))
     by_range = (points - origin) @ scan.normal / np.linalg.norm(p_lrf, axis=1)
     away = np.sign(np.median(by_range))
     height, by_range = away * (points @ scan.normal - scan.distance), away * by_range
     flat = points @ plane_axes(scan.normal).T if to_board is None else to_board(p_lrf, pitch)[:, :2]
-    around = np.zeros(len(flat)) if to_board is None else around_pattern(flat, board)
-    return Face(flat, height, by_range, around, hull(flat))
-
-
-def hull(flat):
-    """Corners of the area that holds points; all of them where they span none (a single scan line)."""
-    try:
-        return flat[ConvexHull(flat).vertices]
-    except (QhullError, ValueError):
-        return flat
+    return Face(flat, height, by_range, np.zeros(len(flat)) if to_board is None else around_pattern(flat, board))
 
 
 def around_pattern(flat, board):
@@ -184,18 +178,12 @@ def common_level(faces):
         known = np.isfinite(face.around)
         share = np.mean(face.around[known]) if known.any() else 0.0
         if LEAST_SHARE < share < 1 - LEAST_SHARE:
-            columns = np.column_stack([_surface(face, face.flat), np.nan_to_num(face.around) * face.by_range])
+            columns = np.column_stack([face.columns(face.flat), np.nan_to_num(face.around) * face.by_range])
             levels.append(_robust_fit(columns[known], face.height[known])[0][-1])
     if len(levels) < FEWEST_SHEETS:
         return np.nan, np.nan
     spread = 1.4826 * np.median(np.abs(levels - np.median(levels)))
     return float(np.median(levels)), float(1.2533 * spread / np.sqrt(len(levels)))
-
-
-def _surface(face, flat):
-    """Columns of a plane and a quadratic surface at points of the plane, shape (n, 6)."""
-    x, y = (flat - (face.outline.min(axis=0) + face.outline.max(axis=0)) / 2).T
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def _robust_fit(columns, values, rounds=3):
@@ -216,14 +204,14 @@ def bend_of(face, placement=0, level=0.0):
     then. The covariance comes from the scatter over parts of the board. Few parts may agree by luck, so that single
     points have their say in the p-value as well.
     """
-    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
+    low, high = face.flat.min(axis=0), face.flat.max(axis=0)
     cell = np.clip((PARTS * (face.flat - low) / np.maximum(high - low, 1e-9)).astype(int), 0, PARTS - 1)
     known = np.isfinite(face.around) if level else np.ones(len(face.flat), bool)
     part = (cell @ [1, PARTS])[known]
     if len(np.unique(part)) < FEWEST_PARTS:
         reason = f"the scan shows {len(np.unique(part))} of {PARTS**2} parts of the board, {FEWEST_PARTS} are needed"
         return Bend(placement, np.nan, np.nan, np.nan, False, f"placement {placement}: {reason}")
-    columns = _surface(face, face.flat[known])
+    columns = face.columns(face.flat[known])
     height = face.height[known] - (level * np.nan_to_num(face.around) * face.by_range)[known]
     found, miss, used = _robust_fit(columns, height)
     columns, miss, part, q = columns[used], miss[used], part[used], found[3:]
@@ -244,12 +232,12 @@ def bend_of(face, placement=0, level=0.0):
 
 
 def _height_range(face, q, covariance):
-    """Greatest difference in height of a quadratic surface (less its plane) over the outline, with its sigma."""
-    low, high = face.outline.min(axis=0), face.outline.max(axis=0)
-    grid = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
-    within = _surface(face, grid[Delaunay(face.outline).find_simplex(grid) >= 0])
+    """Greatest difference in height of a quadratic surface (less its plane) over what was scanned, with its sigma."""
+    hull, ends = ConvexHull(face.flat), (face.flat.min(axis=0), face.flat.max(axis=0))
+    grid, rim = np.stack(np.meshgrid(*np.linspace(*ends, GRID).T), axis=-1).reshape(-1, 2), face.flat[hull.vertices]
+    within = face.columns(grid[Delaunay(rim).find_simplex(grid) >= 0])
     plane = np.linalg.lstsq(within[:, :3], within[:, 3:], rcond=None)[0]
-    columns = np.concatenate([within, _surface(face, face.outline)])
+    columns = np.concatenate([within, face.columns(rim)])
     bent = columns[:, 3:] - columns[:, :3] @ plane
     height = bent @ q
     between = bent[height.argmax()] - bent[height.argmin()]
@@ -264,35 +252,22 @@ def sheet_surface(prepared, placement):
     """
     if prepared.board.pattern is None:
         return None
-    points, seen = raised_points(prepared.board.pattern, prepared.relief), []
+    points, surfaces, weights = raised_points(prepared.board.pattern, prepared.relief), [], []
+    x, y = (points[:, :2] - points[:, :2].mean(axis=0)).T
     for camera, views in prepared.views.items():
         view = views.get(placement)
         if view is None or view.pixels is None or view.T_camera_board is None:
             continue
         if np.isfinite(view.pixels).all(axis=1).sum() >= FEWEST_CORNERS:
-            seen.append(_bent_pattern(view, prepared.models[camera], points))
-    if not seen:
+            pixels, start = view.pixels[None, None], RigidTransform.concatenate([view.T_camera_board])
+            basis = np.stack([x * x, x * y, y * y], axis=1)
+            found = adjust(pixels, points, [prepared.models[camera]], start, intrinsics=False, basis=basis)
+            away = np.sign(found.poses[0].rotation.as_matrix()[:, 2] @ found.poses[0].translation)
+            surfaces.append(away * found.shape)
+            weights.append(np.linalg.inv(found.shape_covariance))
+    if not weights:
         return None
-    surfaces, weights = (np.stack(v) for v in zip(*seen, strict=True))
-    information = weights.sum(axis=0)
+    surfaces, information = np.stack(surfaces), np.sum(weights, axis=0)
     q = np.linalg.solve(information, np.einsum("nij,nj->i", weights, surfaces))
-    differ = np.einsum("ni,nij,nj->", surfaces - q, weights, surfaces - q) / max(3 * (len(seen) - 1), 1)
+    differ = np.einsum("ni,nij,nj->", surfaces - q, weights, surfaces - q) / max(3 * (len(weights) - 1), 1)
     return q, np.linalg.inv(information) * max(1.0, differ)
-
-
-def _bent_pattern(view, model, points, rounds=6):
-    """Surface of the pattern in one image (coefficients with their information), pose and surface free."""
-    seen = np.isfinite(view.pixels).all(axis=1)
-    x, y = (points[seen, :2] - points[:, :2].mean(axis=0)).T
-    shape, pose, q = np.stack([x * x, x * y, y * y], axis=1), pose_array(view.T_camera_board), np.zeros(3)
-    away = np.sign(pose[:, 2] @ pose[:, 3])
-    for _ in range(rounds):
-        turned = rotate_points(pose, points[seen] + np.outer(shape @ q, [0.0, 0.0, 1.0]))
-        miss = view.pixels[seen] - project(turned + pose[:, 3], model)
-        by_point = project_jacobians(turned + pose[:, 3], model)[0]
-        by_shape = (by_point @ pose[:, 2])[:, :, None] * shape[:, None]
-        jacobian = np.concatenate([gradient_by_pose(turned[:, None], by_point), by_shape], axis=2).reshape(-1, 9)
-        step = np.linalg.lstsq(jacobian, miss.ravel(), rcond=None)[0]
-        pose, q = move_pose(pose, step[:6]), q + step[6:]
-    variance = np.sum(miss**2) / (miss.size - 9)
-    return away * q, np.linalg.inv(np.linalg.inv(jacobian.T @ jacobian)[6:, 6:] * variance)

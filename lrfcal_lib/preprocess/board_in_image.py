@@ -10,17 +10,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.camera import line_distance, pinhole, pinhole_jacobian, project, undistort
-from lrfcal_lib.model.geometry import apply_pose, gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
-from lrfcal_lib.preprocess.edges_in_image import (
-    FULL_CONTRAST,
-    EdgeNotSeen,
-    ImageEdge,
-    board_line,
-    picked_edge,
-    refine_edge,
-    sample,
-    step_contrast,
-)
+from lrfcal_lib.model.geometry import gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
+from lrfcal_lib.preprocess import edges_in_image
+from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, board_line, on_board, picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import SIGMA_FLOOR_PX, board_pose, raised_points
 from lrfcal_lib.preprocess.pattern_in_image import grey
 
@@ -29,10 +21,10 @@ LEAST_FILL = 0.9  # of the polygon by the dark region, and the other way round
 SEARCH_PX = 4.0
 EXACT_PX = 0.5  # a pose explains the outline when its corners fall this near (or within 4 sigma)
 SAME_NAMES_PX = 10.0  # from picks to the edges of their names
-POSE_ROUNDS = 15  # of Gauss-Newton
 AGREE_CHI2 = 18.4  # an edge disagrees with a pose beyond this: 1 in 10000 true ones (two degrees of freedom)
 WINDOW = 0.010  # half width of the narrow search, metres: edges sit within 1-3 mm (sd) in the sheet's frame
 PREDICTION_SIGMA = 0.005  # of an edge on the board, metres
+POSE_ROUNDS = 15  # of Gauss-Newton
 CORNER_INSET = 0.03  # share of an edge left out at both ends: corners curl and are torn
 COARSE_PROFILES, COARSE_ACROSS = 24, 25  # samples along and across each edge when orders of corners are compared
 CLEAR_SHARE = 0.7  # an order with less than this share of the best score is ruled out
@@ -64,8 +56,8 @@ class BoardView:
         Edges that cannot be used and why.
     reason : str
         Why the image cannot be used; empty if it can.
-    alternatives : tuple of RigidTransform
-        Other poses that explain a board without pattern as well.
+    alternatives : tuple of BoardView
+        Other poses that explain a board without pattern as well, with the names of the edges that go with them.
     """
 
     camera: str = ""
@@ -85,7 +77,7 @@ class BoardView:
         return next((e for e in self.edges if e.name == name), None)
 
 
-def view_board(image, board, model, view=None, picks=None, *, pixels=None, lines=None, relief=None, guess=None):
+def view_board(image, board, model, view=None, picks=None, *, lines=None, relief=None):
     """Find the board, its pose and its straight edges in one image.
 
     Parameters
@@ -95,14 +87,12 @@ def view_board(image, board, model, view=None, picks=None, *, pixels=None, lines
         With a pattern, or with known corners.
     model : CameraModel
     view : BoardView, optional
-        Says whose image it is.
+        Says whose image it is; for a board with a pattern it has the `pixels` of its corners, in the right order.
     picks : dict of str to ndarray, shape (2, 2), optional
         Ends of edges picked by hand (recorded pixels), which override the detector.
-    pixels, lines, relief : ndarray
-        For a board with a pattern: its corners (k, 2) in the right order, the outline (E, 3) that predicts its edges
-        (without it none are looked for), and the heights of the corners (k,), metres.
-    guess : RigidTransform, optional
-        Rough ``T_camera_board``; chooses between the poses of a board without pattern.
+    lines, relief : ndarray
+        For a board with a pattern: the outline (E, 3) that predicts its edges (without it none are looked for), and the
+        heights of the corners (k,), metres.
 
     Returns
     -------
@@ -115,48 +105,45 @@ def view_board(image, board, model, view=None, picks=None, *, pixels=None, lines
         return replace(view, reason=f"{size}, the intrinsics are for {model.width} x {model.height} pixels")
     if board.pattern is None:
         try:
-            return _view_plain(view, image, board, model, picks, guess)
+            found = _views_plain(view, image, board, model, picks)
         except (OutlineNotFound, EdgeNotSeen) as error:
             return replace(view, reason=str(error))
-    view = _view_pattern(view, image, board, model, picks, pixels, lines, relief)
+        if not found:
+            return replace(view, reason=f"no pose of board '{board.name}' explains the outline in the image")
+        return replace(found[0], alternatives=tuple(found[1:]))
+    view = _view_pattern(view, image, board, model, picks, lines, relief)
     if board.corners is None:
         return view
     pose, covariance = pose_with_edges(view, board, model, relief)
     return replace(view, T_camera_board=pose, covariance=covariance)
 
 
-def _view_pattern(view, image, board, model, picks, pixels, lines, relief):
-    """The view with the pose from the pattern's corners, and the edges around it."""
-    pose, covariance, used = board_pose(pixels, board.pattern, model, relief)
-    pixels = np.where(used[:, None], pixels, np.nan)
+def _view_pattern(view, image, board, model, picks, lines, relief):
+    """The view with the pose from the pattern's corners, and the edges around it, in a narrow search."""
+    pose, covariance, used = board_pose(view.pixels, board.pattern, model, relief)
+    pixels = np.where(used[:, None], view.pixels, np.nan)
     view = replace(view, pixels=pixels, T_camera_board=pose, covariance=covariance)
     if lines is None:
         return replace(view, rejected=tuple((name, "the outline of the board is not known") for name in board.edges))
     inner, corners, edges, rejected = undistort(np.nanmean(pixels, axis=0), model), corners_of_lines(lines), [], []
     for name, line, start, end in zip(board.edges, lines, corners, np.roll(corners, -1, axis=0), strict=True):
+        if name in picks:
+            edges.append(_pick(name, picks, inner, model))
+            continue
+        inset, middle = CORNER_INSET * (end - start), (start + end) / 2
+        uv = on_board(np.stack([start + inset, end - inset, middle, middle + WINDOW * line[:2]]), pose, model)
+        scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW
+        reach = np.clip(scale * WINDOW, 3.0, 40.0), max(scale * PREDICTION_SIGMA, 1.0)
         try:
-            found = _pick(name, picks[name], inner, model) if name in picks else None
-            edges.append(found or _predicted_edge(image, model, pose, name, start, end, line, inner))
+            edges.append(refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, *reach))
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
 
 
-def _pick(name, ends, inner, model):
-    start, end = undistort(ends, model)
+def _pick(name, picks, inner, model):
+    start, end = undistort(picks[name], model)
     return picked_edge(name, start, end, (start + end) / 2 - inner)
-
-
-def _predicted_edge(image, model, pose, name, start, end, line, inner):
-    """Narrow search around an edge drawn on the board."""
-    inset, middle = CORNER_INSET * (end - start), (start + end) / 2
-    on_board = np.stack([start + inset, end - inset, middle, middle + WINDOW * line[:2]])
-    uv = pinhole(pose.apply(np.column_stack([on_board, np.zeros(4)])), model)
-    if not np.isfinite(uv).all():
-        raise EdgeNotSeen("it passes behind the camera")
-    scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW
-    half_width = np.clip(scale * WINDOW, 3.0, 40.0)
-    return refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, half_width, max(scale * PREDICTION_SIGMA, 1.0))
 
 
 def order_scores(image, board, model, orders, poses):
@@ -167,35 +154,28 @@ def order_scores(image, board, model, orders, poses):
     the full search finds.
     """
     lines = board.lines()
-    corners = corners_of_lines(lines)
+    start = corners_of_lines(lines)
+    end, score = np.roll(start, -1, axis=0), np.zeros(len(orders))
     across = (np.linspace(-2, 2, COARSE_ACROSS) * PREDICTION_SIGMA)[:, None, None, None]
     along = np.linspace(CORNER_INSET, 1 - CORNER_INSET, COARSE_PROFILES)[:, None]
-    start, way = corners[:, None], (np.roll(corners, -1, axis=0) - corners)[:, None]
-    xy = start + along * way + across * lines[:, None, :2]
-    points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
-    uv = np.nan_to_num(pinhole(apply_pose(pose_array(poses), points), model), nan=-1e6)
-    strip = sample(image, model, np.moveaxis(uv.reshape(len(orders), COARSE_ACROSS, -1, 2), 0, 1))
-    height = step_contrast(strip.reshape(COARSE_ACROSS, -1, strip.shape[-1]), 1.5, along=1)
-    weight = height / (height + FULL_CONTRAST) * np.exp(-0.5 * (across[..., 0, 0] / PREDICTION_SIGMA) ** 2)
-    scores = np.median(weight.max(axis=0).reshape(len(orders), len(lines), -1), axis=2).sum(axis=1)
-    likely = np.flatnonzero(scores >= CLEAR_SHARE * scores.max())
-    if len(likely) > 1:
-        views = [_view_pattern(BoardView(), image, board, model, {}, orders[i], lines, None) for i in likely]
-        support = np.array([_support(view, board, model, lines) for view in views])
-        scores, coarse = np.zeros(len(orders)), scores.max()
-        scores[likely] = coarse * support / max(support.max(), 1e-9)
-    return scores
-
-
-def _support(view, board, model, lines):
-    """Profiles that found an edge, each counting less the farther its edge lies from where the outline puts it."""
-    corners, score = corners_of_lines(lines), 0.0
-    for edge in view.edges:
-        i = board.edges.index(edge.name)
-        seen = board_line(view, edge, model)
-        off = np.sqrt(np.mean((corners[[i, (i + 1) % len(corners)]] @ seen[:2] + seen[2]) ** 2))
-        score += edge.n_points / (1 + (off / PREDICTION_SIGMA) ** 2)
-    return score
+    xy = start[:, None] + along * (end - start)[:, None] + across * lines[:, None, :2]
+    uv = np.stack([on_board(xy.reshape(COARSE_ACROSS, -1, 2), pose, model) for pose in poses], axis=1)
+    strip = edges_in_image.sample(image, model, uv.reshape(COARSE_ACROSS, -1, 2))
+    height = edges_in_image.step_contrast(strip, 1.5, along=1)
+    expected = np.exp(-0.5 * (across[..., 0, 0] / PREDICTION_SIGMA) ** 2)
+    weight = height / (height + edges_in_image.FULL_CONTRAST) * expected
+    coarse = np.median(weight.max(axis=0).reshape(len(orders), len(lines), -1), axis=2).sum(axis=1)
+    likely = np.flatnonzero(coarse >= CLEAR_SHARE * coarse.max())
+    if len(likely) == 1:
+        return coarse
+    for i in likely:
+        # profiles that found an edge count less the farther it lies from where the outline puts it
+        view = _view_pattern(BoardView(pixels=orders[i]), image, board, model, {}, lines, None)
+        for edge in view.edges:
+            k, seen = board.edges.index(edge.name), board_line(view, edge, model)
+            off = np.mean((np.stack([start[k], end[k]]) @ seen[:2] + seen[2]) ** 2)
+            score[i] += edge.n_points / (1 + off / PREDICTION_SIGMA**2)
+    return coarse.max() * score / max(score.max(), 1e-9)
 
 
 def pose_with_edges(view, board, model, relief=None):
@@ -251,20 +231,17 @@ def pose_from_edges(edges, board, model, start, covariance=None):
     """
     white = np.zeros((0, 6)) if covariance is None else np.linalg.inv(np.linalg.cholesky(covariance))
     start = pose = pose_array(start)
-
-    def whole(pose):
+    step, rounds = np.ones(6), POSE_ROUNDS
+    # plain Gauss-Newton: the weights of the lines move along with the pose, so that no sum of squares falls steadily
+    while True:
         residual, jacobian = line_residuals(edges, board, model, pose)
-        turned = Rotation.from_matrix(pose[:, :3] @ start[:, :3].T).as_rotvec()
-        residual = np.r_[residual.ravel(), white @ np.r_[turned, pose[:, 3] - start[:, 3]]]
-        return residual, np.concatenate([jacobian.reshape(-1, 6), white])
-
-    for _ in range(POSE_ROUNDS):
-        residual, jacobian = whole(pose)
-        step = np.linalg.lstsq(jacobian, -residual, rcond=1e-12)[0]
-        pose = move_pose(pose, step)
-        if np.abs(step).max() < 1e-12:
+        turn = Rotation.from_matrix(pose[:, :3] @ start[:, :3].T)
+        moved = np.r_[turn.as_rotvec(), pose[:, 3] - start[:, 3]]
+        residual, jacobian = np.r_[residual.ravel(), white @ moved], np.concatenate([jacobian.reshape(-1, 6), white])
+        if rounds == 0 or np.abs(step).max() < 1e-12:
             break
-    residual, jacobian = whole(pose)
+        step, rounds = np.linalg.lstsq(jacobian, -residual, rcond=1e-12)[0], rounds - 1
+        pose = move_pose(pose, step)
     return pose_transform(pose), np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), float(residual @ residual)
 
 
@@ -285,35 +262,27 @@ def line_residuals(edges, board, model, pose):
     return (white @ off[..., None])[..., 0], white @ gradient_by_pose(turned, by_point)
 
 
-def _view_plain(view, image, board, model, picks, guess):
-    """The view of a dark board without pattern, whose outline (or picks of all its edges) tells the pose."""
+def _views_plain(view, image, board, model, picks):
+    """Views of a dark board without pattern, one for each pose that its outline (or picks of all its edges) allows."""
+    ends = {name: undistort(uv, model) for name, uv in picks.items()}
     if set(picks) == set(board.edges):
         inner = undistort(np.mean([picks[n] for n in board.edges], axis=(0, 1)), model)
-        picked = {name: _pick(name, picks[name], inner, model) for name in board.edges}
-        # sides in the turning sense of the image; board_poses tries every start, picks know the names
-        found = board_poses(list(picked.values())[::-1], board, model)
-        found = [item for item in found if all(np.allclose(e.centre, picked[e.name].centre) for e in item[2])]
+        # sides in the turning sense of the image
+        sides = [_pick(name, picks, inner, model) for name in board.edges][::-1]
     else:
         corners = undistort(find_polygon(image, len(board.known_corners())), model)
-        middle, sides = corners.mean(axis=0), zip(corners, np.roll(corners, -1, axis=0), strict=True)
-        edges = [
+        middle = corners.mean(axis=0)
+        sides = [
             refine_edge(image, model, "", a + 0.04 * (b - a), b - 0.04 * (b - a), (a + b) / 2 - middle, SEARCH_PX)
-            for a, b in sides
+            for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
         ]
-        ends = {name: undistort(uv, model) for name, uv in picks.items()}
-        found = [
-            item
-            for item in board_poses(edges, board, model)
-            if all(np.abs(line_distance(ends[e.name], e.line)).max() < SAME_NAMES_PX for e in item[2] if e.name in ends)
-        ]
-    if not found:
-        return replace(view, reason=f"no pose of board '{board.name}' explains the outline in the image")
-    if guess is not None:
-        found.sort(key=lambda item: (item[0].rotation * guess.rotation.inv()).magnitude())
-    (pose, covariance, edges), others = found[0], tuple(p for p, _, _ in found[1:])
-    inner = np.mean([e.centre for e in edges], axis=0)
-    edges = tuple(_pick(e.name, picks[e.name], inner, model) if e.name in picks else e for e in edges)
-    return replace(view, T_camera_board=pose, covariance=covariance, edges=edges, alternatives=others)
+    found = []
+    for pose, covariance, edges in board_poses(sides, board, model):
+        if all(np.abs(line_distance(ends[e.name], e.line)).max() < SAME_NAMES_PX for e in edges if e.name in ends):
+            inner = np.mean([e.centre for e in edges], axis=0)
+            edges = tuple(_pick(e.name, picks, inner, model) if e.name in picks else e for e in edges)
+            found.append(replace(view, T_camera_board=pose, covariance=covariance, edges=edges))
+    return found
 
 
 def find_polygon(image, n_corners):
@@ -337,12 +306,11 @@ def find_polygon(image, n_corners):
                 cut = True
             else:
                 best, best_area = corners, area
+    if best is None and cut:
+        raise OutlineNotFound("the dark board is cut by the image border")
     if best is None:
-        raise OutlineNotFound(
-            "the dark board is cut by the image border"
-            if cut
-            else f"no dark region with {n_corners} straight edges in the image: the board must stand out from the rest"
-        )
+        why = "the board must stand out from the rest"
+        raise OutlineNotFound(f"no dark region with {n_corners} straight edges in the image: {why}")
     return best
 
 
@@ -351,16 +319,12 @@ def _polygon(contour, area, n_corners):
     hull = cv2.convexHull(contour)
     if area < LEAST_FILL * cv2.contourArea(hull) or len(hull) < n_corners:
         return None
-    corners = (
-        cv2.minEnclosingTriangle(hull)[1] if n_corners == 3 else cv2.approxPolyN(hull, n_corners, None, -1.0, True)
-    )
-    corners = None if corners is None else corners.reshape(-1, 2)
-    if corners is None or len(corners) != n_corners or area < LEAST_FILL * cv2.contourArea(corners.astype(np.float32)):
+    triangle = n_corners == 3
+    corners = cv2.minEnclosingTriangle(hull)[1] if triangle else cv2.approxPolyN(hull, n_corners, None, -1.0, True)
+    if corners is None or corners.size != 2 * n_corners or area < LEAST_FILL * cv2.contourArea(corners):
         return None
-    corners = corners.astype(float)
-    x, y = corners.T
-    turn = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
-    return corners if turn > 0 else corners[::-1]
+    corners = corners.reshape(-1, 2).astype(float)
+    return corners if cv2.contourArea(corners.astype(np.float32), True) > 0 else corners[::-1]
 
 
 def board_poses(edges, board, model):

@@ -9,16 +9,10 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    fit_plane,
-    lrf_to_platform,
-    polar_covariance,
-    polar_to_points,
-    tilt,
-)
+from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_covariance, polar_to_points, tilt
 from lrfcal_lib.session.read import Sweep
 
 STEEPEST = np.tan(np.radians(80))  # a face seen at a flatter angle than 10 deg is taken for a depth jump
@@ -64,9 +58,8 @@ def surfaces(ranges, bearings, pitch):
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
     close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], np.diff(pitch)[:, None])
-    pairs = np.unique(np.stack([pieces[:-1][close], pieces[1:][close]]), axis=1)
     n = pieces.max(initial=-1) + 1
-    graph = coo_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(n, n))
+    graph = coo_array((np.ones(close.sum()), (pieces[:-1][close], pieces[1:][close])), shape=(n, n))
     joined = connected_components(graph, directed=False)[1] if n else np.zeros(0, int)
     return np.where(pieces >= 0, np.append(joined, -1)[pieces], -1)
 
@@ -93,7 +86,7 @@ def planar_surface(sweep, T_head_lrf, board, rng):
             if sweep.ranges[mask].min() > best[0]:
                 continue
             reach = float(np.median(sweep.ranges[mask]))
-            mask, size, fits = _trimmed(points, mask, plane[0], board, upright)
+            mask, size, fits = _trimmed(points, mask, plane[0], _size_limits(board), upright)
             fault = "" if single else _fault(sweep, T_head_lrf, points, mask, plane[0])
             seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m{fault}")
             if fits and not fault and reach < best[0]:
@@ -127,57 +120,55 @@ def best_plane(points, upright, rng, trials=200, sample=1500):
     """Random sample consensus over neighbouring points, then total least squares over all that agree; None if none."""
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
-    near = np.linalg.norm(seeds[:, None] - few, axis=2)
+    near = cdist(seeds, few)
     near = np.where((near < 0.3) & (near > 1e-6), rng.random(near.shape), -1.0)
     others = few[np.argpartition(-near, 1, axis=1)[:, :2]]
-    second = others[:, 1] - seeds if upright is None else np.broadcast_to(upright, seeds.shape)
-    normals = np.cross(others[:, 0] - seeds, second)
-    length = np.linalg.norm(normals, axis=1)
-    normals = normals[length > 1e-9] / length[length > 1e-9, None]
-    offsets = np.sum(normals * seeds[length > 1e-9], axis=1)
+    normals = np.cross(others[:, 0] - seeds, others[:, 1] - seeds if upright is None else upright)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    good = length[:, 0] > 1e-9
+    normals = normals[good] / length[good]
+    offsets = np.sum(normals * seeds[good], axis=1)
     if len(normals) == 0:
         return None
-    votes = np.sum(np.abs(normals @ few.T - offsets[:, None]) < PLANE_NOISE, axis=1)
-    plane = normals[votes.argmax()], offsets[votes.argmax()]
+    best = np.sum(np.abs(normals @ few.T - offsets[:, None]) < PLANE_NOISE, axis=1).argmax()
+    plane = normals[best], offsets[best]
     for _ in range(3):
         on = points[np.abs(points @ plane[0] - plane[1]) < PLANE_NOISE]
         if upright is not None:
             on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
         try:
             plane = fit_plane(on)[:2]
-        except DegenerateGeometry:
+        except ValueError:  # too few points, or all on one line
             return None
     return plane
 
 
-def _trimmed(points, mask, normal, board, upright):
+def _trimmed(points, mask, normal, limits, upright):
     """A flat surface, if need be without thin strips of floor or wall; its size, and whether it may be the board."""
-    size = plane_size(points[mask], normal, upright)
-    fits = _plausible(size, board, upright is not None)
-    if fits or upright is not None:
-        return mask, size, fits
-    core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
-    labels, count = ndimage.label(core)
-    if count == 0:
-        return mask, size, False
-    core = labels == np.bincount(labels[labels > 0]).argmax()
-    mask = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
-    return mask, size, _plausible(plane_size(points[mask], normal), board, False)
+    (least, most, longest), size = limits, plane_size(points[mask], normal, upright)
+    if upright is not None:
+        return mask, size, 0.3 * np.sqrt(least) < size[1] < longest
+    area, length = size
+    if not (least < area < most and length < longest):
+        core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
+        labels, count = ndimage.label(core)
+        if count == 0:
+            return mask, size, False
+        core = labels == np.bincount(labels[labels > 0]).argmax()
+        mask = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
+        area, length = plane_size(points[mask], normal)
+    return mask, size, least < area < most and length < longest
 
 
-def _plausible(size, board, single_line):
-    """Whether an area (m2) and a greatest length (m) may be what is seen of a board."""
-    least, most, longest = RIGID_SIZES
+def _size_limits(board):
+    """Least and largest area (m2) and greatest length (m) of what may be seen of a board."""
     if board is not None and board.corners is not None:
-        corners = np.asarray(board.corners, float)
-        area, length = ConvexHull(corners).volume, np.linalg.norm(corners[:, None] - corners, axis=2).max()
-        least, most, longest = 0.25 * area, 1.35 * area, 1.2 * length
-    elif board is not None and board.pattern is not None:
+        area, length = ConvexHull(board.corners).volume, pdist(board.corners).max()
+        return 0.25 * area, 1.35 * area, 1.2 * length
+    if board is not None and board.pattern is not None:
         sides = board.pattern.square * np.array([board.pattern.columns + 1, board.pattern.rows + 1])
-        least, most, longest = 0.3 * np.prod(sides), 4 * np.prod(sides), 2.5 * np.linalg.norm(sides)
-    if single_line:
-        return 0.3 * np.sqrt(least) < size[1] < longest
-    return least < size[0] < most and size[1] < longest
+        return 0.3 * np.prod(sides), 4 * np.prod(sides), 2.5 * np.linalg.norm(sides)
+    return RIGID_SIZES
 
 
 def _fault(sweep, T_head_lrf, points, mask, normal):
@@ -215,8 +206,7 @@ def plane_size(points, normal, upright=None):
         hull = ConvexHull(flat)
     except QhullError:
         return 0.0, float(np.linalg.norm(np.ptp(flat, axis=0)))
-    corners = flat[hull.vertices]
-    return float(hull.volume), float(np.linalg.norm(corners[:, None] - corners, axis=2).max())
+    return float(hull.volume), float(pdist(flat[hull.vertices]).max())
 
 
 MEDIAN_WIDTH = 5  # beams
@@ -266,13 +256,6 @@ class BoardScan:
     sigma_range: float
     n_jump_points: int
 
-    def __repr__(self):
-        rows = self.mask.any(axis=1).sum()
-        return (
-            f"BoardScan(placement {self.placement}: {self.mask.sum()} points on {rows} scan lines, "
-            f"sigma {1000 * self.sigma_range:.1f} mm, {self.n_jump_points} jump points)"
-        )
-
 
 def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
     """Find the board in a sweep, filter its ranges and fit a straight line to each scan line.
@@ -297,20 +280,18 @@ def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
         If no flat surface has the board's size.
     """
     T_head_lrf = RigidTransform.identity() if T_head_lrf is None else T_head_lrf
-    rng = np.random.default_rng(0) if rng is None else rng
-    mask, normal, distance = planar_surface(sweep, T_head_lrf, board, rng)
+    mask, *plane = planar_surface(sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng)
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
-    off = np.abs(residuals) > PLANE_NOISE * 2
-    sigma = float(np.sqrt(np.nanmean(np.where(off, np.nan, residuals) ** 2)))
-    if not np.isfinite(sigma):
+    residuals[np.abs(residuals) > PLANE_NOISE * 2] = np.nan
+    if not np.isfinite(residuals).any():
         raise BoardNotFound(f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board")
-    covariance = np.linalg.inv(information) * sigma**2
-    jumps = int(jump_points(sweep.ranges, fitted, sigma).sum())
-    plane = {"normal": normal, "distance": distance, "sigma_range": sigma, "n_jump_points": jumps}
-    return BoardScan(sweep.placement, sweep, T_head_lrf, mask, filtered, fitted, lines, covariance, **plane)
+    sigma = float(np.sqrt(np.nanmean(residuals**2)))
+    covariance, jumps = np.linalg.inv(information) * sigma**2, int(jump_points(sweep.ranges, fitted, sigma).sum())
+    images = mask, filtered, fitted, lines, covariance
+    return BoardScan(sweep.placement, sweep, T_head_lrf, *images, *plane, sigma, jumps)
 
 
 def median_filter(ranges, mask, width=MEDIAN_WIDTH):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from lrfcal_lib.model.camera import distort, line_through, pinhole
 
@@ -22,6 +22,7 @@ FULL_CONTRAST = 30.0  # grey levels: a step of this height counts half, cardboar
 PICK_SIGMA_PX = 1.0  # of a point clicked by hand
 STEP = 0.02  # of the wide search, in squares
 NEAREST, FARTHEST = 1.1, 6.0  # squares outside the outermost inner corners
+BEHIND = -1e6  # pixels; where points behind the camera are drawn
 SIDES = ("top", "right", "bottom", "left")
 SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
 
@@ -58,16 +59,13 @@ class ImageEdge:
     rms_px: float
     picked: bool = False
 
-    def sigma_at(self, uv):
-        """Standard deviation of the line's offset at undistorted pixels (..., 2) on (or near) it, pixels."""
-        # turning the normal by a moves the line at the position s along (-n1, n0) by -a s outwards
-        lever = (np.asarray(uv, float) - self.centre) @ np.array([self.line[1], -self.line[0]])
-        c = self.covariance
-        return np.sqrt(c[0, 0] + 2 * lever * c[0, 1] + lever**2 * c[1, 1])
-
 
 class EdgeNotSeen(ValueError):
     """An edge cannot be used in this image; the message is the reason."""
+
+
+class OutlineNotSeen(ValueError):
+    """The images do not show where a board ends (a sheet on a wall, a background as bright as the board)."""
 
 
 def sample(image, model, uv):
@@ -79,19 +77,18 @@ def sample(image, model, uv):
     normalised = (uv - [model.cx, model.cy]) / [model.fx, model.fy]
     seen = distort(normalised, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
     height, width, channels = image.shape
+    (x, y), (u, v) = np.moveaxis(normalised, -1, 0), np.moveaxis(seen, -1, 0)
     # far outside, where the radial distortion no longer grows, it folds points back into the image
     k1, k2, _, _, k5 = model.distortion
-    r2 = np.sum(normalised**2, axis=-1)
+    r2 = x * x + y * y
     inside = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
-    inside &= np.all((seen >= 0) & (seen < [width - 1, height - 1]), axis=-1)
-    seen = np.where(inside[..., None], seen, 0)
-    corner = np.floor(seen).astype(np.intp)
-    f = (seen - corner).astype(np.float32)
-    flat = image.reshape(-1, channels)
-    at = corner[..., 1] * width + corner[..., 0]
-    u, v = f[..., :1], f[..., 1:]
-    top = flat[at] * (1 - u) + flat[at + 1] * u
-    out = top * (1 - v) + (flat[at + width] * (1 - u) + flat[at + width + 1] * u) * v
+    inside &= (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    column, row = u.astype(np.intp), v.astype(np.intp)
+    u, v = ((s - whole).astype(np.float32)[..., None] for s, whole in ((u, column), (v, row)))
+    flat, at = image.reshape(-1, channels), row * width + column
+    top, bottom = (flat.take(i, axis=0) * (1 - u) + flat.take(i + 1, axis=0) * u for i in (at, at + width))
+    out = top * (1 - v) + bottom * v
     out[~inside] = np.nan
     return out
 
@@ -119,21 +116,18 @@ def peaks(height, least=LEAST_CONTRAST):
     return column, row + 1 + 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-12), b
 
 
-def vote(column, place, weight, shape, slopes, tolerance=1):
+def vote(column, place, weight, shape, slopes):
     """Weight of the profiles with a peak near each line ``place = offset + slope (column - middle)``, (m, across).
 
-    `shape` is (across, along) of the strip, `tolerance` the number of samples on either side that still agree.
+    `shape` is (across, along) of the strip; a sample to either side still agrees.
     """
     across, along = shape
-    out = np.zeros((len(slopes), across))
-    for i, slope in enumerate(slopes):
-        offset = np.rint(place - slope * (column - (along - 1) / 2)).astype(int)
-        hit = np.zeros((across + 2 * tolerance + 1, along))
-        good = (offset >= 0) & (offset < across)
-        for shift in range(2 * tolerance + 1):
-            np.maximum.at(hit, (offset[good] + shift, column[good]), weight[good])
-        out[i] = hit[tolerance : tolerance + across].sum(axis=1)
-    return out
+    offset = np.rint(place - slopes[:, None] * (column - (along - 1) / 2)).astype(int)
+    line, peak = np.nonzero((offset >= 0) & (offset < across))
+    hit = np.zeros((len(slopes), across + 2, along))
+    for agree in range(3):
+        np.maximum.at(hit, (line, offset[line, peak] + agree, column[peak]), weight[peak])
+    return hit[:, 1:-1].sum(axis=2)
 
 
 def fit_line(column, place, offset, slope, tolerance, rounds=12):
@@ -191,6 +185,8 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     """
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = np.linalg.norm(end - start)
+    if min(*start, *end) <= BEHIND:
+        raise EdgeNotSeen("it passes behind the camera")
     if not LEAST_PROFILES <= length < 8 * max(image.shape):
         raise EdgeNotSeen(f"its predicted length is {length:.0f} px")
     along = (end - start) / length
@@ -291,7 +287,29 @@ def edge_votes(image, board, model, pose):
 def on_board(xy, pose, model):
     """Undistorted pixels of points (..., 2) of the board; far outside the image where they lie behind the camera."""
     points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
-    return np.nan_to_num(pinhole(pose.apply(points), model), nan=-1e6).reshape(xy.shape)
+    return np.nan_to_num(pinhole(pose.apply(points), model), nan=BEHIND).reshape(xy.shape)
+
+
+def common_lines(votes, board):
+    """Board lines (4, 3) of the edges that many views agree on, from votes (v, 4, n) that are turned alike.
+
+    OutlineNotSeen names an edge on which they do not agree.
+    """
+    # an edge moves by a few millimetres between placements
+    wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), 7, axis=-1)
+    wide[wide < 0] = np.nan
+    distances, places = wide_distances(board.pattern), []
+    for name, own in zip(SIDES, np.moveaxis(wide, 1, 0), strict=True):
+        enough = np.isfinite(own).sum(axis=0) >= min(3, len(votes))
+        mean = np.zeros(len(distances))
+        mean[enough] = np.nanmean(own[:, enough], axis=0)
+        places.append(outer_peak(gaussian_filter1d(mean, 1.0)))
+        if places[-1] < 0:
+            raise OutlineNotSeen(
+                f"the images do not agree on the {name} edge of board '{board.name}': give the corners of the board or "
+                "pick edges by hand"
+            )
+    return side_lines(board.pattern, distances[places])
 
 
 def outer_peak(votes, least=0.5, quiet=0.2, width=6):

@@ -75,21 +75,21 @@ def straight_runs(points, order, tolerance, shortest):
     return runs
 
 
-def line_of(points):
-    """Total least squares line in a plane: centre, direction, and the points' places along and across it, metres."""
-    centre = points.mean(axis=0)
+def line_of(points, among=slice(None)):
+    """Total least squares line of some points (n, 2): centre, direction, places of all along and across it, metres."""
+    centre = points[among].mean(axis=0)
     offset = points - centre
-    direction = np.linalg.eigh(offset.T @ offset)[1][:, 1]
+    direction = np.linalg.eigh(offset[among].T @ offset[among])[1][:, 1]
     return centre, direction, offset @ direction, offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
 
 
 def _consensus(points, tolerance, apart, rng, trials=300):
-    """Indices of the points near the line that most points agree with, after two least-squares refinements."""
+    """Which points lie near the line that most points agree with, after two least-squares refinements."""
     a, b = points[rng.integers(len(points), size=trials)], points[rng.integers(len(points), size=trials)]
     length = np.linalg.norm(b - a, axis=1)
     far = length > apart
     if not far.any():
-        return np.zeros(0, int)
+        return np.zeros(len(points), bool)
     a, along = a[far], (b - a)[far] / length[far, None]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
@@ -97,12 +97,9 @@ def _consensus(points, tolerance, apart, rng, trials=300):
     best = np.minimum((distance / tolerance) ** 2, 1).sum(axis=1).argmin()
     on = np.abs(distance[best]) < tolerance
     for _ in range(2):
-        if on.sum() < 2:
-            break
-        centre, direction, _, _ = line_of(points[on])
-        offset = points - centre
-        on = np.abs(offset[:, 1] * direction[0] - offset[:, 0] * direction[1]) < tolerance
-    return np.flatnonzero(on)
+        if on.sum() >= 2:
+            on = np.abs(line_of(points, on)[3]) < tolerance
+    return on
 
 
 @dataclass(frozen=True)
@@ -145,6 +142,12 @@ class ScanSide:
         along it, and with it where a wide spot takes the edge to be.
         """
         return float(np.sqrt(12 * (2 * self.rms**2 / self.n_points + EDGE_BEND**2)) / self.length)
+
+    def is_same(self, other):
+        """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
+        along, its = ((s.ends[1] - s.ends[0]) / s.length for s in (self, other))
+        apart = np.cross(other.ends.mean(axis=0) - self.ends.mean(axis=0), along)
+        return abs(along @ its) > np.cos(LEAST_TURN) and np.linalg.norm(apart) < SAME_SIDE
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ def edge_points(scan, variant="half_step"):
         beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at
         less than 20 deg to the scan lines are left out (side -1): there the pitch decides where a line ends.
     """
-    return _edges(scan, variant, False)
+    return _of(variant, crossings(scan)[0])
 
 
 def sweep_edges(scan, variant="half_step"):
@@ -223,13 +226,21 @@ def sweep_edges(scan, variant="half_step"):
     them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points` sees too has the same number. The
     covariance is that of the pitch step (as a displacement on the board) and of the line fit.
     """
-    return _edges(scan, variant, True)
+    return _of(variant, crossings(scan, True, crossings(scan)[1])[0])
 
 
-def _edges(scan, variant, across, least_angle=LEAST_ANGLE):
-    """Crossings of scan lines or, with `across`, of columns: one rule, in which bearing and pitch change places."""
-    if variant not in VARIANTS:
-        raise ValueError(f"variant is one of {', '.join(VARIANTS)}, got '{variant}'")
+def _of(variant, found):
+    if variant not in found:
+        raise ValueError(f"variant is one of {', '.join(found)}, got '{variant}'")
+    return found[variant]
+
+
+def crossings(scan, across=False, known=()):
+    """Crossings of scan lines or, with `across`, of columns: one rule, in which bearing and pitch change places.
+
+    Returns ScanEdges by variant, and all sides with those that are seen at too small an angle; sides that are among the
+    `known` ones keep their number.
+    """
     line, beam, step, end = _ends(scan, across)
     angles, cell = (scan.sweep.pitch, line) if across else (scan.sweep.bearings, beam)
     inner, outer = angles[cell], angles[cell + step.sum(axis=1)]
@@ -237,25 +248,23 @@ def _edges(scan, variant, across, least_angle=LEAST_ANGLE):
     if across and len(angles) > 1:  # the pitch is read in steps, it may seem to stand still
         gap = np.copysign(np.maximum(np.abs(gap), np.median(np.abs(np.diff(angles)))), gap)
     shift, warp_sigma = (0.0, 0.0) if across else _warp(scan, line, beam, end)
-    points, by_angle, range_sigma = _points_at(scan, line, beam, middle, shift, across)
+    points, by_angle, _ = _points_at(scan, line, beam, middle, shift, across)
     here, behind = scan.fitted[line, beam], beyond(scan, line, beam, step)
-    known = _edges(scan, variant, False, 0.0).sides if across else ()
     order, when = (beam, middle) if across else (line, pitch)
-    side, sides = _group(scan, points, when, order, end, behind - here < MIXING, known)
+    side, every = _group(scan, points, when, order, end, behind - here < MIXING, known)
     sigma = np.abs(gap) * UNIFORM
-    sigma = sigma * _inflation(_to_platform(scan, by_angle, when), sigma, side, sides)
-    half = by_angle * (gap / 2)[:, None]
-    if variant == "last_beam":
-        when = pitch
-        points, by_angle, range_sigma = _points_at(scan, line, beam, inner, shift, across)
-    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    noise = _outer(rays * np.hypot(range_sigma, warp_sigma)[:, None])
-    covariance = _outer(by_angle * sigma[:, None]) + noise
-    if sides:  # scans at one pitch have none, and keep all points
-        sides = tuple(s for s in sides if (np.pi / 2 - s.angle if across else s.angle) >= least_angle)
-        side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
-    about = line, beam, step, end, side, sides, half, noise, background_odds(here, behind)
-    return ScanEdges(scan.placement, variant, points, covariance, when, *about)
+    sigma = sigma * _inflation(_to_platform(scan, by_angle, when), sigma, side, every)
+    # scans at one pitch have no sides, and keep all points
+    sides = tuple(s for s in every if (np.pi / 2 - s.angle if across else s.angle) >= LEAST_ANGLE)
+    side = np.where(np.isin(side, [s.side for s in sides]), side, -1) if every else side
+    about = line, beam, step, end, side, sides, by_angle * (gap / 2)[:, None]
+    odds, found = background_odds(here, behind), {}
+    for variant, angle, there in (("last_beam", inner, pitch), ("half_step", middle, when)):
+        points, by_angle, range_sigma = _points_at(scan, line, beam, angle, shift, across)
+        noise = points / np.linalg.norm(points, axis=1, keepdims=True) * np.hypot(range_sigma, warp_sigma)[:, None]
+        noise, spacing = (np.einsum("ni,nj->nij", v, v) for v in (noise, by_angle * sigma[:, None]))
+        found[variant] = ScanEdges(scan.placement, variant, points, spacing + noise, there, *about, noise, odds)
+    return found, every
 
 
 def _ends(scan, across):
@@ -289,8 +298,8 @@ def _points_at(scan, line, beam, angle, shift, across):
     if not across:
         slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
         return (r + shift)[:, None] * rays, slope[:, None] * rays + r[:, None] * turned, range_sigma
-    change = _plane_range(scan, rays, angle) - _plane_range(scan, rays, scan.sweep.pitch[line])
-    points = (scan.fitted[line, beam] + change)[:, None] * rays
+    there, here = (_plane_range(scan, rays, pitch)[0] for pitch in (angle, scan.sweep.pitch[line]))
+    points = (scan.fitted[line, beam] + (there - here))[:, None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     turned = np.cross([1.0, 0.0, 0.0], scan.T_head_lrf.apply(points)) @ rotation  # d p / d pitch, in the LRF frame
     normal = tilt(scan.normal, -angle) @ rotation
@@ -299,18 +308,15 @@ def _points_at(scan, line, beam, angle, shift, across):
 
 
 def _plane_range(scan, rays, pitch):
-    """Range along rays (LRF frame) to the board's plane."""
-    origin = lrf_to_platform(np.zeros((len(rays), 3)), pitch, scan.T_head_lrf)
-    return (scan.distance - origin @ scan.normal) / (_to_platform(scan, rays, pitch) @ scan.normal)
+    """Range along rays (LRF frame) to the board's plane, and the cosine of their incidence."""
+    cosine = _to_platform(scan, rays, pitch) @ scan.normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (scan.distance - tilt(scan.T_head_lrf.translation, pitch) @ scan.normal) / cosine, cosine
 
 
 def _to_platform(scan, vectors, pitch):
     """Directions (not points) from the LRF at a pitch to the nominal platform frame."""
     return tilt(vectors @ scan.T_head_lrf.rotation.as_matrix().T, pitch)
-
-
-def _outer(v):
-    return v[:, :, None] * v[:, None, :]
 
 
 def _warp(scan, line, beam, end):
@@ -374,7 +380,7 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
         for run in straight_runs(flat[mine], place, max(float(spacing), EDGE_SCATTER), shortest):
             rows = mine[run]
             new = _describe(scan, flat[rows], axes, e, float(np.mean(pitch[rows])))
-            number = next((s.side for s in known if _is_same(s, new)), len(known) + len(sides))
+            number = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
             side[rows] = number
             sides.append(replace(new, side=number))
     return side, tuple(sides)
@@ -384,18 +390,10 @@ def _describe(scan, flat, axes, end, pitch):
     """A ScanSide (number still open) from its points in the plane."""
     centre, direction, along, across = line_of(flat)
     ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
-    scan_plane = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
-    level = np.cross(scan_plane, scan.normal)
+    level = np.cross(_to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch), scan.normal)
     cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
     rms = float(np.sqrt(np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)))
     return ScanSide(-1, end, len(flat), float(np.ptp(along)), rms, float(np.arccos(min(cosine, 1.0))), ends)
-
-
-def _is_same(a, b):
-    """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
-    along, other = ((s.ends[1] - s.ends[0]) / s.length for s in (a, b))
-    apart = np.cross(b.ends.mean(axis=0) - a.ends.mean(axis=0), along)
-    return abs(along @ other) > np.cos(LEAST_TURN) and np.linalg.norm(apart) < SAME_SIDE
 
 
 @dataclass(frozen=True)
@@ -475,12 +473,13 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     """
     if reach < 1:
         raise ValueError(f"reach is a number of beams on either side of an edge, at least 1, got {reach}")
-    found = [edges for edges in (along, swept) if edges is not None]
+    found, sweep = [edges for edges in (along, swept) if edges is not None], scan.sweep
     line, beam, step, side = (
         np.concatenate([getattr(edges, name)[edges.side >= 0] for edges in found])
         for name in ("line", "beam", "step", "side")
     )
-    board, cosine = _on_plane(scan)
+    board, cosine = _plane_range(scan, polar_to_points(1.0, sweep.bearings), sweep.pitch[:, None])
+    board[~(board > 0)] = np.nan
     radius = np.full(board.shape, ASSUMED_SPOT_RADIUS) if lrf is None else lrf.spot_radius(board)
     here, behind = board[line, beam], beyond(scan, line, beam, step)
     seen, mixed = np.isfinite(behind), behind - here < MIXING
@@ -490,30 +489,27 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape, reach)
     # before a far background also beams that noise takes off the plane read the board
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
+    gaps = [np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (sweep.pitch, sweep.bearings)]
     with np.errstate(invalid="ignore"):
-        excess = (scan.sweep.ranges - board)[line, beam]
+        miss = sweep.ranges - board
+        excess = miss[line, beam]
         hit = scan.mask[line, beam] | ((np.abs(excess) < near) & (not close))
         # without what hides the board, and without holes: nothing, or something near, read inside the boundary
         keep = hit | (~(excess < -near) & ((excess > MIXING) | (k > 0)))
-    gaps = [np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (scan.sweep.pitch, scan.sweep.bearings)]
-    if not close:
-        keep &= ~_blended(scan, board, radius, near, gaps)[line, beam]
+        if not close:
+            # without cells whose spot may reach a surface (not the odd reading) less than a pulse length away
+            beside = ndimage.binary_opening((np.abs(miss) > near) & (miss < MIXING), np.ones((2, 2)))
+            size = np.nanmedian((radius / board)[scan.mask])
+            spot = [2 * min(int(np.ceil(size / max(gap, 1e-6))), 30) + 1 for gap in gaps]
+            keep &= ~ndimage.binary_dilation(beside, np.ones(spot))[line, beam]
     sides = [s for edges in found for s in edges.sides]
-    keep &= _on_one_side(scan, (line, beam), board, CORNER * radius / cosine, sides, side[row])
+    keep &= _on_one_side(scan, (line, beam), board, (CORNER * radius / np.abs(cosine))[line, beam], sides, side[row])
     across = step[row, 0] != 0
-    whole = {"bearing": scan.sweep.bearings[beam], "pitch": scan.sweep.pitch[line], "hit": hit, "side": side[row]}
-    whole |= {"range_m": board[line, beam], "radius": radius[line, beam], "background": odds[row]}
-    cells = EdgeCells(scan.placement, line, beam, **whole, across=across, step=np.where(across, *gaps))
+    cells = EdgeCells(
+        scan.placement, line, beam, sweep.bearings[beam], sweep.pitch[line], hit, side[row], board[line, beam],
+        radius[line, beam], odds[row], across, np.where(across, *gaps),
+    )  # fmt: skip
     return cells.select(keep)
-
-
-def _on_plane(scan):
-    """Range of the board's plane and cosine of incidence of every beam, shape (L, B); NaN where a beam misses it."""
-    rays = _to_platform(scan, polar_to_points(1.0, scan.sweep.bearings), scan.sweep.pitch[:, None])
-    origin, cosine = tilt(scan.T_head_lrf.translation, scan.sweep.pitch), rays @ scan.normal
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ranges = (scan.distance - origin @ scan.normal)[:, None] / cosine
-    return np.where(ranges > 0, ranges, np.nan), np.abs(cosine)
 
 
 def _neighbours(usable, line, beam, step, shape, reach):
@@ -530,17 +526,6 @@ def _neighbours(usable, line, beam, step, shape, reach):
     return row[first], k[first], line[first], beam[first]
 
 
-def _blended(scan, board, radius, near, gaps):
-    """Cells whose spot may reach a surface less than a pulse length behind the board, or before it."""
-    with np.errstate(invalid="ignore"):
-        miss = scan.sweep.ranges - board
-        beside = (np.abs(miss) > near) & (miss < MIXING)
-    beside = ndimage.binary_opening(beside, np.ones((2, 2)))  # a surface, not the odd reading
-    size = np.nanmedian((radius / board)[scan.mask])
-    reach = [int(np.ceil(size / max(gap, 1e-6))) for gap in gaps]
-    return ndimage.binary_dilation(beside, np.ones([2 * min(r, 30) + 1 for r in reach]))
-
-
 def _on_one_side(scan, cells, board, reach, sides, side):
     """Cells on the stretch of their own side whose spot reaches no other one; all of them where sides are not known."""
     if not sides:
@@ -555,5 +540,5 @@ def _on_one_side(scan, cells, board, reach, sides, side):
         along, apart = (flat - first) @ direction, np.abs((flat - first) @ [-direction[1], direction[0]])
         mine = side == s.side
         keep |= mine & (along > 0) & (along < s.length)
-        alone &= mine | ~(apart < reach[cells])
+        alone &= mine | ~(apart < reach)
     return keep & alone

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -26,9 +25,10 @@ class Adjustment:
 
     `models` have covariances and rms where the intrinsics were free. `mounting` is a stack of ``T_camera_first`` (the
     first is the identity), `poses` one of ``T_first_board``; their covariances (cameras - 1 or views, 6, 6) are of
-    ``[w, v]``. `relief` (k,) are the heights of the corners over the sheet's mean plane, metres, `residuals` (cameras,
-    views, k, 2) seen minus predicted pixels, NaN where a corner was not used. `sigma_px` is that of one coordinate,
-    `rms_px` of distances, as OpenCV counts it; `bic` compares adjustments of the same corners.
+    ``[w, v]``. `relief` (k,) are the heights of the corners over the sheet's mean plane, metres, `shape` (m,) their
+    coefficients in the basis that was given, with their covariance. `residuals` (cameras, views, k, 2) are seen minus
+    predicted pixels, NaN where a corner was not used. `sigma_px` is that of one coordinate, `rms_px` of distances, as
+    OpenCV counts it; `bic` compares adjustments of the same corners.
     """
 
     models: tuple
@@ -37,34 +37,35 @@ class Adjustment:
     poses: RigidTransform
     pose_covariance: np.ndarray
     relief: np.ndarray
+    shape: np.ndarray
+    shape_covariance: np.ndarray
     residuals: np.ndarray
     sigma_px: float
     rms_px: float
     bic: float
 
-    @property
-    def model(self):
-        """Intrinsics of the first camera."""
-        return self.models[0]
+
+def waves(points):
+    """Heights that corners (k, 3) of a sheet may have over its mean plane: a basis, shape (k, k - 3)."""
+    return np.linalg.svd(np.column_stack([np.ones(len(points)), points[:, :2]]))[0][:, 3:]
 
 
-def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, relief=False, fixed=()):
+def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, basis=None, fixed=()):
     """Bundle adjustment of chessboard views (an Adjustment) with analytic derivatives.
 
     `pixels` (cameras, views, k, 2) hold NaN where a corner was not seen, `points` (k, 3) are the corners on the board.
-    The rest are start values, of which the `intrinsics` (but for the `fixed` places in fx, fy, cx, cy, k1..k5) and the
-    `relief` may stay as they are: one height a corner, common to all views, which holds no plane, so that the pose is
-    that of the sheet's mean plane.
+    The rest are start values, of which the `intrinsics` (but for the `fixed` places in fx, fy, cx, cy, k1..k5) may stay
+    as they are. The columns of `basis` (k, m) are heights that all views may have in common; those of :func:`waves`
+    hold no plane, so that the poses are those of the sheet's mean plane.
     """
     cameras, views = pixels.shape[:2]
-    plane = np.column_stack([np.ones(len(points)), points[:, :2]])
-    basis = np.linalg.svd(plane)[0][:, 3:] if relief else np.zeros((len(points), 0))
+    basis = np.zeros((len(points), 0)) if basis is None else basis
     mounting = RigidTransform.identity(1) if mounting is None else mounting
     state = np.stack([m.parameters for m in models]), pose_array(mounting), pose_array(poses), np.zeros(basis.shape[1])
     lens = np.full((cameras, 9), bool(intrinsics))
     lens[:, list(fixed)] = False
-    cuts = np.cumsum([9 * cameras, 6 * (cameras - 1), 6 * views, basis.shape[1]])
-    free, seen = np.r_[lens.ravel(), np.ones(cuts[3] - cuts[0], bool)], np.isfinite(pixels)
+    cuts = np.cumsum([0, 9 * cameras, 6 * (cameras - 1), 6 * views, basis.shape[1]])
+    free, seen = np.r_[lens.ravel(), np.ones(cuts[4] - cuts[1], bool)], np.isfinite(pixels)
     if seen.sum() < free.sum():
         raise ValueError(f"{seen.sum()} image coordinates cannot determine {free.sum()} unknowns: use more views")
 
@@ -79,31 +80,28 @@ def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, rel
         return moved(state, whole)
 
     state = minimise(evaluate, state, retract)[0]
-    block = evaluate(state)
-    residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
-    error, count, sigma_px, covariance = _noise(block, free)
-    lens, mount, view = (
-        _diagonal_blocks(covariance[a:b, a:b], size) for a, b, size in zip([0, *cuts], cuts, (9, 6, 6), strict=False)
-    )
-    if intrinsics:
-        each = zip(models, state[0], lens, map(_rms, residuals), strict=True)
-        models = [m.with_parameters(values, own, rms) for m, values, own, rms in each]
-    bic = float(count * np.log(max(error, 1e-300) / count) + free.sum() * np.log(count))
-    poses = pose_transform(state[1]), mount, pose_transform(state[2]), view
-    return Adjustment(tuple(models), *poses, basis @ state[3], residuals, sigma_px, _rms(residuals), bic)
-
-
-def _noise(block, free):
-    """Sum of squares, number of coordinates, sigma of one, and the covariance of all unknowns (zero where not free)."""
-    jacobian, count = block.jacobian[block.whitener > 0], int(block.whitener.sum())
-    normal, error = jacobian.T @ jacobian, block.residuals @ block.residuals
+    block, count = evaluate(state), int(seen.sum())
+    error = block.residuals @ block.residuals
     sigma2 = max(error / max(count - free.sum(), 1), 1e-18)
-    # unit diagonal, so that pixels, radians and metres mix safely
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
     covariance = np.zeros((len(free),) * 2)
-    covariance[np.ix_(free, free)] = sigma2 * inverse
-    return error, count, float(np.sqrt(sigma2)), covariance
+    covariance[np.ix_(free, free)] = sigma2 * _inverse_normal(block.jacobian[seen.ravel()])
+    own = [np.arange(a, b).reshape(-1, size) for a, b, size in zip(cuts, cuts[1:], (9, 6, 6), strict=False)]
+    lens, mount, view = (covariance[rows[:, :, None], rows[:, None]] for rows in own)
+    residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
+    *each, rms = (float(np.sqrt(2 * np.nanmean(part**2))) for part in (*residuals, residuals))
+    if intrinsics:
+        models = [m.with_parameters(*known) for m, *known in zip(models, state[0], lens, each, strict=True)]
+    bic = float(count * np.log(max(error, 1e-300) / count) + free.sum() * np.log(count))
+    mounts, boards = (pose_transform(state[1]), mount), (pose_transform(state[2]), view)
+    sheet = basis @ state[3], state[3], covariance[cuts[3] :, cuts[3] :]
+    return Adjustment(tuple(models), *mounts, *boards, *sheet, residuals, float(np.sqrt(sigma2)), rms, bic)
+
+
+def _inverse_normal(jacobian):
+    """Pseudo-inverse of the normal equations; unit diagonal, so that pixels, radians and metres mix safely."""
+    normal = jacobian.T @ jacobian
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
 
 
 def predict(state, points, basis):
@@ -112,29 +110,27 @@ def predict(state, points, basis):
     The state is (intrinsics (c, 9), ``T_camera_first`` (c, 3, 4), ``T_first_board`` (v, 3, 4), relief); so are the
     unknowns, without the first mounting, poses as ``[w, v]``.
     """
-    lenses, mounting, poses, relief = state
-    (cameras, views), corners = (len(lenses), len(poses)), len(points)
-    turned = rotate_points(poses, points + (basis @ relief)[:, None] * UP)
+    lenses, mounting, poses, shape = state
+    cameras, views, last = len(lenses), len(poses), 15 * len(lenses) - 6 + 6 * len(poses)
+    turned = rotate_points(poses, points + (basis @ shape)[:, None] * UP)
     p_first = turned + poses[:, None, :, 3]
-    n_lens, n_mount = 9 * cameras, 6 * (cameras - 1)
-    at = n_lens + n_mount + 6 * views
-    pixels = np.empty((cameras, views, corners, 2))
-    out = np.zeros(pixels.shape + (at + basis.shape[1],))
-    own = out[..., n_lens + n_mount : at].reshape(pixels.shape + (views, 6))  # a view
-    every = np.arange(views)
+    pixels, every = np.empty((cameras, *p_first.shape[:2], 2)), np.arange(views)
+    out = np.zeros(pixels.shape + (last + basis.shape[1],))
+    own = out[..., last - 6 * views : last].reshape(pixels.shape + (views, 6))  # a view
     for c, (lens, mount) in enumerate(zip(lenses, mounting, strict=True)):
         mounted = rotate_points(mount, p_first)
-        model = CameraModel(1, 1, *lens[:4], lens[4:])
-        by_point, by_lens = project_jacobians(mounted + mount[:, 3], model)
+        by_point, by_lens = project_jacobians(mounted + mount[:, 3], CameraModel(1, 1, *lens[:4], lens[4:]))
         # the derivatives by fx and fy are the distorted normalised coordinates themselves
         distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
         pixels[c] = lens[:2] * distorted + lens[2:4]
         out[c, ..., 9 * c : 9 * c + 9] = by_lens
         if c:
-            out[c, ..., n_lens + 6 * (c - 1) : n_lens + 6 * c] = gradient_by_pose(mounted[..., None, :], by_point)
+            at = 9 * cameras + 6 * (c - 1)
+            out[c, ..., at : at + 6] = gradient_by_pose(mounted[..., None, :], by_point)
         by_first = by_point @ mount[:, :3]
         own[c, every, :, :, every] = gradient_by_pose(turned[..., None, :], by_first)
-        out[c, ..., at:] = np.einsum("vkij,vj->vki", by_first, poses[:, :, 2])[..., None] * basis[:, None, :]
+        by_height = np.einsum("vkij,vj->vki", by_first, poses[:, :, 2])
+        out[c, ..., last:] = by_height[..., None] * basis[:, None]
     return pixels, out
 
 
@@ -145,15 +141,6 @@ def moved(state, step):
     lens, mount, pose, height = np.split(step, cuts)
     mounting = np.concatenate([mounting[:1], move_pose(mounting[1:], mount.reshape(-1, 6))])
     return lenses + lens.reshape(-1, 9), mounting, move_pose(poses, pose.reshape(-1, 6)), relief + height
-
-
-def _rms(residuals):
-    return float(np.sqrt(2 * np.nanmean(residuals**2)))
-
-
-def _diagonal_blocks(covariance, size):
-    n = len(covariance) // size
-    return covariance.reshape(n, size, n, size)[np.arange(n), :, np.arange(n)]
 
 
 def adjust_robust(pixels, points, models, poses, mounting=None, **options):
@@ -199,8 +186,11 @@ def estimate_intrinsics(pixels, pattern, size, *, relief=False):
     pixels, points = np.asarray(pixels, float)[None], pattern.points()
     board, views = [points.astype(np.float32)] * pixels.shape[1], list(pixels[0].astype(np.float32))
     size = tuple(int(s) for s in size)
-    with _opencv(f"{len(views)} views of the pattern do not determine the intrinsics"):
+    try:
         out = cv2.calibrateCamera(board, views, size, None, None, flags=cv2.CALIB_FIX_K3)
+    except cv2.error as error:
+        why = f"{len(views)} views of the pattern do not determine the intrinsics (OpenCV: {error.err})"
+        raise ValueError(why) from error
     matrix, lens, turns, shifts = out[1:5]
     model = CameraModel(*size, *map(float, (matrix[0, 0], matrix[1, 1], *matrix[:2, 2])), lens.ravel()[:5])
     turns = Rotation.from_rotvec(np.reshape(turns, (-1, 3)))
@@ -214,9 +204,9 @@ def estimate_intrinsics(pixels, pattern, size, *, relief=False):
     poses = RigidTransform.from_components(np.reshape(shifts, (-1, 3)), turns)
     best = adjust_robust(pixels, points, [model], poses, fixed=(8,))
     if relief:
-        wavy = adjust_robust(pixels, points, best.models, best.poses, relief=True, fixed=(8,))
-        best = better(wavy, pixels, points, relief=False, fixed=(8,))
-    return better(best, pixels, points, relief=bool(np.any(best.relief)))
+        wavy = adjust_robust(pixels, points, best.models, best.poses, basis=waves(points), fixed=(8,))
+        best = better(wavy, pixels, points, fixed=(8,))
+    return better(best, pixels, points, basis=waves(points) if np.any(best.relief) else None)
 
 
 def estimate_relief(pixels, pattern, model):
@@ -226,17 +216,8 @@ def estimate_relief(pixels, pattern, model):
     """
     poses = RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in pixels])
     pixels, points = np.asarray(pixels, float)[None], pattern.points()
-    wavy = adjust_robust(pixels, points, [model], poses, relief=True, intrinsics=False)
-    return better(wavy, pixels, points, relief=False, intrinsics=False)
-
-
-@contextmanager
-def _opencv(what):
-    """OpenCV's refusal of what it was given is one of the values."""
-    try:
-        yield
-    except cv2.error as error:
-        raise ValueError(f"{what} (OpenCV: {error.err})") from error
+    wavy = adjust_robust(pixels, points, [model], poses, basis=waves(points), intrinsics=False)
+    return better(wavy, pixels, points, intrinsics=False)
 
 
 def first_pose(points, pixels, model):
@@ -244,8 +225,10 @@ def first_pose(points, pixels, model):
     good = np.isfinite(pixels).all(axis=1)
     board, image = points[good].astype(float), np.ascontiguousarray(pixels[good], float)
     why, how = f"{good.sum()} corners do not determine a pose in front of the camera", cv2.SOLVEPNP_SQPNP
-    with _opencv(why):
+    try:
         found, rotvec, translation = cv2.solvePnP(board, image, model.matrix, model.distortion, flags=how)
+    except cv2.error as error:
+        raise ValueError(f"{why} (OpenCV: {error.err})") from error
     if not found or not np.isfinite(translation).all() or translation[2, 0] <= 0:
         raise ValueError(why)
     return RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))

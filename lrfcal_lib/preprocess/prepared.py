@@ -8,7 +8,7 @@ import numpy as np
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
-from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, edge_points, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.survey import Outline, views_of
 from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
@@ -105,23 +105,23 @@ def prepare_scans(session):
     for placement in session.board_placements:
         try:
             scan = scans[placement] = find_board(session.sweep(placement), session.board, session.T_head_lrf)
-            for variant in VARIANTS:
-                edges[variant][placement] = edge_points(scan, variant)
-                if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
-                    swept[variant][placement] = sweep_edges(scan, variant)
         except (BoardNotFound, SessionError) as error:
             problems[placement] = str(error)
+            continue
+        along, sides = crossings(scan)
+        across = crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {}
+        for out, found in ((edges, along), (swept, across)):
+            for variant in found:
+                out[variant][placement] = found[variant]
     return Prepared(session, session.board, scans, edges, swept, problems=problems)
 
 
 def prepare_images(prepared):
     """The same with the board in every image of the session, the cameras' intrinsics, and the board's outline."""
-    seen, best = views_of(prepared.session, one_per_placement=True), {}
-    for camera, views in seen.views.items():
-        # the first of those with a pose and most edges; an image that belongs to no placement is left out
-        views = sorted(views, key=lambda view: (view.T_camera_board is None, -len(view.edges)))
-        first = {view.placement: view for view in reversed(views) if view.placement >= 0}
-        best[camera] = dict(sorted(first.items()))
+    seen = views_of(prepared.session, one_per_placement=True)
+    # an image that belongs to no placement is left out
+    views = {c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
+             for c, own in seen.views.items()}  # fmt: skip
     problems = prepared.problems | ({"outline": f"faces of the board only: {seen.unseen}"} if seen.unseen else {})
     found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
-    return replace(prepared, models=seen.models, views=best, **found)
+    return replace(prepared, models=seen.models, views=views, **found)

@@ -18,6 +18,7 @@ TRACKING = {"winSize": (21, 21), "maxLevel": 3, "criteria": (3, 40, 0.003)}  # t
 THERE_AND_BACK = 0.1  # pixels; a feature that does not come back is hidden in the other image
 FEWEST_FEATURES, FEWEST_CELLS = 40, 10  # for four unknowns with a covariance from the scatter over cells
 CELLS = np.array([8, 5])  # of the image; neighbouring features share their errors (parallax, a box that was pushed)
+PLAIN_ROUNDS, TUKEY_ROUNDS = 10, 20  # of least absolute residuals, then of Tukey's biweight
 TUKEY = 3.0  # of the median residual of the features, whose lengths are Rayleigh: 3 medians are 3.5 sigma
 GROWTH = 1.3  # of the board's hull in an image: its rim, stand, shadow and whoever holds it move along
 LEAST_STEP = 0.2  # pixels: less than edges and corners of a board are off at one placement
@@ -33,20 +34,6 @@ class BackgroundLost(ValueError):
 
 
 @dataclass(frozen=True)
-class Motion:
-    """Motion of the background between two images: `rotvec` is its turn in the camera frame, radians.
-
-    The camera's own turn is the opposite. The covariance (4, 4) is that of (rotvec, scale).
-    """
-
-    rotvec: np.ndarray
-    scale: float
-    covariance: np.ndarray
-    residual_px: float
-    n_features: int
-
-
-@dataclass(frozen=True)
 class Step:
     """A camera turned between two placements and stayed so.
 
@@ -58,10 +45,8 @@ class Step:
         Turn of the camera, rotation vector in its own frame, radians.
     angle, angle_sigma : float
         Radians.
-    size_px, sigma_px : float
+    size_px : float
         Root mean square motion of the background over the image, undistorted pixels.
-    p_value : float
-        Of a step so large anywhere in a recording without one.
     """
 
     before: int
@@ -70,8 +55,6 @@ class Step:
     angle: float
     angle_sigma: float
     size_px: float
-    sigma_px: float
-    p_value: float
 
 
 @dataclass(frozen=True)
@@ -95,10 +78,6 @@ class Steadiness:
         Root mean square motion of the background over the image that the turn makes.
     corner_px : ndarray, shape (n,)
         Motion of a corner of the image that the scale makes, with its sign.
-    residual_px : ndarray, shape (n,)
-        Median distance of the features from the fitted motion.
-    n_features : ndarray of int, shape (n,)
-        That agree on the motion.
     steps : tuple of Step
     reason : str
         Why there is nothing to judge; '' where there is.
@@ -108,13 +87,11 @@ class Steadiness:
     camera: str
     placements: np.ndarray
     reference: int = -1
-    rotvec: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    size_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    corner_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    residual_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    n_features: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    rotvec: np.ndarray = ()
+    scale: np.ndarray = ()
+    covariance: np.ndarray = ()
+    size_px: np.ndarray = ()
+    corner_px: np.ndarray = ()
     steps: tuple[Step, ...] = ()
     reason: str = ""
     problems: dict = field(default_factory=dict)
@@ -154,10 +131,9 @@ def camera_steadiness(session, camera, views=None, model=None):
     """
     if camera not in session.cameras:
         raise ValueError(f"no camera '{camera}'; the session has {', '.join(session.cameras)}")
-    info, none = session.cameras[camera], np.zeros(0, int)
+    info = session.cameras[camera]
     if info.mount != "platform":
-        reason = f"camera {camera} rides on the head: its background moves with the pitch"
-        return Steadiness(camera, none, reason=reason)
+        return Steadiness(camera, (), reason=f"camera {camera} rides on the head: its background moves with the pitch")
     model = info.model if model is None else model
     if model is None:
         raise ValueError(f"camera '{camera}' has no intrinsics in the session: give model (Prepared.models holds it)")
@@ -165,7 +141,7 @@ def camera_steadiness(session, camera, views=None, model=None):
     records = {p: records[p] for p in session.placements if p in records}
     if len(records) < 2:
         reason = f"camera {camera} has {len(records)} images of placements: nothing to compare"
-        return Steadiness(camera, none, reason=reason)
+        return Steadiness(camera, (), reason=reason)
     hulls = {p: board_hull(view, model) for p, view in (views or {}).items()}
     # the placement whose board covers least of the image; the middle one where boards are unknown
     areas = {p: cv2.contourArea(hulls[p].astype(np.float32)) for p in records if hulls.get(p) is not None}
@@ -192,27 +168,25 @@ def steadiness_of(camera, images, reference_image, reference, model, hulls=None)
 
     `reference_image` is that of the placement `reference`, `hulls` by placement are what to leave out, pixels.
     """
-    hulls, motions, problems = hulls or {}, {}, {}
+    hulls, motions, problems = hulls or {}, {reference: (np.zeros(3), 1.0, np.zeros((4, 4)))}, {}
     level, mask = even_contrast(reference_image), outside(hulls.get(reference), reference_image.shape[:2])
-    features = find_features(reference_image, mask)
+    features, order = find_features(reference_image, mask), []
     for placement, image in images:
-        if placement == reference:
-            motions[placement] = Motion(np.zeros(3), 1.0, np.zeros((4, 4)), 0.0, len(features))
-            continue
         try:
-            start, end = follow(level, even_contrast(image), features, outside(hulls.get(placement), image.shape[:2]))
-            motions[placement] = fit_motion(start, end, model)
+            if placement != reference:
+                hull = outside(hulls.get(placement), image.shape[:2])
+                motions[placement] = fit_motion(*follow(level, even_contrast(image), features, hull), model)[:3]
+            order.append(placement)
         except BackgroundLost as lost:
             problems[placement] = f"camera {camera}, placement {placement}: {lost}"
-    placements, metric = np.array(list(motions), int), pixel_metric(model)
-    found = {k: np.array([getattr(m, k) for m in motions.values()]) for k in Motion.__dataclass_fields__}
+    metric, found = pixel_metric(model), zip(*(motions[p] for p in order), strict=True)
+    turn, scale, covariance = (np.array(v) for v in found)
     # the camera's own turn is the opposite of the background's
-    found["rotvec"] = -found["rotvec"].reshape(-1, 3)
-    found["covariance"] = found["covariance"] * np.outer([-1, -1, -1, 1], [-1, -1, -1, 1])
-    found["size_px"] = turn_px(found["rotvec"], metric)
-    found["corner_px"] = np.hypot(model.width, model.height) / 2 * (found["scale"] - 1)
-    steps = find_steps(placements, found["rotvec"], found["covariance"][:, :3, :3], metric)
-    return Steadiness(camera, placements, reference, **found, steps=steps, problems=problems)
+    turn, covariance = -turn, covariance * np.outer([-1, -1, -1, 1], [-1, -1, -1, 1])
+    size, corner = turn_px(turn, metric), np.hypot(model.width, model.height) / 2 * (scale - 1)
+    steps = find_steps(order, turn, covariance[:, :3, :3], metric)
+    motion = turn, scale, covariance, size, corner, steps
+    return Steadiness(camera, np.array(order, int), reference, *motion, problems=problems)
 
 
 def even_contrast(image):
@@ -252,22 +226,29 @@ def follow(first, second, features, mask):
 
 
 def fit_motion(start, end, model):
-    """Turn and scale (a Motion) that carry features (n, 2) of one image to where another shows them, robust.
+    """Turn and scale that carry features (n, 2) of one image to where another shows them, robust.
 
-    The covariance comes from the scatter over cells of the image, whose features share their errors. BackgroundLost
-    with fewer than 40 features or 10 cells of the image (8 by 5) that agree.
+    Returns the rotation vector of the background in the camera frame (the camera's own turn is the opposite), the
+    scale, their covariance (4, 4) from the scatter over cells of the image, whose features share their errors, and how
+    many features agree. BackgroundLost with fewer than 40 features or 10 cells of the image (8 by 5) that agree.
     """
     column, row = np.clip((start * CELLS / [model.width, model.height]).astype(int), 0, CELLS - 1).T
     cell, focal, centre = row * CELLS[0] + column, np.array([model.fx, model.fy]), np.array([model.cx, model.cy])
     first, second = ((undistort(p, model) - centre) / focal for p in (start, end))
     turn, scale, weight = Rotation.identity(), 1.0, np.ones(len(start))
-    _check_enough(cell)
-    for robust in (False,) * 10 + (True,) * 20:
+    for number in range(PLAIN_ROUNDS + TUKEY_ROUNDS + 1):
+        count, cells = (weight > 0).sum(), len(np.unique(cell[weight > 0]))
+        if count < FEWEST_FEATURES or cells < FEWEST_CELLS:
+            raise BackgroundLost(
+                f"{count} features of the background in {cells} parts of the image can be followed, {FEWEST_FEATURES} "
+                f"in {FEWEST_CELLS} are needed: was the camera mounted anew, or is the scene too plain?"
+            )
+        if number == PLAIN_ROUNDS + TUKEY_ROUNDS:
+            break
         miss, by_state = motion_misses(first, second, turn, scale)
         length = np.maximum(np.linalg.norm(miss * focal, axis=1), 1e-4)
-        unit = np.median(length[weight > 0])
-        weight = np.clip(1 - (length / (TUKEY * unit)) ** 2, 0, None) ** 2 if robust else 1 / np.maximum(length, 0.01)
-        _check_enough(cell[weight > 0])
+        tukey = np.clip(1 - (length / (TUKEY * np.median(length[weight > 0]))) ** 2, 0, None) ** 2
+        weight = 1 / np.maximum(length, 0.01) if number < PLAIN_ROUNDS else tukey
         weighted = by_state * weight[:, None, None]
         bread, score = np.einsum("nij,nik->jk", weighted, by_state), np.einsum("nij,ni->nj", weighted, miss)
         step = np.linalg.solve(bread, score.sum(axis=0))
@@ -275,18 +256,8 @@ def fit_motion(start, end, model):
     # sandwich covariance with cells of the image as its independent parts
     filling = np.zeros((cell.max() + 1, 4))
     np.add.at(filling, cell, score)
-    bread, cells = np.linalg.inv(bread), len(np.unique(cell[weight > 0]))
-    covariance = bread @ (filling.T @ filling) @ bread * cells / (cells - 4)
-    return Motion(turn.as_rotvec(), float(scale), covariance, float(unit), int((weight > 0).sum()))
-
-
-def _check_enough(cell):
-    count, cells = len(cell), len(np.unique(cell))
-    if count < FEWEST_FEATURES or cells < FEWEST_CELLS:
-        raise BackgroundLost(
-            f"{count} features of the background in {cells} parts of the image can be followed, "
-            f"{FEWEST_FEATURES} in {FEWEST_CELLS} are needed: was the camera mounted anew, or is the scene too plain?"
-        )
+    bread = np.linalg.inv(bread)
+    return turn.as_rotvec(), float(scale), bread @ (filling.T @ filling) @ bread * cells / (cells - 4), int(count)
 
 
 def motion_misses(first, second, turn, scale):
@@ -333,21 +304,20 @@ def find_steps(placements, rotvec, covariance, metric):
     own = np.einsum("ij,njk,ik->ni", root, covariance, root)
     sigma = np.maximum(1.4826 * np.median(np.abs(np.diff(moved, axis=0))) / np.sqrt(2), np.sqrt(np.median(own)))
     sigma = max(float(sigma), 1e-6)
-    places, todo = {}, [(0, n)]
+    cuts, todo, steps = [0, n], [(0, n)], []
     while todo:
         low, high = todo.pop()
         k, p_value = _best_split(moved[low:high], sigma, n)
         if p_value < LEVEL:
-            places[low + k] = p_value
+            cuts.append(low + k)
             todo += [(low, low + k), (low + k, high)]
-    cuts, steps = [0, *sorted(places), n], []
+    cuts.sort()
     for before, k, after in zip(cuts, cuts[1:], cuts[2:], strict=False):
         turn = np.median(rotvec[k:after], axis=0) - np.median(rotvec[before:k], axis=0)
         spread = sigma * np.sqrt(MEDIAN_VARIANCE * (1 / (k - before) + 1 / (after - k)))
         angle, size = float(np.linalg.norm(turn)), float(np.linalg.norm(root @ turn))
         angle_sigma = spread * float(np.linalg.norm(np.linalg.inv(root).T @ (turn / angle)))
-        ends = int(placements[k - 1]), int(placements[k])
-        steps.append(Step(*ends, turn, angle, angle_sigma, size, float(spread), places[k]))
+        steps.append(Step(int(placements[k - 1]), int(placements[k]), turn, angle, angle_sigma, size))
     return tuple(steps)
 
 

@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import PurePath
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
+from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
-from lrfcal_lib.preprocess.edges_in_image import (
-    SIDES,
-    board_line,
-    edge_votes,
-    outer_peak,
-    outward_line,
-    side_lines,
-    wide_distances,
-)
-from lrfcal_lib.preprocess.intrinsics import (
-    adjust_robust,
-    board_pose,
-    estimate_intrinsics,
-    estimate_relief,
-    first_pose,
-)
+from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
+from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders, spread_views
 
 UPRIGHT = 0.05  # weight of the turn between two cameras where few placements tell: most look the same way, head up
@@ -36,7 +23,6 @@ LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
 REMEMBERED_IMAGES = 128
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
-SETTLED = 100.0  # weight of a turn that was decided before against the edges of an image, of which a board has a few
 
 
 @dataclass(frozen=True)
@@ -70,8 +56,8 @@ class Outline:
     lengths, length_sd : dict of str to float
         Edge lengths of the outline and their standard deviation over the views that show the edge with both neighbours
         (NaN below two), metres.
-    n_views, n_lengths : dict of str to int
-        Views that show the edge, and those that show it with both neighbours.
+    n_lengths : dict of str to int
+        Views that show the edge with both neighbours.
     board : Board
         With its corners filled in.
     """
@@ -80,26 +66,8 @@ class Outline:
     line_sd: np.ndarray
     lengths: dict
     length_sd: dict
-    n_views: dict
     n_lengths: dict
     board: Board
-
-
-class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends (a sheet on a wall, a background as bright as the board)."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """An image that was chosen: its record, and the pattern's corners as found (k, 2), or the reason why not."""
-
-    record: object
-    corners: np.ndarray | str
-
-    @property
-    def found(self):
-        """Whether the image shows the pattern."""
-        return not isinstance(self.corners, str)
 
 
 def views_of(session, models=None, *, one_per_placement=False):
@@ -112,13 +80,13 @@ def views_of(session, models=None, *, one_per_placement=False):
     return survey(records, session.read_image, session.board, known, session.picks, one_per_placement=one_per_placement)
 
 
-def survey(records, read, board, models, picks=(), *, one_per_placement=False, settled=None):
+def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
 
     Parameters
     ----------
     records : sequence of ImageRecord
-        With ``camera, file, placement, pitch``.
+        With ``camera, file, placement, pitch, purpose``.
     read : callable
         ``read(record)`` gives the image, uint8.
     board : Board
@@ -126,10 +94,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False, s
         By camera; None asks for an estimate from these images.
     picks : sequence of EdgePick
     one_per_placement : bool
-        Use one image of each camera and placement: of those that show the pattern the one whose pitch is nearest to
-        the middle of the placement's images. Images of no placement are all used.
-    settled : dict of str to dict of int to BoardView, optional
-        By camera and placement: views of an earlier survey. Which way round the board is remains as it was there.
+        Use one image of each camera and placement: of those that show the board the one whose pitch is nearest to the
+        middle of the placement's images. Images of no placement are all used.
 
     Returns
     -------
@@ -141,44 +107,91 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False, s
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
         the board does not have.
     """
-    read = lru_cache(maxsize=REMEMBERED_IMAGES)(read)
+    read, marks = lru_cache(maxsize=REMEMBERED_IMAGES)(read), _marks(picks, board)
+    plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
+    if plain and unknown:
+        raise ValueError(
+            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
+        )
+    finder = None if plain else PatternFinder(board.pattern)
+
+    def look(r, view, models, **options):
+        """The board in one image, with what was picked in it by hand."""
+        return view_board(read(r), board, models[r.camera], view, marks.get((r.camera, r.file)), **options)
+
+    def begin(r):
+        """The corners of the pattern in one image, in any order; all of a board that has none."""
+        return look(r, _view(r), models) if plain else _corners(_view(r), read(r), finder)
+
+    usable = [r for r in records if not plain or r.purpose != "intrinsics"]
+    images = [_first(group, begin) for c in models for group in _choices(usable, c, one_per_placement)]
+    if plain:
+        return Survey(_by_camera(models, _turned_alike([view for _, view in images])), dict(models), None, board)
+    flat = {c: m or _intrinsics(c, images, board, read) for c, m in models.items()}
+    images, lines, unseen = _ordered(images, read, board, flat)
+    models, relief = _with_relief(images, board, models, flat)
+    images = [(r, view) for r, view in images if r.purpose != "intrinsics"]
+    known, outline = board.corners is not None or unseen, None
+    for _ in range(1 if known else 2):
+        views = [v if v.reason else look(r, v, models, lines=lines, relief=relief) for r, v in images]
+        if not known:
+            outline = measure_outline(views, board, models)
+            lines = outline.lines
+    board = board if outline is None else outline.board
+    return Survey(_by_camera(models, views), models, outline, board, relief, unseen)
+
+
+def all_views(prepared):
+    """The board in all images of a prepared session, by camera, with its intrinsics, outline and relief.
+
+    Images of no placement are left out. Which way round the board is remains as the prepared views have it: sides of
+    scans bear the names of that turn. Where every placement has one image these are the prepared views.
+    """
+    session, board, views = prepared.session, prepared.board, {camera: [] for camera in prepared.views}
+    records = [r for r in session.images(purpose="board") if r.placement >= 0 and r.camera in views]
+    if len(records) <= sum(map(len, prepared.views.values())) or board.pattern is None:
+        return {camera: list(found.values()) for camera, found in prepared.views.items()}
+    marks, finder, orders = _marks(session.picks, board), PatternFinder(board.pattern), pattern_orders(board.pattern)
+    options = {"lines": None if board.corners is None else board.lines(), "relief": prepared.relief}
+    for r in records:
+        view, seen = _view(r), prepared.views[r.camera][r.placement]
+        if seen.file == view.file or seen.pixels is None:  # the same, or none of the placement's images shows it
+            views[r.camera].append(replace(seen, file=view.file, pitch=view.pitch))
+            continue
+        image = session.read_image(r)
+        view = _corners(view, image, finder)
+        if not view.reason:
+            off = [np.nanstd(view.pixels[order] - seen.pixels, axis=0).sum() for order in orders]
+            view = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]])
+            picked = marks.get((r.camera, r.file))
+            view = view_board(image, board, prepared.models[r.camera], view, picked, **options)
+        views[r.camera].append(view)
+    return views
+
+
+def _marks(picks, board):
+    """Ends of edges picked by hand, by camera and file, then by edge."""
     marks = {}
     for pick in picks:
         if pick.edge not in board.edges:
             raise ValueError(f"{pick.file}: picked edge '{pick.edge}' is not one of the board's edges {board.edges}")
         marks.setdefault((pick.camera, pick.file), {})[pick.edge] = np.asarray(pick.ends, float)
-    view = partial(_view, read, marks)
-    choices = [group for camera in models for group in _choices(records, camera, one_per_placement)]
-    if board.pattern is None:
-        return _survey_plain(choices, view, board, models)
-    finder = PatternFinder(board.pattern)
-    images = [_with_corners(group, read, finder) for group in choices]
-    flat = {c: m or _intrinsics(c, images, board, read) for c, m in models.items()}
-    if board.corners is not None:
-        images, lines, unseen = _ordered_by_outline(images, read, board, flat, settled or {}), board.lines(), ""
-    else:
-        images, lines, unseen = _ordered_by_votes(images, read, board, flat)
-    models, relief = _with_relief(images, board, models, flat)
-    outline = None
-    for _ in range(1 if board.corners is not None or unseen else 2):
-        views = {camera: [] for camera in models}
-        for image in (image for image in images if image.record.purpose != "intrinsics"):
-            views[image.record.camera].append(view(image, board, models, lines=lines, relief=relief))
-        if board.corners is None and not unseen:
-            outline = measure_outline(views, board, models)
-            lines = outline.lines
-    return Survey(views, models, outline, board if outline is None else outline.board, relief, unseen)
+    return marks
 
 
-def _view(read, marks, image, board, models, **options):
-    """The board in one image that was chosen, with what was picked in it by hand."""
-    r = image.record
-    view = BoardView(r.camera, PurePath(r.file).name, r.placement, r.pitch)
-    if board.pattern is not None:
-        if not image.found:
-            return replace(view, reason=image.corners)
-        options["pixels"] = image.corners
-    return view_board(read(r), board, models[r.camera], view, marks.get((r.camera, r.file)), **options)
+def _view(record):
+    return BoardView(record.camera, PurePath(record.file).name, record.placement, record.pitch)
+
+
+def _corners(view, image, finder):
+    try:
+        return replace(view, pixels=finder(image))
+    except PatternNotFound as error:
+        return replace(view, reason=str(error))
+
+
+def _by_camera(cameras, views):
+    return {camera: [view for view in views if view.camera == camera] for camera in cameras}
 
 
 def _choices(records, camera, one_per_placement):
@@ -195,26 +208,23 @@ def _choices(records, camera, one_per_placement):
     return list(groups.values())
 
 
-def _with_corners(group, read, finder):
-    """The first image of a list that shows the pattern; the first one if none does."""
-    first = None
+def _first(group, begin):
+    """The first image of a list that shows the board, as (record, view); the first one if none does."""
+    tried = []
     for record in group:
-        try:
-            return Shown(record, finder(read(record)))
-        except PatternNotFound as error:
-            first = first or Shown(record, str(error))
-    return first
+        tried.append((record, begin(record)))
+        if not tried[-1][1].reason:
+            return tried[-1]
+    return tried[0]
 
 
-def _for_intrinsics(images):
+def _for_intrinsics(images, camera):
     """Corners to estimate intrinsics with: the images taken for that, and the most different others up to a number.
 
     Without images taken for the intrinsics all are used.
     """
-    own, others = (
-        [image.corners for image in images if image.found and (image.record.purpose == "intrinsics") is wanted]
-        for wanted in (True, False)
-    )
+    seen = [(r.purpose == "intrinsics", v.pixels) for r, v in images if r.camera == camera and v.pixels is not None]
+    own, others = ([pixels for meant, pixels in seen if meant is wanted] for wanted in (True, False))
     if not own:
         return others
     own = [own[i] for i in spread_views(own, VIEWS_FOR_INTRINSICS)]
@@ -222,100 +232,73 @@ def _for_intrinsics(images):
 
 
 def _intrinsics(camera, images, board, read):
-    mine = [image for image in images if image.record.camera == camera]
-    size = read(mine[0].record).shape[1::-1] if mine else (0, 0)
+    size = next((read(r).shape[1::-1] for r, _ in images if r.camera == camera), (0, 0))
     try:
-        return estimate_intrinsics(_for_intrinsics(mine), board.pattern, size).model
+        return estimate_intrinsics(_for_intrinsics(images, camera), board.pattern, size).models[0]
     except ValueError as error:
         raise ValueError(f"camera '{camera}': {error}") from error
 
 
 def _with_relief(images, board, models, flat):
     """Intrinsics and the shape of the sheet, now that the corners of all images are in one order."""
-    out, reliefs = {}, []
-    for camera, model in models.items():
-        pixels = _for_intrinsics([image for image in images if image.record.camera == camera])
-        if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
-            out[camera] = flat[camera]
-            continue
-        if model is None:
-            size = (flat[camera].width, flat[camera].height)
-            result = estimate_intrinsics(pixels, board.pattern, size, relief=True)
-        else:
-            result = estimate_relief(pixels, board.pattern, model)
-        out[camera] = result.model
-        reliefs.append(result.relief)
+    out, reliefs = dict(flat), []
+    for camera, model in flat.items():
+        pixels = _for_intrinsics(images, camera)
+        if len(pixels) >= LEAST_VIEWS_FOR_RELIEF:
+            if models[camera] is None:
+                result = estimate_intrinsics(pixels, board.pattern, (model.width, model.height), relief=True)
+            else:
+                result = estimate_relief(pixels, board.pattern, model)
+            out[camera] = result.models[0]
+            reliefs.append(result.relief)
     return out, np.mean(reliefs, axis=0) if reliefs else np.zeros(len(board.pattern.points()))
 
 
-def _poses_and_partners(images, board, models, orders):
-    """Rough poses of the board in every image for every order of its corners; which belong together (:func:`alike`).
+def _ordered(images, read, board, models):
+    """Images with the pattern's corners in the order that the outline asks for, the same in all of a placement.
 
-    The poses of an image are that of one order, turned in the board.
+    Also the lines of the outline: rough ones where it is not known, or None and why they are not seen.
     """
-    points = board.pattern.points()
-    middle = points.mean(axis=0)
-    turns = [Rotation.align_vectors(points[order] - middle, points - middle)[0] for order in orders]
-    turns = RigidTransform.concatenate([RigidTransform.from_components(middle - t.apply(middle), t) for t in turns])
-    poses = [first_pose(points, image.corners, models[image.record.camera]) * turns for image in images]
-    placements = [-1 if i.record.purpose == "intrinsics" else i.record.placement for i in images]
-    return poses, *alike([pose.rotation for pose in poses], placements, [i.record.camera for i in images])
-
-
-def _in_order(images, orders):
-    """All images, those with corners in an order of their own."""
-    orders = iter(orders)
-    return [replace(i, corners=i.corners[next(orders)]) if i.found else i for i in images]
-
-
-def _ordered_by_outline(images, read, board, models, settled):
-    """Corners of every image in the order that the known outline asks for, the same at all images of a placement."""
-    seen, orders, scores = [image for image in images if image.found], pattern_orders(board.pattern), []
-    poses, first, partner = _poses_and_partners(seen, board, models, orders)
-    for image, own, pose in zip(seen, partner, poses, strict=True):
-        pixels, camera = image.corners[orders[own]], image.record.camera
-        view = settled.get(camera, {}).get(image.record.placement)
-        if view is None or view.pixels is None:
-            scores.append(order_scores(read(image.record), board, models[camera], pixels, pose[own]))
-        else:
-            off = np.nanstd(pixels - view.pixels, axis=1).sum(axis=1)
-            scores.append(SETTLED * (off == off.min()))
-    chosen = decide(scores, first)
-    return _in_order(images, [orders[own[k]] for own, k in zip(partner, chosen, strict=True)])
-
-
-def _ordered_by_votes(images, read, board, models):
-    """Images with corners turned alike, and rough lines of the outline, or None and why they are not seen."""
-    if len(board.edges) != 4:
+    known = board.corners is not None
+    if not known and len(board.edges) != 4:
         raise ValueError(
             f"board '{board.name}' has {len(board.edges)} edges and no known corners: only four edges around a pattern "
             "can be measured from images, give the corners"
         )
-    seen, orders = [image for image in images if image.found], pattern_orders(board.pattern, mirrored=False)
-    if not seen:
+    seen = [(r, v, models[v.camera]) for r, v in images if v.pixels is not None]
+    if not known and not seen:
         raise ValueError(f"none of {len(images)} images shows the pattern of board '{board.name}'")
-    _, first, partner = _poses_and_partners(seen, board, models, orders)
-    votes, up = [], []
-    for image, own in zip(seen, partner, strict=True):
-        model = models[image.record.camera]
-        pose = board_pose(image.corners[orders[own[0]]], board.pattern, model)[0]
-        votes.append(edge_votes(read(image.record), board, model, pose))
-        up.append(pose.rotation.as_matrix()[1, 1])
-    votes = np.stack(votes)
-    turned = resolve_turns(votes, np.array(up), first).astype(int)
-    votes = np.where(turned[:, None, None], votes[:, [2, 3, 0, 1]], votes)
-    images = _in_order(images, [orders[own[k]] for own, k in zip(partner, turned, strict=True)])
-    try:
-        return images, common_lines(votes, board), ""
-    except OutlineNotSeen as error:
-        return images, None, str(error)
+    points, orders = board.pattern.points(), pattern_orders(board.pattern, mirrored=known)
+    middle = points.mean(axis=0)
+    turns = [Rotation.align_vectors(points[order] - middle, points - middle)[0] for order in orders]
+    turns = RigidTransform.concatenate([RigidTransform.from_components(middle - t.apply(middle), t) for t in turns])
+    # rough poses in every image for every order of its corners: that of one order, turned in the board
+    poses = [first_pose(points, v.pixels, model) * turns for _, v, model in seen]
+    placements = [-1 if r.purpose == "intrinsics" else v.placement for r, v, _ in seen]
+    first, partner = alike([pose.rotation for pose in poses], placements, [v.camera for _, v, _ in seen])
+    if known:
+        scores = [
+            order_scores(read(r), board, model, v.pixels[orders[own]], pose[own])
+            for (r, v, model), own, pose in zip(seen, partner, poses, strict=True)
+        ]
+        chosen, lines, unseen = decide(scores, first), board.lines(), ""
+    else:
+        votes, up = [], []
+        for (r, v, model), own in zip(seen, partner, strict=True):
+            pose = board_pose(v.pixels[orders[own[0]]], board.pattern, model)[0]
+            votes.append(edge_votes(read(r), board, model, pose))
+            up.append(pose.rotation.as_matrix()[1, 1])
+        chosen, lines, unseen = _by_votes(np.stack(votes), np.array(up), first, board)
+    corners = iter([v.pixels[orders[own[k]]] for (_, v, _), own, k in zip(seen, partner, chosen, strict=True)])
+    return [(r, v if v.reason else replace(v, pixels=next(corners))) for r, v in images], lines, unseen
 
 
-def resolve_turns(votes, up, first):
-    """Which views see the pattern turned by 180 deg against the others, shape (v,).
+def _by_votes(votes, up, first, board):
+    """Which views see the pattern turned by 180 deg against the others, (v,), and the lines that all then agree on.
 
     `votes` (v, 4, n) are those of :func:`edge_votes`, `up` is the component of the board's y axis down the image (most
-    views keep y down), `first` the first of the views that are turned alike, see :func:`alike`.
+    views keep y down), `first` the first of the views that are turned alike, see :func:`alike`. The lines are None
+    where there are none, with the reason.
     """
     # edges move by a few millimetres from view to view: widen the peaks before comparing
     wide = uniform_filter1d(np.nan_to_num(votes), 9, axis=-1)
@@ -328,26 +311,12 @@ def resolve_turns(votes, up, first):
         if np.array_equal(new, turned):
             break
         turned = new
-    return turned if np.mean(np.where(turned, -up, up) > 0) >= 0.5 else ~turned
-
-
-def common_lines(votes, board):
-    """Board lines (4, 3) of the edges that many views agree on, from votes (v, 4, n) that are turned alike."""
-    # an edge moves by a few millimetres between placements
-    wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), 7, axis=-1)
-    wide[wide < 0] = np.nan
-    distances, places = wide_distances(board.pattern), []
-    for name, own in zip(SIDES, np.moveaxis(wide, 1, 0), strict=True):
-        enough = np.isfinite(own).sum(axis=0) >= min(3, len(votes))
-        mean = np.zeros(len(distances))
-        mean[enough] = np.nanmean(own[:, enough], axis=0)
-        places.append(outer_peak(gaussian_filter1d(mean, 1.0)))
-        if places[-1] < 0:
-            raise OutlineNotSeen(
-                f"the images do not agree on the {name} edge of board '{board.name}': give the corners of the board or "
-                "pick edges by hand"
-            )
-    return side_lines(board.pattern, distances[places])
+    turned = turned if np.mean(np.where(turned, -up, up) > 0) >= 0.5 else ~turned
+    try:
+        lines, why = common_lines(np.where(turned[:, None, None], votes[:, [2, 3, 0, 1]], votes), board), ""
+    except OutlineNotSeen as error:
+        lines, why = None, str(error)
+    return turned.astype(int), lines, why
 
 
 def alike(rotations, placements, cameras):
@@ -397,36 +366,18 @@ def decide(scores, first):
     return (total[:, side].argmax(axis=1) + side.start)[first]
 
 
-def _survey_plain(choices, view, board, models):
-    """The same for a board without pattern; one that looks the same when turned is turned alike in a placement."""
-    unknown = [c for c, m in models.items() if m is None]
-    if unknown:
-        raise ValueError(
-            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
-        )
-    found = []
-    for group in choices:
-        tried = []
-        for record in (r for r in group if r.purpose != "intrinsics"):
-            tried.append((record, view(Shown(record, ""), board, models)))
-            if not tried[-1][1].reason:
-                break
-        found += sorted(tried, key=lambda item: item[1].reason != "")[:1]
-    seen = [v for _, v in found if v.T_camera_board is not None]
-    own = []
+def _turned_alike(views):
+    """Views of a plain board, of which one that looks the same when turned is turned alike in a placement."""
+    seen, own = [v for v in views if v.T_camera_board is not None], []
     for v in seen:
-        normal = v.T_camera_board.rotation.as_matrix()[:, 2]
-        same = [p for p in v.alternatives if p.rotation.as_matrix()[:, 2] @ normal > SAME_PLANE]
-        own.append([v.T_camera_board, *same])
+        normals = [a.T_camera_board.rotation.as_matrix()[:, 2] for a in (v, *v.alternatives)]
+        own.append([v, *(a for a, n in zip(v.alternatives, normals[1:], strict=True) if n @ normals[0] > SAME_PLANE)])
     most = max(map(len, own), default=0)
-    turns = [Rotation.concatenate([p.rotation for p in poses + poses[:1] * (most - len(poses))]) for poses in own]
+    own = [same + same[:1] * (most - len(same)) for same in own]
+    turns = [Rotation.concatenate([v.T_camera_board.rotation for v in same]) for same in own]
     partner = alike(turns, [v.placement for v in seen], [v.camera for v in seen])[1]
-    chosen = iter([poses[mine[0]] for poses, mine in zip(own, partner, strict=True)])
-    views = {camera: [] for camera in models}
-    for record, v in found:
-        pose = None if v.T_camera_board is None else next(chosen)
-        views[v.camera].append(v if pose is v.T_camera_board else view(Shown(record, ""), board, models, guess=pose))
-    return Survey(views, dict(models), None, board)
+    chosen = iter([same[mine[0]] for same, mine in zip(own, partner, strict=True)])
+    return [v if v.T_camera_board is None else next(chosen) for v in views]
 
 
 def measure_outline(views, board, models):
@@ -436,37 +387,24 @@ def measure_outline(views, board, models):
     bends between placements, so the spread is its own, not the noise of the images. ValueError names an edge that was
     seen in no image.
     """
-    usable = [(v, models[camera]) for camera, group in views.items() for v in group if not v.reason]
-    seen = [{e.name: board_line(v, e, m) for e in v.edges} for v, m in usable]
-    lines = {name: np.array([own[name] for own in seen if name in own]) for name in board.edges}
-    missing = [name for name, found in lines.items() if not len(found)]
-    if missing:
-        raise ValueError(
-            f"edge '{missing[0]}' of board '{board.name}' was found in none of {len(usable)} images: pick it by hand "
-            "in edges.csv or give the corners of the board"
-        )
-    rough = corners_of_lines([np.median(found, axis=0) for found in lines.values()])
-    fitted = [
-        _median_line(found, rough[[i - len(rough), i + 1 - len(rough)]]) for i, found in enumerate(lines.values())
-    ]
-    measured = replace(board, corners=corners_of_lines([line for line, _ in fitted]))
-    lengths = {}
-    for before, name, after in zip(np.roll(board.edges, 1), board.edges, np.roll(board.edges, -1), strict=True):
-        corners = [
-            corners_of_lines([own[n] for n in (before, name, after)])
-            for own in seen
-            if {before, name, after} <= own.keys()
-        ]
-        lengths[name] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
-    return Outline(
-        np.stack([line for line, _ in fitted]),
-        np.array([sd for _, sd in fitted]),
-        {n: float(x) for n, x in measured.lengths().items()},
-        {n: _spread(x) for n, x in lengths.items()},
-        {n: len(found) for n, found in lines.items()},
-        {n: len(x) for n, x in lengths.items()},
-        measured,
-    )
+    usable, lines, lengths = [v for v in views if not v.reason], [], {}
+    seen = [{e.name: board_line(v, e, models[v.camera]) for e in v.edges} for v in usable]
+    for name in board.edges:
+        lines.append(np.array([own[name] for own in seen if name in own]))
+        if not len(lines[-1]):
+            raise ValueError(
+                f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: pick it by hand "
+                "in edges.csv or give the corners of the board"
+            )
+    rough = corners_of_lines([np.median(found, axis=0) for found in lines])
+    ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
+    fitted, line_sd = map(np.array, zip(*map(_median_line, lines, ends), strict=True))
+    measured = replace(board, corners=corners_of_lines(fitted))
+    for trio in zip(np.roll(board.edges, 1), board.edges, np.roll(board.edges, -1), strict=True):
+        corners = [corners_of_lines([own[name] for name in trio]) for own in seen if own.keys() >= {*trio}]
+        lengths[trio[1]] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
+    spread, count = ({n: f(x) for n, x in lengths.items()} for f in (_spread, len))
+    return Outline(fitted, line_sd, {n: float(x) for n, x in measured.lengths().items()}, spread, count, measured)
 
 
 def _spread(values):
@@ -524,7 +462,8 @@ def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
     between = poses[1] * poses[0].inv()
     rough = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
     mounting = RigidTransform.concatenate([RigidTransform.identity(), rough])
-    options = {"intrinsics": refine, "relief": relief is not None and bool(np.any(relief))}
+    wavy = relief is not None and np.any(relief)
+    options = {"intrinsics": refine, "basis": intrinsics.waves(pattern.points()) if wavy else None}
     options["fixed"] = (8,) if all(m.distortion[4] == 0 for m in models) else ()
-    result = adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
+    result = intrinsics.adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
     return result.mounting[1], result.mounting_covariance[0], result

@@ -1,37 +1,37 @@
 """A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and beams one after another."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
+from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import need
 
 MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
-NOT_VALID, DAZZLED, WEAK, TOO_FAR = 8191, 8190, 8187, 8183  # 13-bit words that are no ranges (listing, 10.8)
-LARGEST_WORD = 0x1FF6  # 8.182 m in mm, 81.82 m in cm
-WHOLE_SCANS = {(100, 100), (100, 50), (100, 25), (180, 100), (180, 50)}  # deg, 1/100 deg: variants of telegram 0x3B
+NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
+VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))  # deg, 1/100 deg: of telegram 0x3B
 RAYS_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
 class Beam:
-    """Settings of a laser range finder; ValueError for those that the device does not have."""
+    """Settings of a laser range finder, an outdoor LMS221 by default; ValueError for those that no device has."""
 
-    name: str
-    angles: tuple[int, ...]  # fields of view that the device can be set to, degrees (technical description, chapter 12)
+    name: str = "LMS221-30206"
+    angles: tuple[int, ...] = (100, 180)  # fields of view it can be set to, degrees (technical description, chapter 12)
     # diameter of the spot at the window, metres, and its growth with distance, radians (technical description)
-    spot_exit: float
-    divergence: float
-    sigma_range: float  # statistical error, 1 sigma, metres (technical description: 10 mm outdoor, 5 mm LMS200)
-    systematic: float  # constant error of this one device, metres
-    systematic_bound: tuple[tuple[float, float], ...]  # largest systematic error that the maker admits, by unit, metres
+    spot_exit: float = 0.016
+    divergence: float = 0.0119
+    sigma_range: float = 0.010  # statistical error, 1 sigma, metres (technical description)
+    systematic: float = 0.0  # constant error of this one device, metres
+    # largest systematic error that the maker admits, by unit, metres
+    systematic_bound: tuple[tuple[float, float], ...] = ((0.001, 0.035), (0.01, 0.05))
     # variant in degrees and 1/100 degree, as telegram 0x3B sets them
-    field_of_view: int
-    resolution: int
+    field_of_view: int = 180
+    resolution: int = 50
     unit: float = 0.001  # metres a count: 0.001 or 0.01
     # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m)
     pulse: float = 1.0
@@ -43,10 +43,10 @@ class Beam:
     rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
 
     def __post_init__(self):
-        if self.field_of_view not in self.angles or (self.field_of_view, self.resolution) not in WHOLE_SCANS:
-            variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
-            known = ", ".join(f"{a}/{step / 100:g}" for a, step in sorted(WHOLE_SCANS) if a in self.angles)
-            raise ValueError(f"{self.name} has no whole scans of {variant}; it can be set to {known}")
+        known = [variant for variant in VARIANTS if variant[0] in self.angles]
+        variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
+        words = f"no whole scans of {variant}; it can be set to {', '.join(f'{a}/{s / 100:g}' for a, s in known)}"
+        need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
         for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
             value = getattr(self, name)
             need(0 <= value < math.inf, f"{self.name}: {name} is {value}, it must be zero or positive")
@@ -54,8 +54,8 @@ class Beam:
         need(bound, f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
         offset = f"{self.name}: a systematic error of {self.systematic} m"
         need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
-        share = f"{self.name}: least_share is {self.least_share}, a share lies between 0 and 1"
-        need(0 <= self.least_share <= 1, share)
+        share = f"least_share is {self.least_share}, a share lies between 0 and 1"
+        need(0 <= self.least_share <= 1, f"{self.name}: {share}")
         need(self.rings >= 0, f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
 
     @property
@@ -73,36 +73,21 @@ class Beam:
         count = self.field_of_view * 100 // self.resolution + 1
         return np.radians(90 - self.field_of_view / 2 + np.arange(count) * self.resolution / 100)
 
-    def beam_times(self):
-        """Time of every beam after the scan began, shape (B,), seconds.
+    @property
+    def unit_name(self):
+        """'mm' or 'cm'."""
+        return "mm" if self.unit < 0.005 else "cm"
 
-        The mirror always turns in steps of 1 deg; turn k starts k times the resolution later, so neighbours of a fine
-        scan are one turn apart in time (telegram listing, 7.5).
-        """
-        bearings = self.bearings()
-        return np.arange(len(bearings)) % self.turns * MIRROR_TURN + bearings / (2 * np.pi) * MIRROR_TURN
-
-    def spot(self, distance):
-        """Diameter of the spot, metres."""
-        return self.spot_exit + self.divergence * np.asarray(distance, float)
-
-
-_OUTDOOR = {
-    "spot_exit": 0.016, "divergence": 0.0119, "sigma_range": 0.010, "systematic": 0.0,
-    "systematic_bound": ((0.001, 0.035), (0.01, 0.05)), "resolution": 50,
-}  # fmt: skip
-LMS211 = Beam("LMS211-30206", (100,), field_of_view=100, **_OUTDOOR)
-LMS221 = Beam("LMS221-30206", (100, 180), field_of_view=180, **_OUTDOOR)
-_INDOOR = {"systematic_bound": ((0.001, 0.015), (0.01, 0.04)), "least_energy": 0.1 / 10.0**2}
-LMS200 = Beam("LMS200-30106", (100, 180), 0.012, 0.0044, 0.005, 0.0, field_of_view=180, resolution=50, **_INDOOR)
+    def info(self, made):
+        """What a session states of it, an LrfInfo; `made` is how ('simulated')."""
+        return LrfInfo(
+            f"{self.name} ({made})", tuple(self.bearings()[[0, -1]].tolist()), math.radians(self.resolution / 100),
+            self.sigma_range, range_resolution=self.unit, max_range=MODES[0].largest * self.unit,
+            spot_exit=self.spot_exit, spot_divergence=self.divergence,
+        )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Scan:
-    """Scan lines as the device sends them: 13-bit words, shape (L, B), and ranges in metres, NaN for codes."""
-
-    words: np.ndarray
-    ranges: np.ndarray
+LMS221 = Beam()
 
 
 def spot_pattern(rings):
@@ -173,24 +158,22 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
     energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / distance**2 / beam.rays
     shape = len(bearings), beam.rays
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    return reading, total, world.dazzling(hits.thing).reshape(shape).any(axis=1)
+    return reading, total, world.dazzling[hits.thing].reshape(shape).any(axis=1)
+
+
+def measured(beam, reading, total, dazzled, rng):
+    """What the device makes of ideal readings: noisy ranges, metres, and why there is none (index into REASONS)."""
+    ranges = reading + beam.systematic + beam.sigma_range * rng.standard_normal(reading.shape)
+    reasons = np.where(np.isfinite(reading), 0, np.where(total > 0, WEAK, NOT_VALID))
+    return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons)
 
 
 def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines, a Scan, at the true pitch of the head in each line (L, 1) or beam (L, B), radians."""
+    """Record scan lines, words (L, B) of 13 bits, at the true pitch of the head in each line (L, 1) or beam (L, B)."""
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
     flat, step = (bearings.ravel(), pitch.ravel()), max(1, RAYS_AT_ONCE // beam.rays)
     starts = range(0, bearings.size, step)
     parts = [ideal_readings(beam, world, *(v[i : i + step] for v in flat), T_head_lrf) for i in starts]
-    reading, total, dazzled = (np.concatenate(p).reshape(bearings.shape) for p in zip(*parts, strict=True))
-    noisy = reading + beam.systematic + beam.sigma_range * rng.standard_normal(reading.shape)
-    return encode(beam, noisy, total, dazzled)
-
-
-def encode(beam, readings, total, dazzled):
-    """A Scan: readings (metres, NaN: no echo) rounded to the device's unit, its codes where there is no range."""
-    counts = np.rint(np.nan_to_num(readings, nan=0.0) / beam.unit)
-    words = np.where(counts > LARGEST_WORD, TOO_FAR, np.clip(counts, 0, LARGEST_WORD))
-    words = np.where(np.isfinite(readings), words, np.where(total > 0, WEAK, NOT_VALID))
-    words = np.where(dazzled, DAZZLED, words).astype(np.uint16)
-    return Scan(words, np.where(words <= LARGEST_WORD, words * beam.unit, np.nan))
+    ideal = (np.concatenate(part).reshape(bearings.shape) for part in zip(*parts, strict=True))
+    ranges, reasons = measured(beam, *ideal, rng)
+    return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

@@ -5,8 +5,6 @@ hundred: sweeps of a whole rig (:func:`observe`), or single shots, one scan line
 (:func:`draw_shots`). It returns plain arrays and knows no solver.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, field
 

@@ -1,23 +1,22 @@
 """The simulated rig, the set-ups by name (``setups.json``), and the places that the board is put."""
 
-from __future__ import annotations
-
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.scene import Exposure, need
 
-MOUNTS = ("head", "platform")
 AHEAD = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # axes ahead to those of a camera or an upright board
 MOST_TRIES = 4000
 PITCH_GRID = np.radians(np.arange(-30.0, 30.1, 0.5))  # pitch angles at which an image may be taken
@@ -46,24 +45,19 @@ class Platform:
             value = getattr(self, name)
             need(0 <= value < math.inf, f"platform: {name} is {value}, it must be zero or positive")
         need(0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive")
-        share = f"platform: stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
-        need(abs(self.stretch) < 0.5, share)
+        share = f"stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
+        need(abs(self.stretch) < 0.5, f"platform: {share}")
 
     def stop(self, commanded, direction, rng):
         """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or from above (-1).
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
         """
-        commanded = np.asarray(commanded, float)
+        commanded, step = np.asarray(commanded, float), self.encoder_step
         self.check(commanded)
-        return self._told(commanded + self.noise * rng.standard_normal(commanded.shape), direction)
-
-    def sweep(self, start, stop, time_s):
-        """True and measured pitch while moving at constant speed; the measured one lags by the latency."""
-        self.check(np.array([start, stop]))
-        way, instants = np.sign(stop - start), (time_s, time_s - self.latency)
-        now, then = (start + way * np.clip(self.speed * t, 0, abs(stop - start)) for t in instants)
-        return self._told(now, way)[0], self._told(then, way)[1]
+        motor = commanded + self.noise * rng.standard_normal(commanded.shape)
+        head = (1 + self.stretch) * motor - np.asarray(direction) * self.backlash / 2
+        return head, np.rint(motor / step) * step if step else motor
 
     def check(self, pitch):
         """Refuse angles beyond the limits."""
@@ -72,26 +66,16 @@ class Platform:
         words = f"platform: pitch {first} to {last} deg is asked for, it turns {has[0]} to {has[1]} deg"
         need(self.limits[0] <= low and high <= self.limits[1], words)
 
-    def _told(self, motor, direction):
-        """Where the head is and what the encoder says where the motor is."""
-        head, step = (1 + self.stretch) * motor - np.asarray(direction) * self.backlash / 2, self.encoder_step
-        return head, np.rint(motor / step) * step if step else motor
-
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera of the rig."""
+    """A camera on the head of the rig."""
 
     name: str
     model: CameraModel  # true intrinsics
-    mounting: RigidTransform  # T_camera_lrf on the head, T_camera_platform on the base
+    mounting: RigidTransform  # T_camera_lrf
     guess: RigidTransform  # the same as a tape measure gives it
-    mount: str = "head"  # one of head, platform
     exposure: Exposure = Exposure()
-
-    def __post_init__(self):
-        known = f"camera '{self.name}': mount is one of {', '.join(MOUNTS)}"
-        need(self.mount in MOUNTS, f"{known}, got '{self.mount}'")
 
 
 @dataclass(frozen=True)
@@ -111,14 +95,27 @@ class Rig:
 
     def camera_pose(self, camera, pitch):
         """``T_camera_platform`` of a RigCamera while the head stands at a true pitch, radians."""
-        if camera.mount == "platform":
-            return camera.mounting
         back = RigidTransform.from_rotation(Rotation.from_rotvec([-pitch, 0.0, 0.0]))
         return camera.mounting * self.T_head_lrf.inv() * back
 
+    def camera_infos(self):
+        """What a session states of the cameras, a list of CameraInfo."""
+        return [CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess) for c in self.cameras]
+
+    def truth(self):
+        """Mountings, intrinsics and board as only the simulator knows them, as JSON."""
+        cameras = {
+            c.name: {"T_camera_lrf": transform_to_json(c.mounting), "intrinsics": model_to_json(c.model),
+                     "exposure": asdict(c.exposure)}
+            for c in self.cameras
+        }  # fmt: skip
+        head, board = transform_to_json(self.T_head_lrf), board_to_json(self.board)
+        return {"T_head_lrf": head, "cameras": cameras, "board": board}
+
     def outline(self, T_platform_board):
-        """Corners of the board in the platform frame, shape (n, 3)."""
-        return T_platform_board.apply(_flat(self.board.known_corners()))
+        """Corners of the board in the platform frame (or a camera's, by its pose there), shape (n, 3)."""
+        corners = self.board.known_corners()
+        return T_platform_board.apply(np.column_stack([corners, np.zeros(len(corners))]))
 
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
@@ -139,7 +136,7 @@ class Rig:
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
         """Whether a camera sees points of the board, its corners by default, inside the image by a margin in pixels."""
-        p = T_camera_board.apply(_flat(self.board.known_corners()) if points is None else points)
+        p = self.outline(T_camera_board) if points is None else T_camera_board.apply(points)
         if p[:, 2].min() < 0.1 or np.abs(p[:, :2] / p[:, 2:]).max() > 1.0:
             return False
         uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
@@ -231,25 +228,19 @@ def random(setup, *key):
 
 
 def placements_of(setup):
-    """The board placements of a setup, a list of Placement."""
-    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
-
-
-def room_placement(setup):
-    """The sweep of the room as a placement without a board; None where the setup has none."""
-    if not setup.room_sweep:
-        return None
-    return Placement(2 * setup.pairs + 1, None, setup.room_sweep[:2], setup.room_images)
+    """The placements of a setup, a list: those of the board, then the sweep of the room where there is one."""
+    room = [Placement(2 * setup.pairs + 1, None, setup.room_sweep[:2], setup.room_images)] if setup.room_sweep else []
+    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES)) + room
 
 
 def check_size(rig, nearest):
     """Refuse a board that does not fit into the view of the LRF or of a camera at a distance, metres."""
-    corners = rig.board.known_corners()
-    length = np.linalg.norm(corners[:, None] - corners, axis=2).max()
+    length = pdist(rig.board.known_corners()).max()
     angle = np.degrees(2 * np.arctan(length / 2 / nearest))
-    views = {f"{rig.beam.name}": float(rig.beam.field_of_view)}
-    for m, name in ((camera.model, camera.name) for camera in rig.cameras):
-        views[f"camera '{name}'"] = float(np.degrees(2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2)))
+    views = {rig.beam.name: float(rig.beam.field_of_view)}
+    for camera in rig.cameras:
+        m = camera.model
+        views[f"camera '{camera.name}'"] = np.degrees(2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2))
     for name, view in views.items():
         large = f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m"
         seen = f"{name} sees {view:.0f} deg; take a smaller board or a greater distance"
@@ -333,8 +324,3 @@ def held_close(rig, camera, count, rng):
             raise ValueError(f"the pattern of board '{rig.board.name}' does not fit into {where}")
         out.append(pose)
     return out
-
-
-def _flat(corners):
-    """Corners (n, 2) of a board as points of its frame, shape (n, 3)."""
-    return np.column_stack([corners, np.zeros(len(corners))])

@@ -5,12 +5,8 @@ A row of ``room.json`` is a shape and a texture with their settings (functions o
 Its numbers are kept to the last bit: the shipped sessions are rebuilt from them to the byte.
 """
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +22,7 @@ FLAT = 0.03  # difference of light over a block of pixels below which its four c
 BLOCK = 2  # pixels
 BATCH = 1 << 19  # rays that are cast at once
 LATTICE = np.random.default_rng(20091001).random((64,) * 3)  # random values that textures are made of
-TEXTURES = {}  # by name, for room.json
+ROOM = json.loads(Path(__file__).with_name("room.json").read_text())
 
 
 def need(good, words):
@@ -104,17 +100,6 @@ def curtain(width, height, depth, folds):
 SHAPES = {f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphere, rod, curtain)}
 
 
-def _texture(function):
-    """Make of a function of points and settings one of the settings that returns a function of points."""
-
-    def make(*settings):
-        return lambda points: function(points, *settings)
-
-    make.__doc__ = function.__doc__
-    TEXTURES[function.__name__] = make
-    return make
-
-
 def value_noise(points, cell):
     """Smooth noise between 0 and 1, shape (n,), from random values on a lattice of cells of this size, metres."""
     at = points / cell
@@ -130,7 +115,6 @@ def value_noise(points, cell):
     return out
 
 
-@_texture
 def plain(points, color, rough=0.0, cell=0.15):
     """One colour, with a soft variation of the share `rough`."""
     if not rough:
@@ -138,29 +122,25 @@ def plain(points, color, rough=0.0, cell=0.15):
     return np.asarray(color, float) * (1 + rough * (value_noise(points, cell) - 0.5))[:, None]
 
 
-@_texture
 def wood(points, color, cell=(0.5, 0.03, 0.03)):
     """Grain along x."""
     return np.asarray(color, float) * (0.8 + 0.4 * value_noise(points, np.asarray(cell)))[:, None]
 
 
-@_texture
 def planks(points, color, width=0.18, length=1.4):
     """A wooden floor: boards along y with dark joints."""
     row = np.floor(points[:, 0] / width)
     tone = LATTICE[row.astype(int) & 63, np.floor(points[:, 1] / length + 0.37 * row).astype(int) & 63, 7]
     joint = np.minimum(np.abs(points[:, 0] / width - np.round(points[:, 0] / width)) * width, 1.0)
     dark = np.where(joint < 0.002, 0.55, 1.0)
-    return wood(color, (0.03, 0.6, 1.0))(points) * ((0.85 + 0.3 * tone) * dark)[:, None]
+    return wood(points, color, (0.03, 0.6, 1.0)) * ((0.85 + 0.3 * tone) * dark)[:, None]
 
 
-@_texture
 def stripes(points, first, second, period, axis=0):
     """Two colours in turn along an axis."""
     return np.array([first, second], float)[np.floor(2 * points[:, axis] / period).astype(int) & 1]
 
 
-@_texture
 def tiles(points, color, joint, size):
     """Square tiles in x and z with joints of 4 mm."""
     at = points[:, [0, 2]] / size
@@ -169,7 +149,6 @@ def tiles(points, color, joint, size):
     return np.where(near[:, None], np.asarray(joint, float), tile)
 
 
-@_texture
 def printed_page(points, width, height, heading=0.1, line=0.0055):
     """Lines of text on white paper in the plane z = 0 about the origin: words as dark bars, a heading, a picture."""
     x, y = points[:, 0] / width + 0.5, 0.5 - points[:, 1] / height
@@ -183,7 +162,6 @@ def printed_page(points, width, height, heading=0.1, line=0.0055):
     return np.repeat(grey[:, None], 3, axis=1)
 
 
-@_texture
 def poster(points, width, height, colors):
     """A picture: hills under a sky with a sun, in the plane z = 0 about the origin."""
     sky, sun, far, near = np.asarray(colors, float)
@@ -196,7 +174,6 @@ def poster(points, width, height, colors):
     return np.where(((np.abs(x - 0.5) > 0.47) | (np.abs(y - 0.5) > 0.48))[:, None], 0.85, out)
 
 
-@_texture
 def book_spines(points, seed, pitch=0.035):
     """Coloured backs of books side by side along x."""
     rng = np.random.default_rng(seed)
@@ -207,7 +184,6 @@ def book_spines(points, seed, pitch=0.035):
     return np.where((np.abs(at - np.round(at)) < 0.05)[:, None], 0.04, color)
 
 
-@_texture
 def chessboard(points, board, dark, light, ring=0.5):
     """A dark board with its chessboard, if it has one; the square diagonally before the first inner corner is light.
 
@@ -221,12 +197,16 @@ def chessboard(points, board, dark, light, ring=0.5):
     return np.repeat(grey[:, None], 3, axis=1)
 
 
+TEXTURES = {f.__name__: f for f in (plain, wood, planks, stripes, tiles, printed_page, poster, book_spines)}
+
+
 @dataclass(frozen=True)
 class Thing:
     """A mesh with what its surface does with light."""
 
     mesh: tuple  # vertices (n, 3) in the thing's own frame, metres, and faces (m, 3)
-    texture: Callable  # points in the thing's frame, shape (n, 3), to albedo, shape (n, 3)
+    # function of points (n, 3) in the thing's frame and settings to albedo (n, 3), then the settings
+    texture: tuple
     pose: RigidTransform = RigidTransform.identity()  # T_platform_thing
     infrared: float | None = None  # diffuse reflectivity at the LRF's wavelength (905 nm); None takes the red albedo
     dazzles: bool = False  # the LRF is dazzled when its spot meets it (a lamp, the sun in a window)
@@ -264,6 +244,7 @@ class World:
     def __init__(self, things, lights=None):
         need(things, "a world needs at least one thing to see, got none")
         self.things, self.lights = tuple(things), lights
+        self.dazzling = np.array([t.dazzles for t in things] + [False])  # by the number of a thing, the last: nothing
         vertices = [thing.pose.apply(thing.mesh[0]) for thing in self.things]
         starts = np.cumsum([0] + [len(v) for v in vertices[:-1]])
         faces = np.concatenate([t.mesh[1] + s for t, s in zip(self.things, starts, strict=True)])
@@ -292,26 +273,21 @@ class World:
         return Hits(distance, face, np.where(seen, self.thing_of[face], -1))
 
     def albedo(self, points, thing):
-        """Albedo of points on things of these numbers, shape (n, 3); zero where there is none."""
+        """Albedo of points on things of these numbers, shape (n, 3)."""
         out, order = np.zeros((len(points), 3)), np.argsort(thing, kind="stable")
         numbers, starts = np.unique(thing[order], return_index=True)
         for number, rows in zip(numbers, np.split(order, starts[1:]), strict=False):
-            if number >= 0:
-                item = self.things[number]
-                out[rows] = item.texture(item.pose.inv().apply(points[rows]))
+            item = self.things[number]
+            texture, *settings = item.texture
+            out[rows] = texture(item.pose.inv().apply(points[rows]), *settings)
         return out
 
     def infrared(self, points, thing):
-        """Reflectivity of surface points for the LRF, shape (n,); zero where there is no thing."""
-        fixed = np.array([np.nan if t.infrared is None else t.infrared for t in self.things] + [0.0])
-        out = fixed[thing]
+        """Reflectivity of surface points for the LRF, shape (n,)."""
+        out = np.array([np.nan if t.infrared is None else t.infrared for t in self.things])[thing]
         ask = np.isnan(out)
         out[ask] = self.albedo(points[ask], thing[ask])[:, 0]
         return out
-
-    def dazzling(self, thing):
-        """Whether things dazzle the LRF, shape (n,)."""
-        return np.array([t.dazzles for t in self.things] + [False])[thing]
 
     def radiance(self, origins, directions, hits):
         """Light that comes back along rays, linear, shape (n, 3).
@@ -338,28 +314,21 @@ class World:
         return out
 
 
-@cache
-def _room():
-    return json.loads(Path(__file__).with_name("room.json").read_text())
-
-
 def furnished(*parts):
     """Things of parts of ``room.json``."""
     things = []
-    for row in (dict(row) for part in parts for row in _room()[part]):
+    for row in (dict(row) for part in parts for row in ROOM[part]):
         (shape, *sizes), (texture, *settings) = row.pop("shape"), row.pop("texture")
         turned = Rotation.from_euler("ZX", [row.pop("turn", 0.0), row.pop("tip", 0.0)], degrees=True)
         pose = RigidTransform.from_components(row.pop("at", [0.0, 0.0, 0.0]), turned)
-        things.append(Thing(SHAPES[shape](*sizes), TEXTURES[texture](*settings), pose, **row))
+        things.append(Thing(SHAPES[shape](*sizes), (TEXTURES[texture], *settings), pose, **row))
     return things
 
 
 def furnished_room(*more):
     """The room around the rig with further things in it, a World: flat, curved and thin things under two lamps."""
-    lights = _room()["lights"]
     parts = ("shell", "fittings", "bookshelf", "desk", "chair", "plant", "standing lamp", "small things")
-    lamps = Lights(np.array(lights["positions"]), np.array(lights["strengths"]), lights["ambient"])
-    return World([*furnished(*parts), *more], lamps)
+    return World([*furnished(*parts), *more], Lights(*map(np.array, ROOM["lights"].values())))
 
 
 def board_on_stand(board, T_platform_board, ring):
@@ -372,8 +341,8 @@ def board_on_stand(board, T_platform_board, ring):
     rods = [(middle, behind, 0.006), (behind, head, 0.008), (head, knee, 0.011)]
     for turn in np.radians([80, 200, 320]):
         rods.append((knee, [head[0] + 0.38 * np.cos(turn), head[1] + 0.38 * np.sin(turn), FLOOR], 0.010))
-    sheet = Thing(polygon(board.corners), chessboard(board, 0.07, 0.75, ring), T_platform_board)
-    return [sheet, *(Thing(rod(*each), plain((0.4, 0.41, 0.43))) for each in rods)]
+    sheet = Thing(polygon(board.corners), (chessboard, board, 0.07, 0.75, ring), T_platform_board)
+    return [sheet, *(Thing(rod(*each), (plain, (0.4, 0.41, 0.43))) for each in rods)]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2
 
-from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m
+from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.solvers import lines, planes
 
@@ -73,7 +73,7 @@ METHODS = {
 STARTS = {
     "crossing": (planes.start_from_planes, lines.start_from_lines, lines.start_from_scene),
     "plane": (planes.start_from_planes,),
-    "scene": (lines.start_from_scene, planes.start_from_planes, lines.start_from_lines),
+    "scene": (planes.start_from_planes, lines.start_from_scene, lines.start_from_lines),
 }
 
 
@@ -91,7 +91,7 @@ def starting_transform(obs, uses="crossing"):
     raise DegenerateGeometry("no start value, give T0. " + " | ".join(reasons))
 
 
-def solve_camera(observations, method="line", T0=None, *, required=True, **options):
+def solve_camera(observations, method="line", T0=None, **options):
     """The pose of a camera by one of the methods.
 
     Parameters
@@ -102,10 +102,8 @@ def solve_camera(observations, method="line", T0=None, *, required=True, **optio
         Of `METHODS`.
     T0 : RigidTransform, optional
         Start value of ``T_camera_source``, one or one a trial; found by :func:`starting_transform` when left out.
-    required : bool
-        False: report unobservable motions instead of raising.
     **options
-        ``loss`` (None, 'huber' or 'cauchy') of single crossings, points or whole placements, with its ``scale``
+        ``loss`` (None or 'cauchy') of single crossings, points or whole placements, with its ``scale``
         (standard deviations, or 'auto'); ``weighted`` (False: every residual counts the same, True: by the propagated
         noise); ``max_iterations``.
 
@@ -126,83 +124,48 @@ def solve_camera(observations, method="line", T0=None, *, required=True, **optio
         raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
     row = METHODS[method]
     obs = observations.along() if row.along else observations
-    anyway = row.uses == "plane" and not required
-    obs.require(row.uses, 1 if anyway else row.fewest)
-    if T0 is None:
-        T0 = planes.start_from_planes(obs, required=False) if anyway else starting_transform(obs, row.uses)
-    pose = pose_array(T0)
+    obs.require(row.uses, row.fewest)
+    pose = pose_array(starting_transform(obs, row.uses) if T0 is None else T0)
     trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
-    options = {"method": method, "uses": row.uses, "required": required} | row.options | options
+    options = {"method": method, "uses": row.uses} | row.options | options
     return row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options)
 
 
-@dataclass(frozen=True)
-class PlacementReport:
-    """How well each placement agrees with a robust estimate.
-
-    `rms` (p,) are metres from the plane or pixels from the lines, `limit` (p,) what is still accepted; `outlying` and
-    `inliers` are the placements above and below it.
-    """
-
-    placements: np.ndarray
-    rms: np.ndarray
-    limit: np.ndarray
-    outlying: tuple[int, ...]
-    inliers: tuple[int, ...]
-
-
 ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal
-KINDS = {
-    "planes": ("zhang_pless", plane_residuals_m, "plane_placement"),
-    "lines": ("line", edge_residuals_px, "crossing_placement"),
-}
+NUMBERS = 2  # a plane's distance and the slope of the scan: neighbouring points err together
 
 
-def find_outlying_placements(obs, kind="planes"):
-    """Find placements that disagree with the others, without being told how many there are.
-
-    Parameters
-    ----------
-    obs : CameraObservations
-    kind : {'planes', 'lines'}
-        What is compared: point-plane distances or edge distances in the image.
+def find_outlying_placements(obs):
+    """Find placements whose planes disagree with the others', without being told how many there are.
 
     Returns
     -------
-    PlacementReport
+    inliers : list of int
+        Numbers of the placements that agree.
+    outlying : dict of int to float
+        Root mean square distances of the others' points from their planes, metres.
 
     Raises
     ------
-    ValueError
-        For another `kind`.
     DegenerateGeometry
         When the observations do not determine the pose.
 
     Notes
     -----
     Residuals are compared with their own level, not with the stated noise: the median over the accepted placements of
-    the mean square, divided by its expectation, sets the scale. A placement counts as many independent numbers as it
-    has crossings, or two with planes (the distance and the slope of the scan: neighbouring points err together).
+    the mean square, divided by its expectation, sets the scale.
     """
-    if kind not in KINDS:
-        raise ValueError(f"unknown kind {kind!r}: use 'planes' or 'lines'")
-    method, residuals_of, groups = KINDS[kind]
     keep, some, options = None, obs, {"scale": "auto", "weighted": False}
-    T = solve_camera(obs, method, loss="cauchy", **options).transform
+    T = solve_camera(obs, "zhang_pless", loss="cauchy", **options).transform
     for _ in range(11):
-        residuals = residuals_of(obs, T)
+        residuals = plane_residuals_m(obs, T)
         known = np.isfinite(residuals)
-        placements, index = np.unique(getattr(obs, groups)[known], return_inverse=True)
-        count = np.bincount(index)
+        placements, index, count = np.unique(obs.plane_placement[known], return_inverse=True, return_counts=True)
         mean = np.bincount(index, residuals[known] ** 2) / count
-        freedom = np.full(len(mean), 2.0) if kind == "planes" else count.astype(float)
-        judges = np.ones(len(mean), bool) if keep is None else keep
-        level = np.median((mean * freedom / chi2.median(freedom))[judges])
-        limit = level * chi2.ppf(ACCEPTED, freedom) / freedom
-        before, keep = keep, mean <= limit
+        level = np.median(mean if keep is None else mean[keep]) / chi2.median(NUMBERS)
+        before, keep = keep, mean <= level * chi2.ppf(ACCEPTED, NUMBERS)
         if np.array_equal(before, keep):
             break
         some = obs.select(placements[keep])
-        T = solve_camera(some, method, T, **options).transform
-    outlying, inliers = (tuple(int(x) for x in placements[flag]) for flag in (~keep, keep))
-    return PlacementReport(placements, np.sqrt(mean), np.sqrt(limit), outlying, inliers)
+        T = solve_camera(some, "zhang_pless", T, **options).transform
+    return placements[keep].tolist(), dict(zip(placements[~keep].tolist(), np.sqrt(mean[~keep]).tolist(), strict=True))

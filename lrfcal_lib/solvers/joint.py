@@ -21,10 +21,6 @@ SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0,
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
 START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 60
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
-LEVELS = (
-    "face_scale", "view_scale", "sigma_pitch", "face_share", "beam_share", "lapse", "sweep_sigma", "side_sigma",
-    "prior",
-)  # fmt: skip
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
@@ -64,8 +60,6 @@ class JointSolution:
         Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by direction (rad).
     sweeps : dict of int to ndarray
         Offset (rad) and stretch of the recorded pitch of each sweep.
-    size : dict of str to float
-        By how much each edge lies outside the stated one, metres.
     noise : dict of str to float
         Factors on the stated standard deviations, and shares of independent errors, as estimated.
     misfit : dict of int to float
@@ -88,7 +82,6 @@ class JointSolution:
     boards: dict
     sensor: dict
     sweeps: dict
-    size: dict
     noise: dict
     misfit: dict
     excluded: dict
@@ -179,20 +172,8 @@ class JointSolution:
 
 
 def solve_joint(
-    obs,
-    T0=None,
-    *,
-    prior=None,
-    axis=True,
-    sensor=("range_offset", "edge_log_odds", "edge_log_softness"),
-    size=False,
-    sides=False,
-    sweep="none",
-    sweep_sigma=SWEEP_SIGMA,
-    lapse=0.0,
-    noise="stated",
-    start=None,
-    required=True,
+    obs, T0=None, *, prior=None, axis=True, sensor=SENSOR[:3], sides=False, sweep="none", sweep_sigma=SWEEP_SIGMA,
+    lapse=0.0, noise="stated", start=None, required=True,
 ):
     """Estimate axis, cameras, range offset, edge bias and the pose of every board at once.
 
@@ -207,8 +188,6 @@ def solve_joint(
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
         Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero (softness: 0.2).
-    size : bool
-        Estimate the board's size: one offset an edge.
     sides : bool
         Every side of every placement deviates from the sensor's edge bias, because backgrounds are not alike.
     sweep : {'none', 'offset', 'offset_stretch'}
@@ -238,12 +217,12 @@ def solve_joint(
     """
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
-    unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), size, sweep, sides=sides)
+    unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
     if start is None:
         obs, lost = without_lost_placements(obs)
         obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
-    data = replace(gather(obs), sweep_sigma=tuple(sweep_sigma), prior=prior)
+    data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     state = converged(start, data, coarse(unknowns))
     state = converged(state, data, unknowns, LAST_STEP)
     data = replace(data, lapse=lapse)
@@ -266,7 +245,7 @@ def solve_again(obs, like):
     known = list(like.boards)
     rows = [known.index(int(p)) for p in obs.placements if int(p) in known]
     obs = obs.select([known[row] for row in rows])
-    data = gathered(obs, like.data)
+    data = gather(obs, **like.data.levels)
     state = converged(of_placements(like.state, rows), data, like.unknowns, LAST_STEP)
     return finished(obs, state, data, like.unknowns, like.excluded, True)
 
@@ -323,11 +302,6 @@ def coarse(unknowns):
     return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
 
 
-def gathered(obs, like):
-    """Padded observations with the noise levels of others."""
-    return replace(gather(obs), **{key: getattr(like, key) for key in LEVELS})
-
-
 def of_placements(state, rows):
     """The state of some placements (by index)."""
     return replace(state, **{key: getattr(state, key)[rows] for key in OWN})
@@ -351,7 +325,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
-    data, least = replace(gather(obs), sweep_sigma=tuple(sweep_sigma)), np.inf
+    data, least = gather(obs, sweep_sigma=tuple(sweep_sigma)), np.inf
     for number, state in enumerate(start_states(obs, T0)):
         if not unknowns.axis:
             known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
@@ -392,7 +366,7 @@ def agreeing_start(obs, state, data, unknowns):
     few = coarse(unknowns)
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
-        cut = gathered(kept, data) if bad else data
+        cut = gather(kept, **data.levels) if bad else data
         found = converged(fitting, cut, few, steps=START_STEPS)
         if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
@@ -450,7 +424,7 @@ def drop_contradictions(obs, state, data, unknowns):
             words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
     if words:
         obs, state = without(obs, state, views, out)
-        data = gathered(obs, data)
+        data = gather(obs, **data.levels)
     return obs, state, data, words
 
 
@@ -481,7 +455,7 @@ def wrong_image(obs, state, data, unknowns, i, limits):
     groups["view"]["used"][each, each] = False
     groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
     data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
-    lone = replace(unknowns, axis=False, sensor=(), poses=False, size=False)
+    lone = replace(unknowns, axis=False, sensor=(), poses=False)
     state = converged(state, data, lone, steps=START_STEPS)
     found = np.max(contradictions(state, data, lone)[0] / limits, axis=1)
     best = int(np.argmin(found))
@@ -495,22 +469,20 @@ def count_rows(obs):
 
 def total_cost(state, data, unknowns):
     """Half the squared residuals and the negative log likelihood of all observations."""
-    total = 0.0
-    for block in joint_blocks(state, data, unknowns):
-        total += block.cost.sum() if block.cost is not None else 0.5 * np.sum(whiten(block, False)[0] ** 2)
+    blocks = joint_blocks(state, data, unknowns)
+    total = sum(np.sum(0.5 * whiten(b, False)[0] ** 2 if b.cost is None else b.cost) for b in blocks)
     return float(total) if np.isfinite(total) else np.inf
 
 
 def in_stated_gauge(state, obs):
     """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
-    axis, stated = (None if T is None else geometry.head_from_axis(geometry.axis_of(T)) for T in
-                    (pose_transform(state.head), obs.T_head_lrf))  # fmt: skip
-    head = axis if stated is None else obs.T_head_lrf * stated.inv() * axis
-    change = head * pose_transform(state.head).inv()
-    cameras = state.cameras.copy()
-    for i, mount in enumerate(obs.mounts):
-        if mount == "platform":
-            cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
+    found = pose_transform(state.head)
+    head = geometry.head_from_axis(geometry.axis_of(found))
+    if obs.T_head_lrf is not None:
+        head = obs.T_head_lrf * geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf)).inv() * head
+    change, cameras = head * found.inv(), state.cameras.copy()
+    for i in np.flatnonzero(np.array(obs.mounts) == "platform"):
+        cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
     return replace(state, head=pose_array(head), boards=boards, cameras=cameras)
 
@@ -518,24 +490,21 @@ def in_stated_gauge(state, obs):
 def joint_words(direction, names, cameras):
     """A direction of the shared unknowns in words."""
     direction = np.asarray(direction) / np.max(np.abs(direction))
-    words = []
+    large, words = np.abs(direction) > 0.3, []
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
-        if index and np.max(np.abs(direction[index])) > 0.3:
+        if large[index].any():
             words.append(geometry.motion_words(direction[index], camera))
-    for name, value in zip(names, direction, strict=True):
-        if abs(value) > 0.3 and not any(name.startswith(f"{c}_") for c in cameras):
-            words.append(WORDS.get(name, name.replace("_", " ")))
-    return " with ".join(words)
+    return " with ".join(words + [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS])
 
 
 def finished(obs, state, data, unknowns, excluded, required):
     """The last steps, in the gauge of the stated platform, and all that a solution says."""
-    names = unknowns.names(obs.cameras, obs.edges)
+    names = unknowns.names(obs.cameras)
 
     def read(s):
         poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
-        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor, s.size])[unknowns.mask]
+        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[unknowns.mask]
 
     found = solve(
         lambda s: joint_blocks(s, data, unknowns), in_stated_gauge(state, obs),
@@ -556,7 +525,6 @@ def finished(obs, state, data, unknowns, excluded, required):
         boards=dict(zip(numbers, pose_transform(state.boards), strict=True)),
         sensor=dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
         sweeps=dict(zip(numbers, state.sweeps, strict=True)),
-        size=dict(zip(obs.edges, state.size.tolist(), strict=True)),
         noise={name: float(getattr(data, name)) for name in levels}
         | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
         misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
 from lrfcal_lib.fit.residuals import SIDE_FREEDOM, SWEEPS, Unknowns, rays, view_block
 from lrfcal_lib.model.camera import project_jacobians
 
@@ -53,8 +53,8 @@ def lens_covariance(obs, found, data, unknowns):
     lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
     weighted = np.sqrt(found.weights[..., None]) * found.jacobian
     hessian = np.swapaxes(weighted, -1, -2) @ weighted
-    inverse = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
-    reduced = J[..., :c] - J[..., c:] @ inverse @ hessian[:, c:, :c]
+    back = eliminate(hessian, np.zeros(hessian.shape[:2]), c)[2]
+    reduced = J[..., :c] - J[..., c:] @ back[..., :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
     for camera, spread in enumerate(obs.lens_covariance):
         mine = (used & (data.view["camera"] == camera))[..., None, None]
@@ -66,11 +66,9 @@ def lens_covariance(obs, found, data, unknowns):
 
 def estimate_noise(state, data, unknowns):
     """Padded observations with noise levels from the residuals at a solution."""
-    blocks, hessian = residuals.named_blocks(state, data, unknowns), 0.0
-    for block in blocks.values():
-        J = whiten(block)[1][..., unknowns.shared :]
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
-    variance = np.diagonal(np.linalg.pinv(hessian, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
+    blocks = residuals.named_blocks(state, data, unknowns)
+    own = linearise(blocks.values(), None, 1.0, (-2, -1))[0][:, unknowns.shared :, unknowns.shared :]
+    variance = np.diagonal(np.linalg.pinv(own, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
     if "face" in blocks:
         data = replace(data, **face_levels(state, data, blocks["face"]))
     if "beam" in blocks:
@@ -102,15 +100,15 @@ def face_levels(state, data, block):
     return {"face_scale": float(scale), "face_share": float(1 / max(ratio, 1.0))}
 
 
-def on_board(state, data):
-    """Measured face points in the boards' frames, shape (p, n, 3)."""
-    return (_face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
-
-
-def _face_points(state, data):
+def face_points(state, data):
     """Measured face points in the platform frame, shape (p, n, 3)."""
     o, d = rays(state, data, data.face)[:2]
     return o + (data.face["range"] - state.sensor[0])[..., None] * d
+
+
+def on_board(state, data):
+    """Measured face points in the boards' frames, shape (p, n, 3)."""
+    return (face_points(state, data) - state.boards[:, None, :, 3]) @ state.boards[:, :, :3]
 
 
 def _part(values, used):
@@ -150,8 +148,7 @@ def view_levels(data, block, state):
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
     turned = replace(data, direction=np.ones(len(data.direction)))
     by_pitch = view_block(state, turned, lone).jacobian[..., 0].reshape(used.shape + (6,))
-    free = 1 - 6 * used.any(axis=1).sum() / max(6 * used.sum(), 1)  # the boards' own poses take up the rest
-    free = max(free, LEAST_FREEDOM)
+    free = max(1 - used.any(axis=1).sum() / max(used.sum(), 1), LEAST_FREEDOM)  # the boards' own poses take up the rest
 
     def level(sigma):
         """Negative log likelihood at an error of the pitch of images, and the data with the scale that fits it."""
@@ -164,8 +161,8 @@ def view_levels(data, block, state):
         z = (whitener @ r)[..., 0][used]
         return 0.5 * np.sum(z**2) / free - np.log(np.diagonal(whitener[used], axis1=-2, axis2=-1)).sum(), trial
 
-    found = [level(sigma) for sigma in (PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1])]
-    return min(found, key=lambda pair: pair[0])[1]
+    sigmas = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
+    return min(map(level, sigmas), key=lambda pair: pair[0])[1]
 
 
 def side_level(square, sigma):
@@ -194,7 +191,7 @@ def misfits(blocks, data, groups=("face", "view")):
 
 def face_misses(state, data, boards, placement):
     """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
-    x = _face_points(state, data)[placement] - boards[:, None, :, 3]
+    x = face_points(state, data)[placement] - boards[:, None, :, 3]
     return _medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
 
 
@@ -218,19 +215,15 @@ def joint_warnings(blocks, data, unknowns, found, names):
     words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
-    axis, offset = (
-        [sigma for name, sigma in zip(found.names, found.sigma, strict=True) if name.startswith(prefix)]
-        for prefix in ("axis_", "offset_")
-    )
-    turn, shift = np.linalg.norm(axis), np.linalg.norm(offset)
-    if axis and (turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET):
+    turn, shift = np.linalg.norm(found.sigma[:4].reshape(2, 2), axis=1) if unknowns.axis else (0.0, 0.0)
+    if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
         words.append(
             f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger "
             "pitch range, take images at more pitch angles, or state the platform with its accuracy"
         )
     held = [name for name in TERMS if name not in unknowns.sensor]
     wider = replace(unknowns, sensor=(*unknowns.sensor, *held))
-    for name, (square, value) in score_tests(found.state, data, wider, held).items() if held else ():
+    for name, square, value in score_tests(found.state, data, wider, held):
         least, what, factor, unit = TERMS[name]
         if square > ASKED and abs(value) > least:
             words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
@@ -239,43 +232,35 @@ def joint_warnings(blocks, data, unknowns, found, names):
 
 def noise_words(blocks, data, names):
     """Groups of observations that scatter more or less than stated."""
-    scatter = {}
+    groups = []
     if "face" in blocks:
         z = whiten(blocks["face"], False)[0][data.face["used"]] / np.sqrt(data.face_share)
-        scatter["ranges", "face_sigma"] = np.sqrt(np.mean(z**2))
-    if "view" in blocks:
-        z = whiten(blocks["view"], False)[0].reshape(data.view["used"].shape + (6,))
-        for number, name in enumerate(names):
-            mine = data.view["used"] & (data.view["camera"] == number)
-            if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
-                scatter[f"poses of the board in camera '{name}'", "view_covariance"] = np.sqrt(np.mean(z[mine] ** 2))
-    low, high = NOISE_LIMITS
+        groups.append(("ranges", "face_sigma", z))
+    for number, name in enumerate(names if "view" in blocks else ()):
+        mine = data.view["used"] & (data.view["camera"] == number)
+        if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
+            z = whiten(blocks["view"], False)[0].reshape(mine.shape + (6,))[mine]
+            groups.append((f"poses of the board in camera '{name}'", "view_covariance", z))
+    levels = [(what, field, np.sqrt(np.mean(z**2))) for what, field, z in groups]
     return [
         f"the {what} scatter {level:.2g} times what is stated ({field}): standard deviations of the result are off "
         "alike; noise='estimate' takes the level from the residuals"
-        for (what, field), level in scatter.items()
-        if not low < level < high
+        for what, field, level in levels
+        if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]
     ]
 
 
 def score_tests(state, data, unknowns, held):
-    """Squared scores of shared unknowns held at zero, in standard deviations, and the values they would take.
+    """Names, squared scores (standard deviations) of shared unknowns held at zero, and the values they would take.
 
     Each one is tested by itself, with all that was estimated free.
     """
-    c, hessian, gradient = unknowns.shared, 0.0, 0.0
-    for block in residuals.named_blocks(state, data, unknowns).values():
-        r, J = whiten(block)
-        transposed = np.swapaxes(J, -1, -2)
-        hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
-    back = hessian[:, :c, c:] @ np.linalg.pinv(hessian[:, c:, c:], rcond=1e-12, hermitian=True)
-    whole = np.sum(hessian[:, :c, :c] - back @ hessian[:, c:, :c], axis=0)
-    score = np.sum(gradient[:, :c] - (back @ gradient[:, c:, None])[..., 0], axis=0)
-    names = unknowns.names(range(unknowns.cameras), range(unknowns.edges))
-    others, out = [i for i, name in enumerate(names) if name not in held], {}
+    hessian, gradient, *_ = linearise(residuals.joint_blocks(state, data, unknowns), None, 1.0, (-2, -1))
+    whole, score = (np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2])
+    names = unknowns.names(range(unknowns.cameras))
+    others = [i for i, name in enumerate(names) if name not in held]
     for name in held:
         free = [*others, names.index(name)]
         covariance = np.linalg.pinv(whole[np.ix_(free, free)], rcond=1e-14, hermitian=True)
         step = -(covariance @ score[free])[-1]
-        out[name] = float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)
-    return out
+        yield name, float(step**2 / max(covariance[-1, -1], 1e-300)), float(step)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.residuals import JointState
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points, pose_array, pose_transform
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import start_from_planes
 
@@ -34,13 +34,13 @@ def start_states(obs, T0=None):
     reasons, made, direct = [], 0, {}
     for camera, mount in enumerate(obs.mounts):
         with suppress(DegenerateGeometry):
-            direct |= {camera: _camera_at_image_pitch(obs, camera)} if mount == "head" else {}
+            direct |= {camera: _camera(obs, camera)} if mount == "head" else {}
     heads = [_axis_from_cameras(obs, direct), T0, obs.T_head_lrf, RigidTransform.identity()]
     for head in (h for h in heads if h is not None):
         for known in [direct, {}] if direct else [{}]:
             try:
                 state = state_of(obs, head, [
-                    known[i] if i in known else _camera_from_sweeps(obs, i, head) for i in range(len(obs.cameras))
+                    known[i] if i in known else _camera(obs, i, head) for i in range(len(obs.cameras))
                 ])  # fmt: skip
             except (DegenerateGeometry, np.linalg.LinAlgError) as error:
                 reasons.append(str(error))
@@ -56,42 +56,32 @@ def thin(rows, count):
     return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
-def _camera_from_planes(obs, camera, views, points):
-    """A camera's pose from its views of boards and points on these (a set for each view, in the camera's own frame)."""
-    numbers = np.arange(len(views))
-    key = np.repeat(numbers, [len(p) for p in points])
-    planes = {"plane_points": np.concatenate(points), "plane_placement": key}
-    boards = {"board_poses": obs.view_pose[views], "board_covariance": obs.view_covariance[views]}
-    return start_from_planes(CameraObservations(None, obs.cameras[camera], **planes, **boards))
+def _camera(obs, camera, head=None):
+    """Pose of a camera from its views of boards and points on these.
 
-
-def _camera_at_image_pitch(obs, camera):
-    """Pose of a camera on the head from scan lines at the pitch of its images: it does not depend on the axis."""
-    points, views = [], []
-    for view in thin(np.flatnonzero(obs.view_camera == camera), VIEWS):
-        mine = np.flatnonzero(obs.face_placement == obs.view_placement[view])
-        away = np.abs(obs.face_pitch[mine] - obs.view_pitch[view])
-        if away.min(initial=np.inf) <= SAME_PITCH:
-            rows = thin(mine[away <= away.min() + 1e-9], POINTS)
-            points.append(polar_to_points(obs.face_range[rows], obs.face_bearing[rows]))
+    From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines at the pitch of its
+    images, which needs no axis.
+    """
+    views, points, mine, name = [], [], np.flatnonzero(obs.view_camera == camera), obs.cameras[camera]
+    if head is not None:
+        mine = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
+    for view in thin(mine, VIEWS):
+        rows, pitch = np.flatnonzero(obs.face_placement == obs.view_placement[view]), obs.view_pitch[view]
+        if head is None:
+            away = np.abs(obs.face_pitch[rows] - pitch)
+            rows = rows[away <= min(away.min(initial=SAME_PITCH) + 1e-9, SAME_PITCH)]
+        if len(rows):
+            rows = thin(rows, POINTS)
+            p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
+            turned = () if head is None else (obs.face_pitch[rows], head, obs.mounts[camera], pitch)
+            points.append(geometry.lrf_to_source(p, *turned) if turned else p)
             views.append(view)
-    if len(views) < FEWEST_VIEWS:
-        raise DegenerateGeometry(f"camera '{obs.cameras[camera]}': {len(views)} images at the pitch of a scan line")
-    return _camera_from_planes(obs, camera, views, points)
-
-
-def _camera_from_sweeps(obs, camera, head):
-    """A camera from whole sweeps, joined by a roughly known axis."""
-    mine = np.flatnonzero(obs.view_camera == camera)
-    views = thin(mine[np.unique(obs.view_placement[mine], return_index=True)[1]], VIEWS)
-    views, points = [view for view in views if np.any(obs.face_placement == obs.view_placement[view])], []
-    for view in views:
-        rows = thin(np.flatnonzero(obs.face_placement == obs.view_placement[view]), POINTS)
-        p = polar_to_points(obs.face_range[rows], obs.face_bearing[rows])
-        points.append(geometry.lrf_to_source(p, obs.face_pitch[rows], head, obs.mounts[camera], obs.view_pitch[view]))
-    if not views:
-        raise DegenerateGeometry(f"camera '{obs.cameras[camera]}' never sees a board that the scans hit")
-    return _camera_from_planes(obs, camera, views, points)
+    if len(views) < (FEWEST_VIEWS if head is None else 1):
+        raise DegenerateGeometry(f"camera '{name}' never sees a board that the scans hit")
+    planes = {"plane_points": np.concatenate(points)}
+    planes["plane_placement"] = np.repeat(np.arange(len(views)), [len(p) for p in points])
+    boards = {"board_poses": obs.view_pose[views], "board_covariance": obs.view_covariance[views]}
+    return start_from_planes(CameraObservations(None, name, **planes, **boards))
 
 
 def _axis_from_cameras(obs, poses):
@@ -127,22 +117,19 @@ def state_of(obs, head, cameras):
         boards[seen] = boards_in_images(obs, pose_array(head), poses, first)
     for placement in np.setdiff1d(np.arange(count), seen):
         boards[placement] = pose_array(board_from_scan(obs, placement, head))
-    own = boards, np.zeros((count, 2)), np.zeros((count, edges))
-    return JointState(pose_array(head), poses, sensor, np.zeros(edges), *own)
+    return JointState(pose_array(head), poses, sensor, boards, np.zeros((count, 2)), np.zeros((count, edges)))
 
 
 def boards_in_images(obs, head, cameras, views):
     """``T_platform_board`` (n, 3, 4) from some views, each by itself; `head` and `cameras` as in JointState."""
-    camera, pose = obs.view_camera[views], obs.view_pose[views]
-    back = np.swapaxes(cameras[camera][..., :3], -1, -2)
-    rotation = back @ pose[:, :3, :3]
-    shift = (back @ (pose[:, :3, 3] - cameras[camera][..., 3])[..., None])[..., 0]
+    camera = obs.view_camera[views]
     on_head = np.array([mount == "head" for mount in obs.mounts])[camera]
-    turn = geometry.exp_rotation(np.stack([obs.view_pitch[views], 0 * shift[:, 0], 0 * shift[:, 0]], axis=1))
-    moved = turn @ head[:, :3] @ rotation
-    at = (turn @ (shift @ head[:, :3].T + head[:, 3])[..., None])[..., 0]
-    rotation = np.where(on_head[:, None, None], moved, rotation)
-    return np.concatenate([rotation, np.where(on_head[:, None], at, shift)[..., None]], axis=-1)
+    pitch = Rotation.from_rotvec(np.outer(obs.view_pitch[views] * on_head, [1.0, 0.0, 0.0]))
+    T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
+    T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
+    return pose_array(
+        RigidTransform.from_rotation(pitch) * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
+    )
 
 
 def board_from_scan(obs, placement, head):
@@ -172,17 +159,14 @@ def _turn_in_plane(obs, placement, head, axes, centre):
     o = lrf_to_platform(np.zeros_like(ray), obs.beam_pitch[beams], head)
     d = lrf_to_platform(ray, obs.beam_pitch[beams], head) - o
     x = (o + (((centre - o) @ axes[2]) / (d @ axes[2]))[:, None] * d - centre) @ axes[:2].T
-    edge, lines = obs.beam_edge[beams], obs.lines()
-    angles = []
-    for e in np.flatnonzero(np.bincount(edge) >= FEWEST_ANGLE_POINTS):
-        middle = x[edge == e].mean(axis=0)
-        along = np.linalg.svd(x[edge == e] - middle, full_matrices=False)[2][0]
-        outwards = np.array([along[1], -along[0]])
-        outwards *= np.sign(outwards @ middle) or 1.0
-        angles.append(np.arctan2(outwards[1], outwards[0]) - np.arctan2(lines[e, 1], lines[e, 0]))
-    if len(angles) < 2:
-        raise DegenerateGeometry(f"placement {obs.placements[placement]}: scans cross {len(angles)} edges, two needed")
-    turn = np.angle(np.mean(np.exp(1j * np.array(angles))))
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    normals = lines[edge, :2] @ R.T
-    return R, np.linalg.lstsq(normals, np.sum(normals * x, axis=1) + lines[edge, 2], rcond=None)[0]
+    edge, line = obs.beam_edge[beams], obs.lines()[obs.beam_edge[beams]]
+    crossed = np.sum(np.bincount(edge) >= FEWEST_ANGLE_POINTS)
+    if crossed < 2:
+        raise DegenerateGeometry(f"placement {obs.placements[placement]}: scans cross {crossed} edges, two needed")
+    # n . (R^T x + t) + c = 0, linear in cosine and sine of the turn and in t; then the shift for that turn alone
+    sine = line[:, 0] * x[:, 1] - line[:, 1] * x[:, 0]
+    A = np.column_stack([np.sum(line[:, :2] * x, axis=1), sine, line[:, :2]])
+    c, s = np.linalg.lstsq(A, -line[:, 2], rcond=None)[0][:2]
+    R = np.array([[c, -s], [s, c]]) / np.hypot(c, s)
+    normals = line[:, :2] @ R.T
+    return R, np.linalg.lstsq(normals, np.sum(normals * x, axis=1) + line[:, 2], rcond=None)[0]

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import edge_shift, interval_terms, line_block, read_pose, sight_block, sight_normals
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import pinhole_jacobian
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    apply_pose,
-    gradient_by_pose,
-    motion_words,
-    move_pose,
-    moved_noise,
-    noise_correction,
-    pose_transform,
-    rotate_points,
-)
+from lrfcal_lib.model.geometry import DegenerateGeometry, gradient_by_pose, move_pose, noise_correction, rotate_points
 from lrfcal_lib.solvers.planes import shifted, start_rotations
 
 
@@ -34,7 +22,7 @@ def distance_block(pose, obs):
     plain = sight_block(pose, obs.crossing_points, normals, 1.0)
     rotated = rotate_points(pose, obs.crossing_points)
     q = rotated + pose[..., None, :, 3]
-    shift = moved_noise(pose, normals, obs.crossing_covariance)
+    shift = geometry.moved_noise(pose, normals, obs.crossing_covariance)
     line = (obs.crossing_line_sigma / length) ** 2 * q[..., 2]
     variance = np.sum(shift * normals, axis=-1) + line * q[..., 2]
     factor = plain.residuals / variance
@@ -86,8 +74,10 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
     groups = getattr(obs, f"{uses}_placement")
-    about = {"names": POSE_NAMES, "method": method, "read": read_pose, "words": lambda d: motion_words(d, obs.camera)}
-    return solve(problem, pose, move_pose, groups=groups, required=required, earlier=earlier, **about, **options)
+    return solve(
+        problem, pose, move_pose, names=geometry.POSE_NAMES, method=method, read=read_pose, groups=groups,
+        words=lambda d: geometry.motion_words(d, obs.camera), required=required, earlier=earlier, **options,
+    )
 
 
 SOFTNESS = 0.2  # spot radii, start value
@@ -115,7 +105,7 @@ def interval_block(state, obs, sight, half, sigma):
     edge: the same to first order where the camera is near the LRF.
     """
     margin, jacobian = interval_margins(state, obs, sight)
-    cost, score, information, _ = interval_terms(margin + half, margin - half, sigma)
+    cost, score, information = interval_terms(margin + half, margin - half, sigma)
     root = np.sqrt(np.maximum(information, LEAST_INFORMATION / (half**2 / 3 + sigma**2)))
     return Block(score / root, root[..., None] * jacobian, np.ones_like(root), cost=cost)
 
@@ -133,10 +123,10 @@ def freeze_intervals(state, obs, sight, lengths, softness):
     Of some values of the softness (spot radii) that is taken which makes the intervals most likely.
     """
     pose = state[..., :4]
-    depth = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
+    depth = np.abs(geometry.apply_pose(pose, obs.crossing_points)[..., 2])
     half = np.abs(np.sum(sight * rotate_points(pose, obs.crossing_half_step), axis=-1))
     half = np.maximum(half, 0.02 * np.linalg.norm(obs.crossing_half_step, axis=-1))
-    noise = np.sum(moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
+    noise = np.sum(geometry.moved_noise(pose, sight, obs.crossing_noise) * sight, axis=-1)
     margin = interval_margins(state, obs, sight)[0]
     soft = np.reshape(softness, (-1,) + (1,) * margin.ndim) * obs.crossing_radius
     variance = np.maximum(soft, 2 * LEAST_STEP * half) ** 2 + noise + (obs.crossing_line_sigma * depth / lengths) ** 2
@@ -145,7 +135,7 @@ def freeze_intervals(state, obs, sight, lengths, softness):
     return half, np.sqrt(np.take_along_axis(variance, best, axis=0)[0])
 
 
-def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_iterations=60):
+def estimate_likely(residual, obs, pose, *, method, uses):
     """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges lie.
 
     `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is
@@ -164,14 +154,13 @@ def estimate_likely(residual, obs, pose, *, method, uses, required=True, max_ite
         return transform, np.concatenate([parameters, state[..., :1, 4]], axis=-1)
 
     def words(direction):
-        return "the sensor's edge bias" if abs(direction[6]) > 0.5 else motion_words(direction[:6], obs.camera)
+        return "the sensor's edge bias" if abs(direction[6]) > 0.5 else geometry.motion_words(direction[:6], obs.camera)
 
     state = np.concatenate([pose, np.zeros(pose.shape[:-1] + (1,))], axis=-1)
     problem, state, earlier = minimise_in_rounds(freeze, state, move_biased, ROUNDS, max_iterations=30)
     return solve(
-        problem, state, move_biased, names=(*POSE_NAMES, "log_odds"), method=method, read=read, words=words,
-        scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, required=required, earlier=earlier,
-        max_iterations=max_iterations,
+        problem, state, move_biased, names=(*geometry.POSE_NAMES, "log_odds"), method=method, read=read, words=words,
+        scales=np.r_[np.ones(6), 10.0], groups=obs.crossing_placement, earlier=earlier,
     )  # fmt: skip
 
 
@@ -186,34 +175,31 @@ def edge_bias(solution, radius=1.0, background=0.0):
 
 
 def start_from_lines(obs):
-    """Many rotations at once, each with its best translation, refined on planes of sight; robust vote."""
+    """From crossings and the image lines of their edges."""
     obs.require("crossing", 6)
-    normals, points, rotations = sight_normals(obs.crossing_lines, obs.model)[0], obs.crossing_points, start_rotations()
-    right = -np.sum(normals * (points @ np.swapaxes(rotations, -1, -2)), axis=-1)
-    found = shifted(rotations, normals, right)
-    for loss in (None, "cauchy"):
-        options = {"loss": loss, "scale": "auto", "max_iterations": 40}
-        found = minimise(lambda pose: sight_block(pose, points, normals, 0.005), found, move_pose, **options)[0]
-    z = apply_pose(found, points)[..., 2]
-    keep = (z > 0).mean(axis=1) > 0.8
-    if not keep.any():
-        raise DegenerateGeometry(
-            f"camera '{obs.camera}': no pose puts the {len(points)} crossings in front of the camera"
-        )
-    found, z = found[keep], z[keep]
-    distance = np.abs(sight_block(found, points, normals, 1.0).residuals) / np.abs(z)
-    count = max(6, int(0.75 * len(points)))
-    return pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])
+    return _start_from_sights(obs.crossing_points, obs.crossing_lines, obs)
 
 
 def start_from_scene(obs):
-    """Perspective n points (SQPnP within RANSAC) from points that LRF and camera both name."""
+    """From named points: each is seen where a column and a row of the image cross."""
     obs.require("scene", 4)
-    arguments = (np.ascontiguousarray(obs.scene_points), np.ascontiguousarray(obs.scene_pixels), obs.model.matrix, None)
-    options = {"flags": cv2.SOLVEPNP_SQPNP, "reprojectionError": 20.0, "iterationsCount": 500}
-    found, rotvec, translation, _ = cv2.solvePnPRansac(*arguments, **options)
-    if not found:
-        raise DegenerateGeometry(
-            f"camera '{obs.camera}': no pose agrees with four of the {len(obs.scene_points)} scene points"
-        )
-    return RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))
+    u, v = obs.scene_pixels.T
+    lines = np.concatenate([np.column_stack([1 + 0 * u, 0 * u, -u]), np.column_stack([0 * v, 1 + 0 * v, -v])])
+    return _start_from_sights(np.tile(obs.scene_points, (2, 1)), lines, obs)
+
+
+def _start_from_sights(points, lines, obs):
+    """Many rotations at once, each with its best translation, refined on planes of sight; robust vote."""
+    normals, rotations = sight_normals(lines, obs.model)[0], start_rotations()
+    found = shifted(rotations, normals, -np.sum(normals * (points @ np.swapaxes(rotations, -1, -2)), axis=-1))
+    for loss in (None, "cauchy"):
+        options = {"loss": loss, "scale": "auto", "max_iterations": 40}
+        found = minimise(lambda pose: sight_block(pose, points, normals, 0.005), found, move_pose, **options)[0]
+    z = geometry.apply_pose(found, points)[..., 2]
+    keep = (z > 0).mean(axis=1) > 0.8
+    if not keep.any():
+        raise DegenerateGeometry(f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera")
+    found, z = found[keep], z[keep]
+    distance = np.abs(sight_block(found, points, normals, 1.0).residuals) / np.abs(z)
+    count = max(6, int(0.75 * len(points)))
+    return geometry.pose_transform(found[np.argmin(np.sum(np.sort(distance, axis=1)[:, :count] ** 2, axis=1))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -10,56 +11,16 @@ from scipy.stats import f as f_distribution
 
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import pad, sight_normals
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    gradient_by_pose,
-    lrf_to_platform,
-    move_pose,
-    pose_array,
-    pose_parameters,
-    pose_transform,
-    tilt,
-)
-from lrfcal_lib.model.observations import check_finite
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, gradient_by_pose, pose_array, pose_transform
 from lrfcal_lib.solvers.planes import start_from_planes
 
 ERRORS = ("direction", "offset", "stretch")  # of the pitch: the first is shared, the others each sweep's own
 MODELS = {"none": (), "direction": ("direction",), "sweep": ("offset",), "sweep_stretch": ("offset", "stretch")}
 PLANE_NUMBERS, EDGE_NUMBERS = 3, 2  # independent numbers: a plane's distance and two angles; an edge's offset and angle
-PRIOR_OFFSET, PRIOR_STRETCH = np.radians(5.0), 0.5  # hold what one sweep cannot show (and the common offset)
+PRIOR = np.array([np.radians(5.0), 0.5])  # offset, stretch: hold what one sweep cannot show (and the common offset)
 SIGMA = 0.003  # metres, of one independent number; the level of the noise comes from the residuals
-POINTS = 300  # of each face
 LEVEL = 0.01  # a larger model must beat the last one wanted with this p-value
-
-
-@dataclass(frozen=True)
-class SweepPoints:
-    """Points on the boards' faces as the LRF measured them.
-
-    Attributes
-    ----------
-    points : ndarray, shape (m, 3)
-        LRF frame, metres.
-    pitch : ndarray, shape (m,)
-        Recorded pitch, radians.
-    placement : ndarray of int, shape (m,)
-    T_head_lrf : RigidTransform
-    direction : dict of int to int
-        Sweep direction (+1 or -1; 0 for a single shot) of each placement.
-    middle : dict of int to float, optional
-        Pitch about which a sweep is stretched; the mean of the points' pitch when left out.
-    """
-
-    points: np.ndarray
-    pitch: np.ndarray
-    placement: np.ndarray
-    T_head_lrf: RigidTransform
-    direction: dict[int, int]
-    middle: dict[int, float] | None = None
-
-    def __post_init__(self):
-        check_finite(self, " of the sweeps")
 
 
 @dataclass(frozen=True)
@@ -86,67 +47,47 @@ class PitchData:
         return int(PLANE_NUMBERS * len(self.placements) + EDGE_NUMBERS * edges)
 
 
-def gather(sweeps, cameras, number=POINTS):
-    """Observations of the placements that all cameras know, with `number` points of each face, evenly thinned."""
+def gather(cameras, direction, middle):
+    """Observations of the placements that all cameras know; the faces are those of the first."""
+    every = list(cameras.values())
     for name, obs in cameras.items():
         if obs.source != "platform":
             raise ValueError(
                 f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to the platform"
             )
-    placements = np.unique(sweeps.placement)
-    for obs in cameras.values():
-        placements = placements[np.isin(placements, obs.placements)]
+    placements = reduce(np.intersect1d, [every[0].plane_placement, *(obs.placements for obs in every)])
     if len(placements) < 4:
         raise DegenerateGeometry(
             f"{len(placements)} placements seen by the LRF and all cameras: at least 4 needed to compare sweeps"
         )
-    rows = [np.flatnonzero(sweeps.placement == p) for p in placements]
-    middle = np.array([sweeps.pitch[r].mean() for r in rows])
-    if sweeps.middle is not None:
-        middle = np.array([sweeps.middle[p] for p in placements.tolist()])
-    rows = np.concatenate([r[np.unique(np.linspace(0, len(r) - 1, number).astype(int))] for r in rows])
-    points = lrf_to_platform(sweeps.points[rows], sweeps.pitch[rows], sweeps.T_head_lrf)
-    place = np.searchsorted(placements, sweeps.placement[rows])
-    faces = _shared_out({"points": points, "pitch": sweeps.pitch[rows]}, place, place, len(placements))
+
+    def shared_out(obs, name, parts, **more):
+        """A group padded by placement, all rows of a part (a face, an edge of a placement) together with weight 1."""
+        group = {"points": obs.group(name)["points"], "pitch": obs.group(name)["pitch"]} | more
+        place = obs.group(name)["placement"]
+        keep = np.isin(place, placements)
+        group["placement"] = np.searchsorted(placements, place)
+        _, index, number = np.unique(parts[keep], return_inverse=True, return_counts=True)
+        group = {key: value[keep] for key, value in group.items()}
+        return pad(group | {"weight": 1 / np.sqrt(number[index])}, len(placements))
+
     edges, boards = [], []
-    for obs in cameras.values():
-        place = np.minimum(np.searchsorted(placements, obs.crossing_placement), len(placements) - 1)
-        pitch = pitch_of(obs.crossing_points, sweeps.T_head_lrf, middle[place])
-        keep = np.isfinite(pitch) & (placements[place] == obs.crossing_placement)
-        sight = sight_normals(obs.crossing_lines, obs.model)[0]
-        group = {"points": obs.crossing_points[keep], "pitch": pitch[keep], "sight": sight[keep]}
-        edge = np.unique(obs.crossing_edge[keep], return_inverse=True)[1]
-        edges.append(_shared_out(group, place[keep], place[keep] * (len(edge) + 1) + edge, len(placements)))
+    for obs in every:
+        sides = np.unique(obs.crossing_edge, return_inverse=True)[1]
+        parts = obs.crossing_placement * (len(sides) + 1) + sides
+        edges.append(shared_out(obs, "crossing", parts, sight=sight_normals(obs.crossing_lines, obs.model)[0]))
         order = np.argsort(obs.placements)
         boards.append(obs.board_poses[order[np.searchsorted(obs.placements, placements, sorter=order)], :3])
-    direction = np.array([sweeps.direction.get(p, 0) for p in placements.tolist()])
+    direction, middle = (np.array([known[p] for p in placements.tolist()]) for known in (direction, middle))
+    faces = shared_out(every[0], "plane", every[0].plane_placement)
     return PitchData(placements, direction, middle, faces, edges, np.array(boards), tuple(cameras))
-
-
-def _shared_out(group, place, part, count):
-    """Pad a group by placement, all rows of a part (a face, an edge of a placement) together with weight 1."""
-    _, index, number = np.unique(part, return_inverse=True, return_counts=True)
-    return pad(group | {"weight": 1 / np.sqrt(number[index]), "placement": place}, count)
-
-
-def pitch_of(p_platform, T_head_lrf, near):
-    """Pitch at which the scan plane passes through platform points, the solution nearest to `near`; NaN where none."""
-    normal, point = T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), T_head_lrf.translation
-    x, y, z = p_platform.T
-    # n . (Rx(-pitch) p - t) = 0  is  a cos(pitch) + b sin(pitch) = c
-    a, b, c = normal[1] * y + normal[2] * z, normal[1] * z - normal[2] * y, normal @ point - normal[0] * x
-    with np.errstate(invalid="ignore", divide="ignore"):
-        reach = np.arccos(c / np.hypot(a, b))
-    both = np.arctan2(b, a) + np.stack([reach, -reach])
-    both = near + (both - near + np.pi) % (2 * np.pi) - np.pi
-    return np.where(np.abs(both[0] - near) <= np.abs(both[1] - near), both[0], both[1])
 
 
 def corrected_points(group, data, state):
     """Platform points with the recorded pitch corrected, and their derivative by the pitch."""
     _, direction, offset, stretch = state
     change = (direction * data.direction + offset)[:, None] + stretch[:, None] * (group["pitch"] - data.middle[:, None])
-    q = tilt(group["points"], change)
+    q = geometry.tilt(group["points"], change)
     return q, np.stack([0 * change, -q[..., 2], q[..., 1]], axis=-1)
 
 
@@ -166,8 +107,8 @@ def plane_distances(state, data):
             slope = np.sum((normal @ pose[:, :3]) * by_pitch, axis=-1)
             J = np.zeros(r.shape + (6 * cameras + len(ERRORS),))
             J[..., 6 * i : 6 * i + 6] = gradient_by_pose(rotated, normal)
-            J[..., -3], J[..., -2] = slope * data.direction[:, None], slope
-            J[..., -1] = slope * (group["pitch"] - data.middle[:, None])
+            away = group["pitch"] - data.middle[:, None]
+            J[..., -3:] = np.stack([slope * data.direction[:, None], slope, slope * away], axis=-1)
             yield group, r, J
 
 
@@ -183,10 +124,8 @@ def pitch_blocks(state, data, name):
     blocks = [Block(r, J[..., columns], group["weight"] / sigma) for group, r, J in plane_distances(state, data)]
     if own:
         values, k = np.stack(state[2:], axis=1)[:, : len(own)], len(columns)
-        J = np.zeros(values.shape + (k,))
-        J[:, range(len(own)), range(k - len(own), k)] = 1.0
-        prior = np.array([PRIOR_OFFSET, PRIOR_STRETCH])[: len(own)]
-        blocks.append(Block(values, J, np.broadcast_to(1 / prior, values.shape)))
+        J = np.broadcast_to(np.eye(k)[k - len(own) :], values.shape + (k,))
+        blocks.append(Block(values, J, np.broadcast_to(1 / PRIOR[: len(own)], values.shape)))
     return blocks
 
 
@@ -196,14 +135,14 @@ def move_pitch_state(state, step, name):
     common, own = step
     steps = dict(zip(MODELS[name], [*common[6 * cameras :], *own.T], strict=True))
     moved = [value + steps.get(error, 0.0) for error, value in zip(ERRORS, state[1:], strict=True)]
-    return move_pose(poses, common[: 6 * cameras].reshape(cameras, 6)), *moved
+    return geometry.move_pose(poses, common[: 6 * cameras].reshape(cameras, 6)), *moved
 
 
 def misfit(data, state):
-    """What the models are compared by, and rms distances of face points and of crossings by camera, metres.
+    """What the models are compared by (m^2), and rms distances of face points from the boards by camera, metres.
 
     Sum over the placements of the mean square distance of the fitted scan plane from the camera's plane, and over
-    their edges of the mean square distance of the crossings from the planes of sight, m^2; mean over the cameras.
+    their edges of the mean square distance of the crossings from the planes of sight; mean over the cameras.
     """
     q, _ = corrected_points(data.faces, data, state)
     used = data.faces["used"]
@@ -211,14 +150,13 @@ def misfit(data, state):
     away = (q - np.sum(q * used[..., None], axis=1, keepdims=True) / count[:, None, None]) * used[..., None]
     flat = np.linalg.svd(away, full_matrices=False)[2][:, 2]
     own = np.sum(flat[:, None] * away, axis=-1)  # what the scan scatters about its own plane tells nothing of the pitch
-    total, rms, edge_rms, found = 0.0, {}, {}, plane_distances(state, data)
+    total, rms, found = 0.0, {}, plane_distances(state, data)
     for name, pose, board in zip(data.cameras, state[0], data.boards, strict=True):
         r, (edges, d, _) = next(found)[1] * used, next(found)
-        rms[name], number = float(np.sqrt(np.sum(r**2) / used.sum())), edges["used"].sum()
+        rms[name] = float(np.sqrt(np.sum(r**2) / used.sum()))
         aligned = own * np.sign(np.sum((board[..., 2] @ pose[:, :3]) * flat, axis=1))[:, None]
-        edge_rms[name] = float(np.sqrt(np.sum((d * edges["used"]) ** 2) / number)) if number else np.nan
         total += np.sum(np.sum(((r - aligned) * used) ** 2, axis=1) / count) + np.sum((d * edges["weight"]) ** 2)
-    return float(total) / len(state[0]), rms, edge_rms
+    return float(total) / len(state[0]), rms
 
 
 @dataclass(frozen=True)
@@ -235,7 +173,7 @@ class PitchModel:
         ``pitch + offset + stretch (pitch - middle)``.
     transforms : dict of str to RigidTransform
         ``T_camera_platform``.
-    misfit, rms, edge_rms
+    misfit, rms
         Of :func:`misfit`.
     F, p_value : float
         Test against the model before (nan for the first): would the misfit fall so much by chance?
@@ -248,12 +186,18 @@ class PitchModel:
     transforms: dict[str, RigidTransform]
     misfit: float
     rms: dict[str, float]
-    edge_rms: dict[str, float]
     n_parameters: int
-    n_numbers: int
-    F: float
-    p_value: float
     converged: bool
+    F: float = np.nan
+    p_value: float = np.nan
+
+    def tested(self, small, numbers):
+        """The model with F and its p-value against a smaller one, of so many independent numbers."""
+        if small is None or self.n_parameters <= small.n_parameters or numbers <= self.n_parameters:
+            return self
+        more, free = self.n_parameters - small.n_parameters, numbers - self.n_parameters
+        F = (small.misfit - self.misfit) / more / (self.misfit / free)
+        return replace(self, F=float(F), p_value=float(f_distribution.sf(F, more, free)))
 
 
 @dataclass(frozen=True)
@@ -281,14 +225,18 @@ class PitchErrors:
     wanted: str
 
 
-def estimate_pitch_errors(sweeps, cameras):
+def estimate_pitch_errors(cameras, direction, middle):
     """Estimate errors of the recorded pitch together with the cameras' poses, in nested models.
 
     Parameters
     ----------
-    sweeps : SweepPoints
     cameras : dict of str to CameraObservations
-        Cameras fixed to the platform (``source='platform'``); their board poses are used, and their crossings.
+        Cameras fixed to the platform (``source='platform'``), with recorded pitch; their board poses are used, their
+        crossings, and the face points of the first.
+    direction : dict of int to int
+        Sweep direction (+1 or -1; 0 for a single shot) of each placement.
+    middle : dict of int to float
+        Pitch about which a sweep is stretched, radians.
 
     Returns
     -------
@@ -301,59 +249,44 @@ def estimate_pitch_errors(sweeps, cameras):
     ValueError
         When a camera is not fixed to the platform.
     """
-    data, models, direction, before, wanted = gather(sweeps, cameras), {}, (np.nan, np.nan), None, None
-    poses, zeros = [pose_array(start_from_planes(cameras[name])) for name in data.cameras], 0.0 * data.middle
-    state = (np.array(poses), 0.0, zeros, zeros)
+    data, models, turn, before, wanted = gather(cameras, direction, middle), {}, (np.nan, np.nan), None, None
+    poses, zeros = [pose_array(start_from_planes(obs)) for obs in cameras.values()], 0.0 * data.middle
+    state, numbers = (np.array(poses), 0.0, zeros, zeros), data.n_numbers
     for name in MODELS:
         if name == "direction" and not {-1, 1} <= set(data.direction.tolist()):
             continue
         if name.startswith("sweep"):
             state = (state[0], 0.0, state[2] + state[1] * data.direction, state[3])
-        found = _solve_model(name, data, state)
-        state = found.state
+        state, sigma, model = _solve_model(name, data, state)
         if name == "direction":
-            direction = float(state[1]), float(found.trusted_sigma[-1])
-        before = _tested(_model(name, data, found), before)
-        models[name], wanted = before, wanted or before
-        wanted = before if _tested(before, wanted).p_value < LEVEL else wanted
-    return PitchErrors(data.placements, data.direction, *direction, models, wanted.name)
+            turn = float(state[1]), sigma
+        models[name] = before = model.tested(before, numbers)
+        wanted = before if wanted is None or before.tested(wanted, numbers).p_value < LEVEL else wanted
+    return PitchErrors(data.placements, data.direction, *turn, models, wanted.name)
 
 
 def _solve_model(name, data, state):
-    """Solve one model; the stated sigmas only weigh faces against edges, the level comes from the residuals."""
-    names = [f"{c}_{n}" for c in data.cameras for n in POSE_NAMES] + ["direction_offset"] * (name == "direction")
+    """Solve one model: state, standard deviation of the last shared unknown, PitchModel.
+
+    The stated sigmas only weigh faces against edges, the level comes from the residuals.
+    """
+    names = [f"{c}_{n}" for c in data.cameras for n in geometry.POSE_NAMES]
+    names += ["direction_offset"] * (name == "direction")
     found = solve(
         lambda s: pitch_blocks(s, data, name), state, lambda s, step: move_pitch_state(s, step, name), names=names,
-        read=lambda s: (None, np.concatenate([pose_parameters(s[0]).ravel(), [s[1]]])[: len(names)]), required=False,
+        read=lambda s: (None, np.r_[geometry.pose_parameters(s[0]).ravel(), s[1]][: len(names)]), required=False,
         method=f"pitch_{name}", shared=len(names), limit=10.0, freedom=data.n_numbers - 6,
-    )  # fmt: skip
-    level = misfit(data, found.state)[0] / max(data.n_numbers - 6, 1) / SIGMA**2 / found.inflation
-    return replace(found, covariance=level * found.covariance)
-
-
-def _model(name, data, found):
-    """Wrap a solved model."""
+    )
     (poses, direction, offset, stretch), p = found.state, len(data.placements)
-    total, rms, edge_rms = misfit(data, found.state)
+    total, rms = misfit(data, found.state)
+    level = total / max(data.n_numbers - 6, 1) / SIGMA**2 / found.inflation
+    sigma = float(replace(found, covariance=level * found.covariance).trusted_sigma[-1])
     parameters = 6 + {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
-    offset, offset_sigma = direction * data.direction + offset, np.zeros(p)
-    if name == "direction":
-        offset_sigma = np.full(p, found.trusted_sigma[-1])
-    elif name != "none":  # from the scatter of the residuals, what is shared held
+    offset, offset_sigma = direction * data.direction + offset, np.full(p, sigma if name == "direction" else 0.0)
+    if name.startswith("sweep"):  # from the scatter of the residuals, what is shared held
         offset, own = offset - offset.mean(), found.jacobian[..., 6 * len(poses) :]
         inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own)
         offset_sigma = np.sqrt(inverse[:, 0, 0] * total / max(data.n_numbers - parameters, 1)) / SIGMA
     transforms = {camera: pose_transform(pose) for camera, pose in zip(data.cameras, poses, strict=True)}
-    return PitchModel(
-        name, offset, offset_sigma, stretch, transforms, total, rms, edge_rms, parameters, data.n_numbers,
-        np.nan, np.nan, bool(found.converged),
-    )  # fmt: skip
-
-
-def _tested(model, small):
-    """A model with F and its p-value against a smaller one: would the misfit fall so much by chance?"""
-    if small is None or model.n_parameters <= small.n_parameters or model.n_numbers <= model.n_parameters:
-        return model
-    more, free = model.n_parameters - small.n_parameters, model.n_numbers - model.n_parameters
-    F = (small.misfit - model.misfit) / more / (model.misfit / free)
-    return replace(model, F=float(F), p_value=float(f_distribution.sf(F, more, free)))
+    model = PitchModel(name, offset, offset_sigma, stretch, transforms, total, rms, parameters, bool(found.converged))
+    return found.state, sigma, model

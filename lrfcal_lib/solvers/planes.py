@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, pad, plane_residuals_m, read_pose
+from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
-    DegenerateGeometry,
-    apply_pose,
-    gradient_by_pose,
-    hat,
-    motion_words,
-    move_pose,
-    pose_array,
-    pose_transform,
-    rotate_points,
-)
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, apply_pose, move_pose, pose_transform
 
 
-@dataclass(frozen=True)
-class PlaneSets:
+class PlaneSets(NamedTuple):
     """Face points (..., p, n, 3) by placement, padded with zeros to the same number, source frame, metres.
 
-    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the observations' own.
+    `boards` (..., p, 3, 4) are ``T_camera_board``, `rows` (p,) those of the placements among the observations' own,
+    `number` (p,) that of each one's points.
     """
 
     placements: np.ndarray
@@ -40,16 +31,12 @@ class PlaneSets:
     boards: np.ndarray
     board_covariance: np.ndarray
     rows: np.ndarray
-
-    @property
-    def count(self):
-        """Number of points of each placement, shape (p,)."""
-        return self.used.sum(axis=1)
+    number: np.ndarray
 
 
-def plane_sets(obs, least=3):
-    """Group the face points of the placements (at least so many) whose board pose the camera knows."""
-    obs.require("plane", least)
+def plane_sets(obs):
+    """Group the face points of the placements (three at least) whose board pose the camera knows."""
+    obs.require("plane", 3)
     placements, rows, _ = np.intersect1d(obs.placements, obs.plane_placement, return_indices=True)
     mine = np.flatnonzero(np.isin(obs.plane_placement, placements))
     where = np.searchsorted(placements, obs.plane_placement[mine])
@@ -57,7 +44,8 @@ def plane_sets(obs, least=3):
     index, used = padded["row"], padded["used"]
     points, covariance = obs.plane_points[..., index, :], obs.plane_covariance[..., index, :, :]
     boards, spread = obs.board_poses[..., rows, :3, :], obs.board_covariance[..., rows, :, :]
-    return PlaneSets(placements, np.where(used[..., None], points, 0.0), covariance, used, boards, spread, rows)
+    points = np.where(used[..., None], points, 0.0)
+    return PlaneSets(placements, points, covariance, used, boards, spread, rows, used.sum(axis=1))
 
 
 def compress(sets, weights):
@@ -124,7 +112,7 @@ def plane_terms(pose, triangles, boards, offset=0.0):
     turned = np.swapaxes(pose[..., :3], -1, -2)
     top, last = (turned @ normal[..., None])[..., 0], np.sum(normal * between, axis=-1, keepdims=True)
     residuals = (triangles @ np.concatenate([top, last], axis=-1)[..., None])[..., 0] + offset
-    spin = turned @ hat(normal)
+    spin = turned @ geometry.hat(normal)
     normal = np.broadcast_to(normal, top.shape)[..., None, :]
     moment = np.cross(normal[..., 0, :], between)[..., None, :]
     upper = np.concatenate([spin, np.zeros_like(spin)], axis=-1)
@@ -160,17 +148,13 @@ INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 INTRINSIC_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 
 
-def start_from_planes(obs, required=True):
-    """A start value of ``T_camera_source``: closed form in random subsets of the placements, least trimmed squares.
-
-    Needs three placements where `required`; otherwise a pose that fits the planes all the same.
-    """
-    sets = plane_sets(obs, 3 if required else 1)
-    if required:
-        check_normals(sets, obs.camera)
+def start_from_planes(obs):
+    """A start value of ``T_camera_source``: closed form in random subsets of the placements, least trimmed squares."""
+    sets = plane_sets(obs)
+    check_normals(sets, obs.camera)
     triangles, p = compress(sets, 1.0), len(sets.placements)
     (frame, flat), found = common_plane(triangles), []
-    if p >= 3 and not flat:
+    if not flat:
         found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
     if p >= 5:
         found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
@@ -179,11 +163,11 @@ def start_from_planes(obs, required=True):
     def trimmed(candidates):
         """Mean square (m^2) of candidates over more placements than a closed form uses."""
         residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
-        squares = np.sort(np.sum(residuals**2, axis=2) / sets.count, axis=1)
+        squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
         return squares[:, : max(squares.shape[1] // 2 + 2, 7 if flat else 5)].mean(axis=1)
 
     def evaluate(pose):
-        return plane_block(pose, triangles / 0.005, sets.boards, None, sets.count)
+        return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
 
     best = candidates[np.argsort(trimmed(candidates))[:8]]
     refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
@@ -263,10 +247,7 @@ def _rotation_grid_on_planes(sets, triangles):
     rotations, (_, centre), normal = start_rotations(), _centred(triangles), sets.boards[:, :, 2]
     moved = np.sum(normal * (centre @ np.swapaxes(rotations, -1, -2)), axis=-1)
     start = shifted(rotations, normal, np.sum(normal * sets.boards[:, :, 3], axis=1) - moved)
-    sigma = 0.005
-    found, *_ = minimise(
-        lambda pose: plane_block(pose, triangles / sigma, sets.boards), start, move_pose, max_iterations=40
-    )
+    found = minimise(lambda pose: plane_block(pose, triangles / 0.005, sets.boards), start, move_pose)[0]
     ahead = (apply_pose(found, centre)[..., 2] > 0).all(axis=1)
     return found[ahead] if ahead.any() else found
 
@@ -277,7 +258,7 @@ def start_rotations():
     return np.concatenate([Rotation.create_group("O").as_matrix(), some])
 
 
-def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
+def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, **options):
     """The pose of a camera from the board's planes (Zhang and Pless).
 
     Weighted by the points' covariance across the board and, correlated within a placement, that of the board's pose;
@@ -286,26 +267,26 @@ def estimate_from_planes(residual, obs, pose, *, method, uses, weighted=True, re
     unweighted estimate on: weights of a bad pose would hold it there. A loss judges whole placements, because a bad
     board pose spoils all points of its placement.
     """
-    sets = plane_sets(obs, 3 if required else 1)
-    if required and sets.boards.ndim == 3:
+    sets = plane_sets(obs)
+    if sets.boards.ndim == 3:
         check_normals(sets, obs.camera)
 
     def freeze(pose, number):
         """The residuals with weights and compressed points as they are at a pose."""
         if not (weighted and number):
             triangles = compress(sets, equal_weights(sets, pose))
-            return lambda p: residual(p, triangles, sets.boards, None, sets.count)
+            return lambda p: residual(p, triangles, sets.boards, None, sets.number)
         triangles, offset, _ = correct_and_compress(sets, pose)
         whitener = board_whitener(pose, triangles, sets.boards, sets.board_covariance)
         return lambda p: residual(p, triangles, sets.boards, whitener, offset=offset)
 
     problem, pose, earlier = minimise_in_rounds(freeze, pose, move_pose, 5 if weighted else 0, **options)
-    count = int(sets.count.sum())
+    count = int(sets.number.sum())
     return solve(
         problem, pose, move_pose, names=POSE_NAMES, method=method, read=read_pose,
-        words=lambda d: motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
-        required=required, n_observations=count, earlier=earlier,
-        chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0, **options,
+        words=lambda d: geometry.motion_words(d, obs.camera), groups=sets.placements, freedom=count - 6,
+        n_observations=count, earlier=earlier, **options,
+        chi2_rest=correct_and_compress(sets, pose)[2] if weighted else 0.0,
     )  # fmt: skip
 
 
@@ -334,17 +315,17 @@ def planes_and_pattern(state, planes, obs, lens=9):
     by_lens = np.zeros(residuals.shape + (lens,))
     distances = Block(residuals, np.concatenate([by_pose, by_lens, by_board], axis=-1), whitener[:, None])
     camera, pixels, seen = obs.model.with_parameters(intrinsics), obs.pattern_pixels, np.isfinite(obs.pattern_pixels)
-    q, rotated = apply_pose(boards, obs.pattern_points), rotate_points(boards, obs.pattern_points)
+    q, rotated = apply_pose(boards, obs.pattern_points), geometry.rotate_points(boards, obs.pattern_points)
     by_point, by_lens = project_jacobians(q, camera)
     errors = np.where(seen, project(q, camera) - np.where(seen, pixels, 0.0), 0.0)
-    by_board = np.stack([gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
+    by_board = np.stack([geometry.gradient_by_pose(rotated, by_point[..., i, :]) for i in range(2)], axis=-2)
     jacobian = np.concatenate([np.zeros_like(by_board), by_lens[..., :lens], by_board], axis=-1)
     p = len(boards)
     sigma = seen.reshape(p, -1) / obs.pattern_sigma_px
     return [distances, Block(errors.reshape(p, -1), jacobian.reshape(p, sigma.shape[1], 12 + lens), sigma)]
 
 
-def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens=9, **options):
+def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     """Pose, intrinsics and board poses together: pattern reprojection plus point-plane distances.
 
     Of the intrinsics the first `lens` are free: 4 is K alone (as published), 9 with the distortion. The start is the
@@ -359,12 +340,13 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens
             f"camera '{obs.camera}': {len(obs.pattern_points)} pattern corners, a joint "
             "refinement needs a printed pattern"
         )
-    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, required=required, **options)
-    sets, poses = plane_sets(obs, 3 if required else 1), obs.board_poses.copy()
+    solution = estimate_from_planes(plane_block, obs, pose, method=method, uses=uses, **options)
+    sets = plane_sets(obs)
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, solution)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
-    numbers = int(sets.count.sum() + np.isfinite(obs.pattern_pixels).sum())
-    state, fixed, earlier = (pose_array(solution.transform), obs.model.parameters, poses[:, :3]), np.zeros(9 - lens), []
+    numbers = int(sets.number.sum() + np.isfinite(obs.pattern_pixels).sum())
+    state = geometry.pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3]
+    fixed, earlier = np.zeros(9 - lens), []
     for _ in range(2):
         sets = replace(sets, boards=state[2][sets.rows])
         triangles, offset, rest = correct_and_compress(sets, state[0])
@@ -377,12 +359,11 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, required=True, lens
             lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + np.r_[step[0][6:], fixed], move_pose(s[2], step[1])),
             read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1][:lens]])),
             names=POSE_NAMES + INTRINSIC_NAMES[:lens], method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES[:lens],
-            shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, required=required, chi2_rest=rest,
-            n_observations=numbers, earlier=earlier, **options,
-        )  # fmt: skip
+            shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, chi2_rest=rest, n_observations=numbers,
+            earlier=earlier, **options,
+        )
         state, earlier = solution.state, [solution.cost_history]
     errors = solution.residuals[:, -2 * count :] * obs.pattern_sigma_px
     rms = float(np.sqrt(2 * np.sum(errors**2) / np.isfinite(obs.pattern_pixels).sum()))  # per corner, as OpenCV has it
-    covariance = np.pad(solution.covariance[6:, 6:], (0, 9 - lens))
-    poses[:, :3] = state[2]
-    return replace(solution, model=obs.model.with_parameters(state[1], covariance, rms), board_poses=poses)
+    model = obs.model.with_parameters(solution.state[1], np.pad(solution.covariance[6:, 6:], (0, 9 - lens)), rms)
+    return replace(solution, model=model, board_poses=pose_transform(solution.state[2]).as_matrix())

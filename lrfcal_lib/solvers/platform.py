@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -10,59 +11,13 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.fit.least_squares import Block, name_words, solve
 from lrfcal_lib.fit.residuals import AXIS_COLUMNS, SIGMA_FLOOR, chart_parameters, move_head, pad
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
-from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
-    axis_of,
-    cross,
-    fit_line,
-    fit_plane,
-    hat,
-    head_from_axis,
-    lrf_to_platform,
-    move_pose,
-    pose_array,
-    pose_transform,
-    tilt,
-)
-from lrfcal_lib.model.observations import check_finite
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import DegenerateGeometry, axis_of, fit_line, hat, head_from_axis, lrf_to_platform, tilt
 
 SIGMA_SKEW, SIGMA_GAP = np.radians(0.2), 0.002  # of boards: the right angle of the two edges, their distance (metres)
 LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is useless
+WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)  # a combination of the four motions of the axis
 TINY = 1e-30  # of a complex step: derivatives without rounding
-
-
-@dataclass(frozen=True)
-class PlatformObservations:
-    """Edge points (and face points) of boards swept by the pitching LRF.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3)
-        Edge points, LRF frame, metres.
-    covariance : ndarray, shape (n, 3, 3)
-    pitch : ndarray, shape (n,)
-        Recorded pitch of their scan lines, radians.
-    placement : ndarray of int, shape (n,)
-    edge : ndarray of int, shape (n,)
-        1 or 2: the two perpendicular edges of equations (7) to (14).
-    face_points, face_covariance, face_pitch, face_placement : ndarray
-        Points on the board's face, likewise; they may be empty.
-    """
-
-    points: np.ndarray
-    covariance: np.ndarray
-    pitch: np.ndarray
-    placement: np.ndarray
-    edge: np.ndarray
-    face_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    face_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    face_pitch: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    face_placement: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-
-    def __post_init__(self):
-        check_finite(self)
-        if not np.isin(self.edge, (1, 2)).all():
-            raise ValueError(f"edge must be 1 or 2 (the two perpendicular edges), got {np.unique(self.edge)}")
 
 
 @dataclass(frozen=True)
@@ -106,7 +61,7 @@ def start_head(T0):
     return head_from_axis(axis_of(RigidTransform.identity() if T0 is None else T0))
 
 
-def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
+def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
     """The tilt axis from 3D line fits, weighted by propagated noise.
 
     Parameters
@@ -116,8 +71,6 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
         Start value of ``T_head_lrf``; an axis through the LRF's origin along its x when left out.
     sigma_pitch : float
         Standard deviation of a recorded pitch, radians.
-    required : bool
-        False: report unobservable motions instead of raising.
 
     Returns
     -------
@@ -137,71 +90,49 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0, required=True):
     """
     gauge, earlier = start_head(T0), []
     for final in (False, True):  # the second time in the gauge of the axis that was found
-        data, boards, skipped = prepare_boards(obs, gauge)
-        points, p = int(data.edge["used"].sum() + data.face["used"].sum()), len(boards)
+        edge, face, boards, skipped = prepare_boards(obs, gauge)
+        number, p = int(edge["used"].sum()), len(boards)
+        points = number + int(face["used"].sum())
+        state = geometry.pose_array(gauge), np.array(list(boards.values())), np.zeros((p, 2))
         found = solve(
-            lambda state, data=data: platform_blocks(state, data, sigma_pitch),
-            (pose_array(gauge), boards, np.zeros((p, 2))), move_platform, names=AXIS_NAMES, method="platform_3d",
-            read=lambda state: (pose_transform(state[0]), chart_parameters(state[0])), words=_words, shared=4,
-            freedom=points + int(data.edge["used"].sum()) + 2 * p - 4 - 8 * p, limit=0.5, max_iterations=100,
-            n_observations=points, required=required and final, earlier=earlier,
-        )  # fmt: skip
+            partial(platform_blocks, edge=edge, face=face, sigma_pitch=sigma_pitch), state, move_platform,
+            names=AXIS_NAMES, method="platform_3d", words=WORDS, shared=4,
+            read=lambda state: (geometry.pose_transform(state[0]), chart_parameters(state[0])),
+            freedom=points + number + 2 * p - 4 - 8 * p, limit=0.5, max_iterations=100,
+            n_observations=points, required=final, earlier=earlier,
+        )
         gauge, earlier = head_from_axis(axis_of(found.transform)), [found.cost_history]
-    skew, gap = found.state[2].T
-    return PlatformSolution(found, data.placements, skew, gap, skipped)
-
-
-def _words(direction):
-    """A combination of the four motions of the axis in words."""
-    return name_words(direction, AXIS_WORDS, 0.3)
-
-
-@dataclass(frozen=True)
-class Boards:
-    """Observations padded by placement: `edge` and `face` with points, covariance, pitch, second, used.
-
-    `second` is 1 for points of edge 2, 0 for others; `lone` marks placements with one edge.
-    """
-
-    placements: np.ndarray
-    edge: dict
-    face: dict
-    lone: np.ndarray
+    return PlatformSolution(found, np.array(list(boards)), *found.state[2].T, skipped)
 
 
 def prepare_boards(obs, T_head_lrf):
-    """Padded observations, a start board (x along edge 1, z its normal) of every placement, and why some are skipped.
+    """Edge and face points padded by placement, a start board by placement, and why some placements are skipped.
 
-    Boards are pose arrays (p, 3, 4), ``T_platform_board``.
+    `second` is 1 for points of edge 2 and 0 for others, those of a lone edge, too. Boards are pose arrays (3, 4),
+    ``T_platform_board``, with x along edge 1 and z along the normal.
     """
-    p_platform = lrf_to_platform(obs.points, obs.pitch, T_head_lrf)
-    face_platform = lrf_to_platform(obs.face_points, obs.face_pitch, T_head_lrf)
-    kept, boards, rows, faces, skipped = [], [], [], [], {}
-    for placement in np.unique(obs.placement).tolist():
-        edges = [np.flatnonzero((obs.placement == placement) & (obs.edge == e)) for e in (1, 2)]
-        edges, face = [e for e in edges if len(e) >= 2], np.flatnonzero(obs.face_placement == placement)
+    groups = obs.group("edge"), obs.group("face")
+    p_edge, p_face = (lrf_to_platform(group["points"], group["pitch"], T_head_lrf) for group in groups)
+    boards, skipped, second = {}, {}, np.full(len(p_edge), -1.0)
+    for placement in np.unique(obs.edge_placement).tolist():
+        edges = [(obs.edge_placement == placement) & (obs.edge_number == e) for e in (1, 2)]
+        edges = [rows for rows in edges if rows.sum() >= 2]
         try:
-            boards.append(_start_board([p_platform[e] for e in edges], face_platform[face]))
+            boards[placement] = _start_board([p_edge[rows] for rows in edges], p_face[obs.face_placement == placement])
         except DegenerateGeometry as error:
             skipped[placement] = str(error)
             continue
-        kept.append(placement)
-        rows.append(edges)
-        faces.append(face)
-    if not kept:
+        for number, rows in enumerate(edges):
+            second[rows] = number
+    if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    second = np.concatenate([np.repeat([0.0, 1.0][: len(edges)], [len(e) for e in edges]) for edges in rows])
-    edge = _padded(obs, "", [np.concatenate(edges) for edges in rows], second)
-    face = _padded(obs, "face_", faces, np.zeros(sum(map(len, faces))))
-    return Boards(np.array(kept), edge, face, np.array([len(e) == 1 for e in rows])), np.array(boards), skipped
-
-
-def _padded(obs, prefix, rows, second):
-    """Some rows of each placement, padded; with a floor of the noise, because no board is flat."""
-    every, place = np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(r) for r in rows])
-    group = {name: getattr(obs, prefix + name)[every] for name in ("points", "covariance", "pitch")}
-    group = pad(group | {"second": second, "placement": place}, len(rows))
-    return group | {"covariance": group["covariance"] + SIGMA_FLOOR**2 * np.eye(3)}
+    padded, numbers = [], list(boards)
+    for group, number in zip(groups, (second, np.zeros(len(p_face))), strict=True):
+        kept = np.isin(group["placement"], numbers) & (number >= 0)
+        group = {key: value[kept] for key, value in (group | {"second": number}).items()}
+        padded.append(pad(group | {"placement": np.searchsorted(numbers, group["placement"])}, len(numbers)))
+        padded[-1]["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
+    return *padded, boards, skipped
 
 
 def _start_board(edges, face):
@@ -217,7 +148,7 @@ def _start_board(edges, face):
         # the origin is where edge 1 comes nearest to edge 2
         point = point + x * (between @ x - cosine * (between @ second)) / (1 - cosine**2)
     elif len(face) >= 3:
-        normal = fit_plane(face)[0]
+        normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
     else:
         raise DegenerateGeometry("only one edge, and no points on the face")
@@ -234,7 +165,7 @@ def board_coordinates(head, boards, points, pitch):
     eye = np.broadcast_to(np.eye(3), turned.shape)
     axis = (turned @ np.concatenate([-hat(rotated), eye], axis=-1))[..., AXIS_COLUMNS]
     board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
-    by_pitch = (to_board @ cross(np.array([1.0, 0.0, 0.0]), q)[..., None])[..., 0]
+    by_pitch = (to_board @ geometry.cross(np.array([1.0, 0.0, 0.0]), q)[..., None])[..., 0]
     return lever @ boards[:, :, :3], np.concatenate([axis, board], axis=-1), turned @ head[:, :3], by_pitch
 
 
@@ -272,31 +203,30 @@ def distance_block(state, group, sigma_pitch, which):
     return Block(r.reshape(p, -1), J.reshape(p, -1, 12), whitener, corrected=corrected.reshape(p, -1, 12))
 
 
-def platform_blocks(state, data, sigma_pitch):
+def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
-    p, used = len(boards), data.edge["used"][..., None]
-    tolerance = np.zeros((p, 2, 12))
-    tolerance[:, 0, 10] = tolerance[:, 1, 11] = 1.0
+    p, used, lone = len(boards), edge["used"][..., None], ~np.any(edge["second"], axis=1)
+    tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
     # a board seen with one edge may slide along it: its origin is held at the middle of that edge's points
-    b, J, _, _ = board_coordinates(head, boards, data.edge["points"], data.edge["pitch"])
+    b, J, _, _ = board_coordinates(head, boards, edge["points"], edge["pitch"])
     along = np.concatenate([b[..., :1], J[..., 0, :]], axis=-1) * used
     middle = np.sum(along, axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
     return [
-        distance_block(state, data.edge, sigma_pitch, slice(0, 2)),
-        distance_block(state, data.face, sigma_pitch, slice(1, 2)),
+        distance_block(state, edge, sigma_pitch, slice(0, 2)),
+        distance_block(state, face, sigma_pitch, slice(1, 2)),
         Block(bends, tolerance, np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))),
-        Block(middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), data.lone[:, None] * 100.0),
+        Block(middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), lone[:, None] * 100.0),
     ]
 
 
 def move_platform(state, step):
     """Retraction of axis, boards, and their skew and gap."""
     common, own = step
-    return move_head(state[0], common), move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
+    return move_head(state[0], common), geometry.move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
 
 
-def solve_projected(obs, T0=None, *, printed=False, required=True):
+def solve_projected(obs, T0=None, *, printed=False):
     """The tilt axis by the paper's projected line fits; for parameters and errors see :func:`solve_platform`.
 
     Of the observations the edge points are used, without their covariance; that of the result comes from the scatter of
@@ -313,8 +243,8 @@ def solve_projected(obs, T0=None, *, printed=False, required=True):
     result depends on that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
-    turn = _to_printed_chart(pose_array(gauge)[:, 3]).real if printed else 0.0
-    groups, skipped = _slanted(obs, tilt(lrf_to_platform(obs.points, obs.pitch, gauge), turn))
+    turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real if printed else 0.0
+    groups, skipped = _slanted(obs, tilt(lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge), turn))
     if not groups:
         raise DegenerateGeometry(f"projected fits: no placement can be used: {skipped}; use the 3D fits instead")
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
@@ -322,9 +252,10 @@ def solve_projected(obs, T0=None, *, printed=False, required=True):
     def solved(head, scatter, **earlier):
         """The fits with a given scatter about the lines."""
         return solve(
-            lambda head: projected_block(head, obs, groups.values(), scatter, printed), pose_array(head), move_head,
-            names=AXIS_NAMES, method="platform_projected", words=_words, groups=np.repeat(list(groups), rows),
-            read=lambda head: (pose_transform(head), chart_parameters(head)), limit=np.inf, required=required,
+            partial(projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed),
+            geometry.pose_array(head), move_head, names=AXIS_NAMES, method="platform_projected", words=WORDS,
+            groups=np.repeat(list(groups), rows), limit=np.inf,
+            read=lambda head: (geometry.pose_transform(head), chart_parameters(head)),
             max_iterations=100, **earlier,
         )  # fmt: skip
 
@@ -338,10 +269,10 @@ def solve_projected(obs, T0=None, *, printed=False, required=True):
 def _slanted(obs, p_platform):
     """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate planes, and why not others."""
     groups, skipped = {}, {}
-    for placement in np.unique(obs.placement).tolist():
-        groups[placement] = [np.flatnonzero((obs.placement == placement) & (obs.edge == e)) for e in (1, 2)]
+    for placement in np.unique(obs.edge_placement).tolist():
+        edges = [np.flatnonzero((obs.edge_placement == placement) & (obs.edge_number == e)) for e in (1, 2)]
         reasons = []
-        for number, rows in enumerate(groups[placement], start=1):
+        for number, rows in enumerate(edges, start=1):
             if len(rows) < 3:
                 reasons.append(f"edge {number} has {len(rows)} points, at least 3 needed")
                 continue
@@ -350,7 +281,8 @@ def _slanted(obs, p_platform):
             reasons += [f"edge {number} is parallel to the {p} plane: its projected fits divide by zero" for p in level]
         if reasons:
             skipped[placement] = reasons[0]
-            del groups[placement]
+        else:
+            groups[placement] = edges
     return groups, skipped
 
 
@@ -359,10 +291,10 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
 
     The Jacobian by the axis chart comes from complex steps, exact but for rounding.
     """
-    rotated = obs.points @ head[:, :3].T
+    rotated = obs.edge_points @ head[:, :3].T
     by_axis = np.concatenate([-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1)
     by_axis = np.moveaxis(by_axis[..., AXIS_COLUMNS], -1, 0)
-    q = tilt(rotated + head[:, 3], obs.pitch) + TINY * 1j * tilt(by_axis, obs.pitch)
+    q = tilt(rotated + head[:, 3], obs.edge_pitch) + TINY * 1j * tilt(by_axis, obs.edge_pitch)
     if printed:
         q = tilt(q, _to_printed_chart(head[:, 3] + TINY * 1j * np.eye(6)[AXIS_COLUMNS, 3:])[:, None])
     terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1) / scatter
@@ -379,7 +311,7 @@ def _to_printed_chart(t):
 def _six_terms(first, second):
     """Errors of the four projected fits, ``u1 . u2``, and the gap D of equation (14) of one placement, (4, m)."""
     (errors1, u1, p1), (errors2, u2, p2) = (_projected_line(q) for q in (first, second))
-    normal = cross(u1, u2)
+    normal = geometry.cross(u1, u2)
     gap = _dot(normal, p1 - p2) / np.sqrt(_dot(normal, normal))
     return np.concatenate([errors1, errors2, _dot(u1, u2), gap], axis=-1)
 
