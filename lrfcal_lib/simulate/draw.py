@@ -58,7 +58,7 @@ class Bench(Devices):
 
 @dataclass(frozen=True, kw_only=True)
 class ShotSetup(Devices):
-    """What single shots are drawn from: devices like the paper's, boards at `distances` (metres); see :class:`Devices`."""
+    """What single shots are drawn from: devices like the paper's, boards at `distances` (metres)."""
 
     board: Board = field(default_factory=lambda: triangle_board(pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))))
     softness: float = 0.03
