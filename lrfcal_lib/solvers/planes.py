@@ -348,7 +348,7 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     state = geometry.pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3]
     fixed, earlier = np.zeros(9 - lens), []
     for _ in range(2):
-        sets = replace(sets, boards=state[2][sets.rows])
+        sets = sets._replace(boards=state[2][sets.rows])
         triangles, offset, rest = correct_and_compress(sets, state[0])
         whitener = board_whitener(state[0], triangles, sets.boards, common)
         planes = np.zeros((p, 4, 4)), np.zeros((p, 4)), np.zeros((p, 4, 4))
