@@ -23,17 +23,6 @@ def lrf(model="SICK LMS400", **options):
     return LrfInfo(model, (0.9, 2.2), 0.002, 0.005, **options)
 
 
-def contradictions(monkeypatch, offset_mm, sigma_mm):
-    """Reasons to doubt what is stated, and by how much, of as much of a joint calibration as tells the range offset."""
-    monkeypatch.setattr(verdict, "doubtful", lambda solution, admitted: [])
-    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma_mm / 1000]))
-    seen = SimpleNamespace(face_range=np.array([2.0]))
-    sensor = {"range_offset": offset_mm / 1000, "pitch_scale": 0.0}
-    solution = SimpleNamespace(solution=inner, sensor=sensor, observations=seen, transforms={})
-    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None))
-    return verdict.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
-
-
 @pytest.mark.parametrize(
     ("stated", "admitted"),
     [
@@ -53,7 +42,13 @@ def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted)
     [(-5.2, 2.2, []), (9, 2, []), (11, 2, ["with care"]), (-87, 3.9, ["no"]), (68, 14, ["no"]), (30, 14, [])],
 )
 def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers):
-    found, doubt = contradictions(monkeypatch, offset, sigma)
+    """Millimetres; of as much of a joint calibration as tells it. By as much all ranges may be wrong."""
+    monkeypatch.setattr(verdict, "doubtful", lambda solution, admitted: [])
+    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
+    seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
+    solution = SimpleNamespace(solution=inner, sensor=sensor, observations=seen, transforms={})
+    prepared = SimpleNamespace(session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None))
+    found, doubt = verdict.contradicts_stated(SimpleNamespace(solution=solution, prepared=prepared))
     assert [reason.answer for reason in found] == answers
     assert doubt == (abs(offset) / 1000 if found else 0.0)
     assert all("board" in r.words and "squares" in r.words and f"{offset} mm" in r.words for r in found)

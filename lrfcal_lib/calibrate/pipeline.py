@@ -287,6 +287,11 @@ def calibrate_cameras(observations, methods=METHODS):
     return solutions, problems
 
 
+def largest_range(values, groups):
+    """Largest range of the values of one group, 0 where there are none."""
+    return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
+
+
 def joint_settings(prepared, observations):
     """Which unknowns the data of a session ask for: keyword arguments of `solve_joint`.
 
@@ -294,9 +299,8 @@ def joint_settings(prepared, observations):
     show that there is one; a spread of the edge bias where there are sides enough; the stated platform as a prior with
     its stated standard deviations.
     """
-    session, noise, places = prepared.session, prepared.pitch_noise, observations.face_placement
-    spans = [np.ptp(observations.face_pitch[places == i]) for i in np.unique(places)]
-    axis = bool(max(spans, default=0.0) > LEAST_SWEEP)
+    session, noise = prepared.session, prepared.pitch_noise
+    axis = bool(largest_range(observations.face_pitch, observations.face_placement) > LEAST_SWEEP)
     sensor = ("range_offset", "edge_log_odds", "edge_log_softness")
     sensor += ("pitch_scale",) if axis else ()  # a wrong scale that is held at zero goes into the axis
     sides = len(set(zip(observations.beam_placement.tolist(), observations.beam_edge.tolist(), strict=True)))

@@ -238,7 +238,7 @@ class SerialDevice:
 
     def close(self, *_):
         """Remove the port."""
-        self.port.close()
+        self.port.end()
 
     __enter__, __exit__ = start, close
 
@@ -328,46 +328,45 @@ class SerialDevice:
 
 
 class _Memory:
-    """The port of a device on a VirtualHost; `handle` is what the program has that opened it."""
+    """A port in memory, of a device on a VirtualHost: both ends, the program's as far as a serial.Serial is used.
+
+    What was unplugged stays lost for the program that holds it; the device gets a new one.
+    """
 
     def __init__(self, device):
-        self.path, self.device, self.machine, self.handle = device.path, device, device.clock.machine, None
-        self.wake = device.advance
+        self.port, self.device, self.machine, self.wake = device.path, device, device.clock.machine, device.advance
+        self.open, self.lost, self.data = False, False, b""
 
-    there = property(lambda self: self.path in self.machine.ports)
-    open = property(lambda self: self.handle is not None)
-    rate = property(lambda self: self.handle.baudrate if self.open else 0)
+    there = property(lambda self: self.port in self.machine.ports)
+    rate = property(lambda self: self.baudrate if self.open else 0)
 
     def start(self):
         self.machine.devices.append(self.device)
 
-    def close(self):
+    def end(self):
         with contextlib.suppress(ValueError):
             self.machine.devices.remove(self.device)
         self.unplug()
 
     def plug(self):
-        self.machine.ports[self.path] = lambda baudrate, timeout: _Handle(self, baudrate, timeout)
+        self.machine.ports[self.port] = self._opened
 
     def unplug(self):
-        self.machine.ports.pop(self.path, None)
-        if self.open:
-            self.handle.lost, self.handle = True, None
+        self.machine.ports.pop(self.port, None)
+        self.lost, self.open, self.device.port = True, False, _Memory(self.device)
 
     def put(self, data):
-        data = data[: ROOM - len(self.handle.data)]
-        self.handle.data += data
+        data = data[: ROOM - len(self.data)]
+        self.data += data
         return len(data)
 
+    # the end of the program
 
-class _Handle:
-    """What is used of a serial.Serial."""
-
-    def __init__(self, at, baudrate, timeout):
-        if at.open:
-            raise PortError(f"the port {at.path} is busy, held by another program: close that program")
-        self.port, self.baudrate, self.timeout, self.data, self.lost = at.path, baudrate, timeout, b"", False
-        self._at, at.handle = at, self
+    def _opened(self, baudrate, timeout):
+        if self.open:
+            raise PortError(f"the port {self.port} is busy, held by another program: close that program")
+        self.baudrate, self.timeout, self.open, self.data = baudrate, timeout, True, b""
+        return self
 
     def _here(self):
         if self.lost:
@@ -379,22 +378,21 @@ class _Handle:
         return len(self.data)
 
     def read(self, size=1):
-        self._at.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
+        self.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
         self._here()
         found, self.data = self.data[:size], self.data[size:]
         return found
 
     def write(self, data):
         self._here()
-        self._at.device.hear(bytes(data))
+        self.device.hear(bytes(data))
 
     def reset_input_buffer(self):
         self._here()
         self.data = b""
 
     def close(self):
-        if self._at.handle is self:
-            self._at.handle = None
+        self.open = False
 
 
 class _Terminal(threading.Thread):
@@ -407,7 +405,7 @@ class _Terminal(threading.Thread):
     there = property(lambda self: self._master is not None)
     rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
 
-    def close(self):
+    def end(self):
         """Take the port away and end the thread."""
         self._quit = True
         if self.is_alive():

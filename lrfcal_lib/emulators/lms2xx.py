@@ -300,8 +300,10 @@ class EmulatedLms(SerialDevice):
         self.telegrams, self._number = self.telegrams + 1, self._number + 1
         self.reply(codec.SCAN, raw, at, then, BURST if self.memory.baudrate == 500000 else None, MIRROR_TURN)
 
-    _turns = property(lambda self: 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1],
-                      doc="Turns of the mirror for a scan of the stream.")  # fmt: skip
+    @property
+    def _turns(self):
+        """Turns of the mirror for a scan of the stream."""
+        return 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1]
 
     def _plan(self):
         """Measure the next scan of the stream; of one that lags, some are left out: the indices show the gap."""

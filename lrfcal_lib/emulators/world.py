@@ -81,23 +81,10 @@ class EmulatedWorld:
         self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
 
     def scan(self, turn, quarters, times):
-        """Readings of a scan of the laser range finder.
+        """Readings of a scan, whose first turn of the mirror, bearings (B,) in quarters of a degree and beams' instants
+        (B,), seconds of the devices, are given.
 
-        Parameters
-        ----------
-        turn : int
-            Of the mirror, the first of the scan.
-        quarters : ndarray of int, shape (B,)
-            Bearings in quarters of a degree.
-        times : ndarray, shape (B,)
-            Of every beam, seconds of the devices.
-
-        Returns
-        -------
-        ranges, reasons : ndarray, shape (B,)
-            Metres; index into `REASONS`, 0 for a range.
-        pitch : ndarray, shape (2,)
-            Of the head at the earliest and the latest beam, radians.
+        Ranges (B,), metres; index into `REASONS` (B,), 0 for a range; pitch (2,) of the head at the first and the last.
         """
         (place, world), rig = self._scene, self.setup.rig
         pitch, key = np.broadcast_to(self.head.pitch(times), times.shape), None

@@ -118,10 +118,9 @@ def measure_yield(solution, models, features=None):
     features = _inner(solution, 8) if features is None else np.asarray(features, float)
     background = np.median(obs.beam_background) if len(radius) else 0.0
     faces, ratios = np.bincount(obs.face_placement, minlength=len(boards)), []
-    rate = SimpleNamespace(
-        bearing_step=_step(obs, "bearing"), pitch_step=_step(obs, "pitch"), spot=spot, background=background,
-        faces=faces.max(), cells=cells, features=features, face_share=1.0, edge_share=1.0,
-    )  # fmt: skip
+    rate = SimpleNamespace(spot=spot, background=background, faces=faces.max(), cells=cells, features=features)
+    rate.bearing_step, rate.pitch_step = _step(obs, "bearing"), _step(obs, "pitch")
+    rate.face_share = rate.edge_share = 1.0
     bare = replace(solution.state, sweeps=0 * solution.state.sweeps, sides=0 * solution.state.sides)
     expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, rate)), solution.unknowns)
     found = _edge_information(solution.state, solution.data, solution.unknowns)
@@ -197,8 +196,8 @@ def _beams(boards, solution, rate):
     across = np.linalg.norm(np.cross(ray, direction), axis=-1)
     radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
     step = np.sqrt(rate.bearing_step * rate.pitch_step) * distance
-    sigma = flip_sigma(np.exp(solution.state.sensor[2]), radius, step)[0]
-    shift = edge_shift(solution.state.sensor[1], radius, rate.background)[0]
+    sigma = flip_sigma(np.exp(solution.sensor["edge_log_softness"]), radius, step)[0]
+    shift = edge_shift(solution.sensor["edge_log_odds"], radius, rate.background)[0]
     # beams per metre off the edge; those near a corner are not used
     number = density * np.maximum(length[edge] - 4 * radius, 0.0) * across / len(ALONG)
     rows = np.sum((number * 4 * step).reshape(n, edges, -1), axis=2)

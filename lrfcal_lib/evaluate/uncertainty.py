@@ -93,11 +93,10 @@ def chain_of(solution, camera=None):
     found, unknowns, sweep = solution.solution, solution.unknowns, solution.data.sweep_sigma
     wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
     index = np.array([found.names.index(name) if name in found.names else -1 for name in wanted])
-    known, rows = index >= 0, np.ix_(index, index)
+    known = index >= 0
     # zero for what is known; what has no bound is among `unseen`
-    covariances = tuple(
-        np.where(np.outer(known, known) & np.isfinite(C[rows]), C[rows], 0.0) for C in (found.covariance, found.trusted)
-    )
+    both = (C[np.ix_(index, index)] for C in (found.covariance, found.trusted))
+    covariances = tuple(np.where(np.outer(known, known) & np.isfinite(C), C, 0.0) for C in both)
     # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever the edge bias.
     scales = np.array([SCALES.get(name, 1.0) for name in found.names])
     own = marginal(information(solution).sum(axis=0) * scales[:, None] * scales, index[known])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import doubtful, far_from_stated, places_of_cameras
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
@@ -321,9 +322,9 @@ def _of_placements(solution):
     place = np.concatenate([obs.face_placement, obs.beam_placement, shown])
     # the pitch shows the axis: of each placement, of the whole recording where a camera stands on the base
     within = "" if "platform" in obs.mounts else " within a placement"
-    span = _largest_range(pitch, place if within else 0 * place)
+    span = largest_range(pitch, place if within else 0 * place)
     axis = any(name in solution.solution.names for name in AXIS_NAMES)
-    flat = len(turned) and _largest_range(turned, shown) < SMALL_IMAGE_PITCH
+    flat = len(turned) and largest_range(turned, shown) < SMALL_IMAGE_PITCH
     mean = boards[:, :, 2].mean(axis=0)
     off = np.arccos(np.clip(boards[:, :, 2] @ mean / np.linalg.norm(mean), -1, 1)).max()
     middles = boards[:, :, :3] @ outline(solution).mean(axis=0) + boards[:, :, 3]
@@ -343,27 +344,21 @@ def _of_placements(solution):
     ]  # fmt: skip
 
 
-def _largest_range(values, groups):
-    """Largest range of the values of one group, 0 where there are none."""
-    return max((np.ptp(values[groups == group]) for group in np.unique(groups)), default=0.0)
-
-
 def _of_residuals(solution):
     """What residuals and their scatter say against the model: rows of whether, answer, kind and words."""
-    level = max(np.median([*solution.misfit.values()]), 1.0) if solution.misfit else 1.0
-    bad = {p: np.sqrt(value / level) for p, value in solution.misfit.items() if value > MISFIT * level}
-    misfits = ", ".join(f"{p} ({times:.1f} times)" for p, times in bad.items())
+    level, misfit = max(np.median([*solution.misfit.values()]), 1.0), solution.misfit.items()
+    misfits = ", ".join(f"{p} ({np.sqrt(z / level):.1f} times)" for p, z in misfit if z > MISFIT * level)
     clustered, ratio, worst = solution.solution.covariance_placements, {"axis": 0.0}, "axis"
     if clustered is not None:
         plain, scatter = (group_sigma(C, solution) for C in (solution.solution.covariance, clustered))
         ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
         worst = max(ratio, key=ratio.get)
     what = "the axis" if worst == "axis" else f"camera '{worst}'"
-    noise = {"ranges": solution.noise.get("face_scale", 1.0), "images": solution.noise.get("view_scale", 1.0)}
+    noise = {"ranges": solution.noise["face_scale"], "images": solution.noise.get("view_scale", 1.0)}
     large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
-    share = solution.noise.get("face_share", 1.0)  # beams about an edge always repeat errors: they share a background
+    share = solution.noise["face_share"]  # beams about an edge always repeat errors: they share a background
     return [
-        (bad, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
+        (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
         (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
         (ratio[worst] > MODEL_ERROR, CARE, "model error",
          f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: an error of the model"),

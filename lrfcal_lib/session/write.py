@@ -73,7 +73,7 @@ class SessionWriter:
         if set(os.listdir(self.path)) - {stated.LOCK}:
             raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
         self._make_folders()
-        self._write_index()
+        self._state()
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
@@ -97,8 +97,11 @@ class SessionWriter:
     def _write(self, name, content):
         write_file(self.path / name, content, self.path)
 
-    def _write_index(self):
-        self._write("session.json", json.dumps(self.data, indent=1) + "\n")
+    def _state(self, **changes):
+        """Change session.json; where that cannot be written, nothing is changed."""
+        data = self.data | changes
+        self._write("session.json", json.dumps(data, indent=1) + "\n")
+        self.data = data
 
     def _begin_table(self, name, columns):
         if not os.path.lexists(self.path / name):
@@ -109,8 +112,7 @@ class SessionWriter:
 
     def _note_placement(self, placement):
         if placement >= 0 and placement not in self.data["placements"]:
-            self.data["placements"] = sorted([*self.data["placements"], int(placement)])
-            self._write_index()
+            self._state(placements=sorted([*self.data["placements"], int(placement)]))
 
     def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
         """Append the scan lines of a placement; SessionError for wrong shapes or units, or other bearings than before.
@@ -307,15 +309,6 @@ class SessionRecorder(SessionWriter):
         self._make_folders()
         self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
-    def _state(self, **changes):
-        """Change session.json; where that cannot be written, nothing is changed."""
-        before, self.data = self.data, self.data | changes
-        try:
-            self._write_index()
-        except OSError:
-            self.data = before
-            raise
-
     def _go_on(self):
         """Take over what an earlier recording wrote, without the placement that it did not finish."""
         mine, data = json.loads(json.dumps(self.data)), stated.read_json(self.path / "session.json", self.path)
@@ -369,7 +362,7 @@ class SessionRecorder(SessionWriter):
         for placement in self.data["unfinished"]:
             self.drop_placement(placement)
         del self.data["unfinished"]
-        self._write_index()
+        self._state()
         complete(self.path)
         self.close()
 

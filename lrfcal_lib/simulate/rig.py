@@ -15,9 +15,9 @@ from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.model.geometry import tilt
 from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate.beam import LMS221, Beam
+from lrfcal_lib.simulate.draw import AHEAD
 from lrfcal_lib.simulate.scene import Exposure, need
 
-AHEAD = Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # axes ahead to those of a camera or an upright board
 MOST_TRIES = 4000
 PITCH_GRID = np.radians(np.arange(-30.0, 30.1, 0.5))  # pitch angles at which an image may be taken
 OUTSIDE = np.radians(2.0)  # a sweep begins and ends this far outside the board
