@@ -71,14 +71,9 @@ def lms400(lms400_session):
 
 
 LONGEST = (
-    "test_notebooks",
-    "test_notebooks_recording",
-    "test_record_emulated",
-    "test_image",
-    "test_panel_browser",
-    "test_record_bad_input",
-    "test_real_lms400",
-)
+    "test_notebooks", "test_notebooks_recording", "test_record_emulated", "test_image", "test_notebooks_scant",
+    "test_report", "test_golden", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):

@@ -112,8 +112,9 @@ def page():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=120_000)
         page = browser.new_page()
+        page.set_default_timeout(120_000)  # a busy machine takes its time
         page.route("http*://**", lambda route: route.abort())  # nothing from the network
         yield page
         browser.close()

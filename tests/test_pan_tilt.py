@@ -14,8 +14,9 @@ import pytest
 import virtual
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.head import HeadSettings, PanTilt, drawn_to_readings
+from lrfcal_lib.drivers.head import PanTilt, drawn_to_readings
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.rig_file import HeadSettings
 from lrfcal_lib.emulators.head import EmulatedHead, Head
 from lrfcal_lib.emulators.line import FAULTS
 from lrfcal_lib.simulate.rig import Platform
@@ -385,7 +386,8 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
     """In real time, on a pseudo-terminal."""
     code = """
     import sys, time
-    from lrfcal_lib.drivers.head import HeadSettings, PanTilt
+    from lrfcal_lib.drivers.head import PanTilt
+    from lrfcal_lib.drivers.rig_file import HeadSettings
     head = PanTilt(sys.argv[1], HeadSettings(baudrate=38400, gap_s=0.005))
     head.start_sweep(1.0, speed=1)
     try:

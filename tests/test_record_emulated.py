@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from lrfcal_lib.acquire.checks import check_placement
-from lrfcal_lib.acquire.record import Terminal, record_session
+from lrfcal_lib.acquire.record import record_session
 from lrfcal_lib.calibrate.observe import observe_all
 from lrfcal_lib.calibrate.pipeline import calibrate_cameras, calibrate_jointly, calibrate_platform, prepare
 from lrfcal_lib.drivers.host import VirtualHost
@@ -91,9 +91,7 @@ def recorded_session(setup, tmp_path_factory):
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
         with Rig.open(stated, clock=host.time, host=host, camera=lambda name: Still(emulated, name)) as rig:
-            record_session(
-                rig, folder / "s", terminal=Terminal(ask=lambda text: pytest.fail("the board moves by itself"))
-            )
+            record_session(rig, folder / "s")  # nobody is asked for anything: the board moves by itself
     return open_session(folder / "s")
 
 
@@ -138,7 +136,7 @@ def test_the_recording_calibrates_as_the_simulated_session(recorded_session, pre
     platforms, cameras = [], []
     for one in prepared:
         platforms.append(calibrate_platform(one, one.pitch_noise.offset))
-        solutions, problems = calibrate_cameras(observe_all(one, platforms[-1].T_head_lrf), [METHOD])
+        solutions, problems = calibrate_cameras(observe_all(one, platforms[-1].transform("combined")), [METHOD])
         assert problems == {}
         cameras.append(solutions["left", METHOD])
     compare(*cameras, setup[0].rig.cameras[0].mounting, 6, 0.15)

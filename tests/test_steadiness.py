@@ -236,9 +236,11 @@ def test_pitch_is_put_in_words():
     assert pitch_words(None) == [] and pitch_words(SimpleNamespace(wanted="none")) == []
 
 
-def test_problems_name_their_placement():
-    words = diagnosis.problem_words({6: "camera left: its plane is 90 mm off the scan", "6 2": "placement 6: crooked"})
-    assert words == ["placement 6: camera left: its plane is 90 mm off the scan", "placement 6: crooked"]
+def test_problems_name_their_placement_and_a_faultless_recording_has_no_findings():
+    problems = {6: "camera left: its plane is 90 mm off the scan", "6 2": "placement 6: crooked"}
+    named = ["placement 6: camera left: its plane is 90 mm off the scan", "placement 6: crooked"]
+    assert diagnosis.problem_words(problems) == named
+    assert diagnosis.findings_in_words(diagnosis.Diagnosis({}, BoardBends({}), None, {})) == []
 
 
 def test_the_figure_marks_the_step():
@@ -273,7 +275,3 @@ def test_the_scale_of_both_real_cameras_drifts_together(nudged):
     left, right = (nudged[c].corner_px for c in ("left", "right"))
     assert np.corrcoef(left, right)[0, 1] > 0.95
     assert all(found.scale_drifts for found in nudged.values())
-
-
-def test_findings_of_a_faultless_recording_are_none():
-    assert diagnosis.findings_in_words(diagnosis.Diagnosis({}, BoardBends({}), None, {})) == []

@@ -207,48 +207,42 @@ def test_size_and_exposure_that_a_stream_cannot_set(server, caplog):
 # -------------------------------------------------------------------------------------------------------- V4L2
 
 
+class Device:
+    """A V4L2 device of 640 x 480 in place of cv2.VideoCapture; `fixed` keys keep their values, `ends` fails grabs."""
+
+    there, opens, allowed, ends, grey, fixed, made = True, True, True, False, False, set(), 0
+
+    def __init__(self, path, backend):
+        assert backend == cv2.CAP_V4L2
+        self.got = {cv2.CAP_PROP_FRAME_WIDTH: 640.0, cv2.CAP_PROP_FRAME_HEIGHT: 480.0, cv2.CAP_PROP_FPS: 30.0,
+                    cv2.CAP_PROP_EXPOSURE: 157.0}  # fmt: skip
+        self.isOpened, self.release = lambda: self.opens, lambda: None
+
+    def set(self, key, value):
+        self.got |= {} if key in self.fixed else {key: float(value)}
+        return key not in self.fixed
+
+    def get(self, key):
+        return self.got.get(key, 0.0)
+
+    def grab(self):
+        time.sleep(0.01)
+        return not self.ends
+
+    def retrieve(self):
+        self.made += 1
+        image = numbered(self.made, (int(self.get(cv2.CAP_PROP_FRAME_WIDTH)), int(self.get(cv2.CAP_PROP_FRAME_HEIGHT))))
+        return True, image[:, :, 0] if self.grey else image
+
+
 @pytest.fixture
 def device(monkeypatch):
-    """A V4L2 device of 640 x 480 behind cv2.VideoCapture, whose habits can be changed.
-
-    `fixed` keys keep their values, `ends` makes the grabs fail.
-    """
-
-    class Device:
-        there, opens, ends, grey, fixed, made = True, True, False, False, set(), 0
-
-        def __init__(self, path, backend):
-            assert backend == cv2.CAP_V4L2
-            self.got = {cv2.CAP_PROP_FRAME_WIDTH: 640.0, cv2.CAP_PROP_FRAME_HEIGHT: 480.0, cv2.CAP_PROP_FPS: 30.0,
-                        cv2.CAP_PROP_EXPOSURE: 157.0}  # fmt: skip
-
-        def isOpened(self):  # noqa: N802
-            return Device.opens
-
-        def set(self, key, value):
-            self.got |= {} if key in Device.fixed else {key: float(value)}
-            return key not in Device.fixed
-
-        def get(self, key):
-            return self.got.get(key, 0.0)
-
-        def grab(self):
-            time.sleep(0.01)
-            return not Device.ends
-
-        def retrieve(self):
-            Device.made += 1
-            size = int(self.get(cv2.CAP_PROP_FRAME_WIDTH)), int(self.get(cv2.CAP_PROP_FRAME_HEIGHT))
-            image = numbered(Device.made, size)
-            return True, image[:, :, 0] if Device.grey else image
-
-        def release(self):
-            pass
-
-    monkeypatch.setattr(video.cv2, "VideoCapture", Device)
-    monkeypatch.setattr(video.os.path, "exists", lambda path: Device.there)
-    monkeypatch.setattr(video.os, "access", lambda path, mode: True)
-    return Device
+    """The class of the devices that there are, whose habits can be changed."""
+    made = type("Device", (Device,), {})
+    monkeypatch.setattr(video.cv2, "VideoCapture", made)
+    monkeypatch.setattr(video.os.path, "exists", lambda path: made.there)
+    monkeypatch.setattr(video.os, "access", lambda path, mode: made.allowed)
+    return made
 
 
 FIXED = (cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH)
@@ -283,16 +277,14 @@ def test_device_lost_and_found(device):
         assert camera.settings["exposure"]["got"] == pytest.approx(0.005)
 
 
-@pytest.mark.parametrize(("habits", "allowed", "what"), [
-    ({"opens": False}, True, "/dev/video0 gives no video: close other programs"),
-    ({}, False, "no permission for /dev/video0: run 'sudo usermod -aG video"),
-    ({"there": False}, True, "there is no camera /dev/video0: check its plug; present are"),
-    ({"source": "images/*.png"}, True, "images/.*.png is no camera: name a device, .*, or a URL"),
+@pytest.mark.parametrize(("source", "habit", "what"), [
+    (0, {"opens": False}, "/dev/video0 gives no video: close other programs"),
+    (0, {"allowed": False}, "no permission for /dev/video0: run 'sudo usermod -aG video"),
+    (0, {"there": False}, "there is no camera /dev/video0: check its plug; present are"),
+    ("images/*.png", {}, "images/.*.png is no camera: name a device, .*, or a URL"),
 ])  # fmt: skip
-def test_devices_that_cannot_be_opened(device, monkeypatch, habits, allowed, what):
-    source = habits.pop("source", 0)
-    for name, value in habits.items():
+def test_devices_that_cannot_be_opened(device, source, habit, what):
+    for name, value in habit.items():
         setattr(device, name, value)
-    monkeypatch.setattr(video.os, "access", lambda path, mode: allowed)
     with pytest.raises(PortError, match=what):
         Camera(source, name="left")

@@ -73,15 +73,7 @@ def check_placement(session, placement, advice=None):
 
 
 def check_scan(sweep, board, T_head_lrf=None):
-    """Lights of the scans of a placement: 'scan' and, where the board was found, 'edges'.
-
-    Parameters
-    ----------
-    sweep : Sweep or None
-        None where there is no range at all.
-    board : Board
-    T_head_lrf : RigidTransform, optional
-    """
+    """Lights of a Sweep (None where there is no range at all): 'scan' and, where the board was found, 'edges'."""
     if sweep is None:
         return [Light("scan", "bad", "no scan line with a range: is something close before the window?")]
     try:
@@ -116,16 +108,7 @@ def _edges(found):
 
 
 def check_image(image, board, model=None, name="image"):
-    """The Light, of this name, of an image of the board.
-
-    Parameters
-    ----------
-    image : ndarray of uint8, shape (h, w) or (h, w, 3)
-    board : Board
-    model : CameraModel, optional
-        Needed for a board without a pattern.
-    name : str
-    """
+    """The Light, of this name, of an image of the Board; one without a pattern needs a CameraModel."""
     if board.pattern is None:
         if model is None:
             return Light(name, "warn", "not checked: the board has no pattern, and the camera no intrinsics yet")
@@ -153,16 +136,7 @@ def check_image(image, board, model=None, name="image"):
 def edge_rise(picture, grid):
     """Median distance in which the edges between squares rise from 10 to 90 %, pixels: 2.6 sigma of a Gaussian blur.
 
-    Parameters
-    ----------
-    picture : ndarray of uint8, shape (h, w)
-    grid : ndarray, shape (rows, columns, 2)
-        Inner corners of a chessboard, pixels.
-
-    Returns
-    -------
-    float
-        At most 0.7 of a square.
+    `grid` (rows, columns, 2) has the inner corners of the chessboard in a picture (h, w); at most 0.7 of a square.
     """
     pairs = [(grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])]
     ends = np.stack([np.concatenate([pair[i].reshape(-1, 2) for pair in pairs]) for i in (0, 1)])

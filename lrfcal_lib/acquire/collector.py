@@ -164,23 +164,11 @@ class Collector(Closed):
         self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
 
     def connect(self, rig, session):
-        """Open a rig and a session; a session that was recorded with the same rig goes on.
+        """Open a rig and a session (a folder); a session that was recorded with the same rig goes on.
 
-        Parameters
-        ----------
-        rig : path-like or str
-            Rig file, or the name of an emulated rig ('practice', 'sim_quick', 'sim_lms221').
-        session : path-like
-            Folder.
-
-        Raises
-        ------
-        RigFileError
-            If there is no such file or rig, or it cannot be used.
-        DeviceError
-            If a device does not open; those opened before are closed again.
-        SessionError, RecordingError
-            If the session states another rig, or cannot be written.
+        The rig is a rig file, or the name of an emulated rig. RigFileError if there is no such file or rig, or it
+        cannot be used; DeviceError if a device does not open (those opened before are closed again); SessionError or
+        RecordingError if the session states another rig, or cannot be written.
         """
         self.close()
         with self._own(), contextlib.ExitStack() as stack:
@@ -286,22 +274,10 @@ class Collector(Closed):
         return None if self.recording is None else next_task(self.recording, self._told)
 
     def capture(self, progress=lambda share, text: None):
-        """Record the next task; the board is where it should be, or an emulated rig puts it there.
+        """Record the next task, the board being where it should, or put there by an emulated rig; the Lights of checks.
 
-        Parameters
-        ----------
-        progress : callable
-            ``progress(share, text)`` after every event.
-
-        Returns
-        -------
-        list of Light
-            What the checks say.
-
-        Raises
-        ------
-        DeviceError, RecordingError, Interrupted
-            The last if it was stopped: the placement does not count.
+        ``progress(share, text)`` is called after every event. DeviceError, RecordingError, or Interrupted if it was
+        stopped: the placement does not count.
         """
         self._needed()
         task = self.task()

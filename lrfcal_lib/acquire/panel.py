@@ -158,17 +158,8 @@ def scan_picture(ranges, bearings, field_of_view):
 def sweep_picture(rows, bearings, field_of_view, pitch, step):
     """A sweep as it grows: ranges as colours, near is bright, grey where there is none; BGR.
 
-    Bearing grows to the left as in the scene, pitch upwards.
-
-    Parameters
-    ----------
-    rows : dict of float to ndarray, shape (B,)
-        Ranges by pitch.
-    bearings : ndarray, shape (B,)
-    field_of_view, pitch : (float, float)
-        Ends, radians.
-    step : float
-        Between scan lines, radians; of a continuous sweep the most between two.
+    Bearing grows to the left as in the scene, pitch upwards; radians, of field of view and pitch their ends. `rows` has
+    ranges (B,) by pitch, `step` is that between scan lines, of a continuous sweep the most between two.
     """
     half, width, height = np.degrees(step) / 2, RIGHT - LEFT, BOTTOM - TOP
     across = np.degrees([max(field_of_view), min(field_of_view)])
@@ -364,8 +355,8 @@ class Panel(Closed):
             parts, collector = self.parts, self.collector
             collector.connect(parts.rig.value.strip(), Path(parts.session.value.strip()).expanduser())
             low, high = collector.limits_deg
-            parts.slider.min, parts.slider.max = min(low, parts.slider.max), high
-            parts.slider.min = low
+            with parts.slider.hold_trait_notifications():
+                parts.slider.min, parts.slider.max = low, high
             parts.show_pictures(collector.rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()

@@ -94,7 +94,7 @@ class Recording(Closed):
     def close_views_to_do(self):
         """Images of the board held close still to be taken: camera and number of the view, counted from 0."""
         wanted, taken = self.rig.stated.plan.intrinsics_images, self.writer.shots_of("intrinsics")
-        return [(camera, view) for camera in self.rig.stated.cameras for view in range(taken[camera], wanted)]
+        return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
 
     def run(self, placement):
         """Record a placement of :meth:`to_do`: a generator that yields every event of the rig once it is on the disk.
@@ -187,36 +187,27 @@ class Recording(Closed):
 
 
 class Terminal:
-    """Plain lines; on a terminal one more that is rewritten while the head moves (by carriage returns alone).
+    """Plain lines; on a terminal one more that is rewritten while the head moves (by carriage returns alone)."""
 
-    Parameters
-    ----------
-    out : text stream, optional
-        stdout by default.
-    ask : callable
-        ``ask(text) -> str``.
-    """
-
-    def __init__(self, out=None, ask=input):
-        self.out, self._ask, self._width = sys.stdout if out is None else out, ask, 0
+    def __init__(self):
+        self._width = 0
 
     def say(self, text):
         """A line of its own, instead of the one that is rewritten."""
         if self._width:
-            print("\r" + " " * self._width, end="\r", file=self.out, flush=True)
+            print("\r" + " " * self._width, end="\r", flush=True)
             self._width = 0
         if text:
-            print(text, file=self.out, flush=True)
+            print(text, flush=True)
 
     def ask(self, text):
         """What the user answers; RecordingError if nobody can."""
         self.say("")
         try:
-            return self._ask(text).strip().lower()
+            return input(text).strip().lower()
         except EOFError:
-            raise RecordingError(
-                "nobody is there to move the board: run record in a terminal, or with an emulated rig"
-            ) from None
+            hint = "run record in a terminal, or with an emulated rig"
+            raise RecordingError(f"nobody is there to move the board: {hint}") from None
 
     def follow(self, placement, number, of, events):
         """Show the recording of a placement while it runs."""
@@ -230,9 +221,9 @@ class Terminal:
                 scans, pitch = scans + len(event.readings), event.pitch[-1]
             images += isinstance(event, Photographed)
             counted = f"{scans} scans, {images} images"
-            if self.out.isatty():
+            if sys.stdout.isatty():
                 text = f"  {stop}{math.degrees(pitch):+.2f} deg, {counted}"[: shutil.get_terminal_size().columns - 1]
-                print("\r" + text.ljust(self._width), end="", file=self.out, flush=True)
+                print("\r" + text.ljust(self._width), end="", flush=True)
                 self._width = len(text)
         self.say(f"  {counted} in {time.monotonic() - begun:.0f} s")
 
@@ -241,32 +232,29 @@ class Terminal:
         self.say(f"{MARKS[light.state]}  {name or light.name}: {light.text}")
 
 
-def record_session(rig, path, *, resume=False, count=None, terminal=None):
+def record_session(rig, path, *, resume=False, count=None):
     """Record a session with an open rig, from the first placement that is missing to the last of the plan.
 
     Parameters
     ----------
     rig, path, resume, count
         As of :class:`Recording`, which is returned: finished, with all placements or those that the user wanted.
-    terminal : Terminal, optional
 
     Raises
     ------
     DeviceError, SessionError, RecordingError
     """
-    terminal = terminal or Terminal()
-    recording = Recording(rig, path, resume=resume, count=count)
-    if recording.finished:
-        terminal.say(f"{path}: going on, {recording.safe()}")
-    try:
-        _close_views(recording, terminal)
-        _placements(recording, terminal)
-        recording.finish()
-    except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal, see `emergency`
-        error.add_note(recording.safe(resume=True))
-        raise
-    finally:
-        recording.close()
+    terminal = Terminal()
+    with Recording(rig, path, resume=resume, count=count) as recording:
+        if recording.finished:
+            terminal.say(f"{path}: going on, {recording.safe()}")
+        try:
+            _close_views(recording, terminal)
+            _placements(recording, terminal)
+            recording.finish()
+        except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal
+            error.add_note(recording.safe(resume=True))
+            raise
     return recording
 
 
@@ -307,7 +295,7 @@ def _placements(recording, terminal):
             terminal.light(light)
 
 
-def main(rig_file, path, *, resume=False, count=None, mode=None, terminal=None):
+def main(rig_file, path, *, resume=False, count=None, mode=None):
     """Record from the command line; options as of :func:`record_session`, `mode` instead of the plan's.
 
     0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal. The head
@@ -316,7 +304,7 @@ def main(rig_file, path, *, resume=False, count=None, mode=None, terminal=None):
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
         with Rig.open(read_rig_file(rig_file).with_mode(mode)) as rig:
-            recording = record_session(rig, path, resume=resume, count=count, terminal=terminal)
+            recording = record_session(rig, path, resume=resume, count=count)
     except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
         text, code = f"error: {error}", FAILED
         if isinstance(error, KeyboardInterrupt):

@@ -28,21 +28,11 @@ NAME_DISTANCE = 0.08  # metres between a side in the cloud and the board edge it
 NAME_ANGLE = np.deg2rad(3.0)  # between them; a side turned more is none (a cloud cut by hand, an occluder)
 RIGHT_ANGLE = 0.15  # largest |cosine| between two sides that are taken for the board's perpendicular edges
 
-# tables without rows
-NUMBER, WHOLE = np.zeros(0), np.zeros(0, int)
-RANGES = dict.fromkeys(("range", "bearing", "pitch", "sigma"), NUMBER) | {"placement": WHOLE}
-BEAMS = dict.fromkeys(("bearing", "pitch", "radius", "background", "step"), NUMBER)
-BEAMS |= {"hit": np.zeros(0, bool), "edge": WHOLE, "placement": WHOLE}
-VIEWS = {"camera": WHOLE, "pitch": NUMBER, "pose": np.zeros((0, 4, 4)), "covariance": np.zeros((0, 6, 6))}
-VIEWS |= {"placement": WHOLE, "lens": np.zeros((0, 6, 9))}
-EDGES = {"points": np.zeros((0, 3)), "covariance": np.zeros((0, 3, 3)), "pitch": NUMBER}
-EDGES |= {"placement": WHOLE}
 
-
-def stack(prefix, parts, nothing=()):
-    """Parts of a table end to end: its columns by name, with a prefix; `nothing` is one without rows."""
-    parts = list(parts) or [nothing]
-    return {prefix + key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+def stack(prefix, parts):
+    """Parts of a table end to end: its columns by name, with a prefix; none without parts."""
+    parts = list(parts)
+    return {prefix + key: np.concatenate([part[key] for part in parts]) for key in (parts[0] if parts else ())}
 
 
 def observe(
@@ -205,7 +195,7 @@ def platform_observations(prepared, variant="half_step"):
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
-    return PlatformObservations(**stack("edge_", edges, EDGES | {"number": WHOLE}), **stack("face_", faces, EDGES))
+    return PlatformObservations(**stack("edge_", edges), **stack("face_", faces))
 
 
 def _perpendicular(along, swept):
@@ -322,9 +312,9 @@ def observe_joint(prepared, views=None):
         mounts=tuple(session.cameras[c].mount for c in views),
         T_head_lrf=session.T_head_lrf,
         lens_covariance=np.array([np.zeros((9, 9)) if C is None else C for C in spreads]) if views else None,
-        **stack("face_", ranges, RANGES),
-        **stack("beam_", _beams(prepared, scans), BEAMS),
-        **stack("view_", _views(prepared, views, list(scans)), VIEWS),
+        **stack("face_", ranges),
+        **stack("beam_", _beams(prepared, scans)),
+        **stack("view_", _views(prepared, views, list(scans))),
     )
 
 

@@ -1,79 +1,17 @@
-"""The pitch axis of a Pelco-D head: settings, moves, sweeps and readings, with whatever the head answers."""
+"""The pitch axis of a Pelco-D head: moves, sweeps and readings, with whatever the head answers."""
 
 import itertools
 import logging
 import math
 import threading
-from typing import Annotated, Literal
-
-from pydantic import BeforeValidator, StrictBool
 
 from lrfcal_lib.drivers import pelco_d, port
 from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, SET_TILT, UP, HeadLine, encode_extended, encode_frame
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
-from lrfcal_lib.drivers.stated import Angle, Stated, number, several, whole
-from lrfcal_lib.session.stated import refused
 
 LOG = logging.getLogger(__name__)
-Perhaps = Literal["auto", True, False]
-Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01, 360, "deg/s")
-ORDER = "the lower one comes first"
 ASSUMED = 4.0, 4.0  # deg/s
-
-
-class HeadSettings(Stated):
-    """Settings of a Pelco-D head; ValueError for values that no head can have.
-
-    Nothing is published about the Ya An YA3050, so all defaults are assumptions.
-    """
-
-    address: whole(0, 255) = 1  # the usual factory setting of the DIP switches
-    baudrate: whole(50, 4_000_000) = 2400  # the most common default; 9600 is the next
-    # Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not state
-    # it means true: a silent head may as well be one with another address or rate.
-    feedback: Perhaps = "auto"
-    # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
-    absolute: Perhaps = "auto"
-    # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed; true makes a missing
-    # one an error (the adapter is dead), false makes one a warning.
-    echo: Perhaps = "auto"
-    # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
-    pitch_limits_deg: Annotated[several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)] = (-60.0, 60.0)
-    position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
-    invert: StrictBool = False  # it hangs upside down or counts the other way: its "up" lowers the view
-    tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
-    # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed heads, until it was
-    # learnt, and the log says so.
-    degrees_per_second: Annotated[
-        several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
-    ] = None
-    # From the motion frame to the movement, less what it runs on after the stop.
-    start_delay_s: number(-10, 10, "s") = 0.0
-    start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
-    tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
-    arrival_deg: Near = 0.5  # a move that ends this near has arrived; its settled pitch counts
-    settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
-    stall_s: Seconds = 1.5  # rest elsewhere for this long: it does not get to where it was sent
-    poll_s: Seconds = 0.1  # between queries while it moves
-    reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
-    gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
-    retries: whole(0, 20) = 3  # queries repeated when no reply came
-    sends: whole(1, 20) = 1  # motion frames in a row: 2 on weak lines; stops are sent twice in any case
-    repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
-    reconnect_s: number(0, 3600, "s") = 3.0  # a call waits this long for a vanished port to come back
-
-    def elevation(self, pitch):
-        """What the head calls a pitch, rad."""
-        return math.radians(self.position_zero_deg) + (-pitch if self.invert else pitch)
-
-    def pitch(self, elevation):
-        """The pitch of an elevation that the head tells, rad, in [-pi, pi)."""
-        turn = elevation - math.radians(self.position_zero_deg)
-        turn = (turn + math.pi) % (2 * math.pi) - math.pi
-        return -turn if self.invert else turn
-
-
 BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
 GROWTH = 4  # of bursts while the speed is being learnt
@@ -94,16 +32,9 @@ class Stopped(DeviceError):
 class Motion:
     """Motions of one axis, its speeds, and where it must be by now; rad, rad/s, instants of the host.
 
-    Attributes
-    ----------
-    abort : threading.Event
-        Set to end what runs; nothing moves the head while it is set.
-    feedback : bool
-        The head tells its tilt, if maybe not while it moves.
-    calibrated : bool
-        The speed was stated or measured, not assumed.
-    rows : list of (float, float, bool, float)
-        Of a sweep: host time, pitch, whether it was measured, and dead reckoning before that was known.
+    While the event `abort` is set nothing moves the head. `feedback`: it tells its tilt, if maybe not while it moves;
+    `calibrated`: its speed was stated or measured, not assumed; `rows` are of a sweep: host time, pitch, whether it was
+    measured, and dead reckoning before that was known.
     """
 
     def __init__(self, line, settings, log, clock):
@@ -320,20 +251,17 @@ class Motion:
             self._longest = max(self._longest, took)
         raise self._short_of(pitch, target)
 
-    def timed(self, target, deadline):
-        """Move by time; the pitch that results is dead reckoning.
+    def timed(self, target, seconds, deadline):
+        """Move by time, unless the shortest motion would lead further away; the pitch that results is dead reckoning.
 
         Raises LineLost if the port vanished: the pitch is unknown then; Refused if there is not enough time.
         """
-        start, step = self.estimate(), self.settings.tilt_speed
-        seconds = abs(target - start) / self.speed(target - start, step)
-        if seconds < self._shortest_s / 2:
-            return start  # the shortest motion would lead further away
         needed_s = seconds + self.settings.start_delay_s
-        if self._now() + needed_s > deadline:
-            raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
-        self.run(target, step)
-        self.pause(self.settings.settle_s)
+        if seconds >= self._shortest_s / 2:
+            if self._now() + needed_s > deadline:
+                raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
+            self.run(target, self.settings.tilt_speed)
+            self.pause(self.settings.settle_s)
         return self.estimate()
 
     def sweep(self, goal, step):
@@ -367,17 +295,7 @@ class Motion:
 
 
 def drawn_to_readings(rows):
-    """Track of a sweep: what lies between two readings is stretched to both, before the first and after the last not.
-
-    Parameters
-    ----------
-    rows : list of (float, float, bool, float)
-        Time, pitch, whether it was measured, dead reckoning before that was known.
-
-    Returns
-    -------
-    list of (float, float, bool)
-    """
+    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what is outside is not."""
     track, told = [row[:3] for row in rows], [i for i, row in enumerate(rows) if row[2]]
     for first, last in itertools.pairwise(told):
         start, way = rows[first][1], rows[last][3] - rows[first][1]
@@ -394,7 +312,7 @@ class PanTilt(port.Closed):
     ----------
     path : str or Path
         Of the port.
-    settings : HeadSettings
+    settings : rig_file.HeadSettings
     clock : callable, optional
         Host clock, s; time.time() of the host by default.
 
@@ -402,7 +320,6 @@ class PanTilt(port.Closed):
     ----------
     has_feedback : bool
         It tells its tilt.
-    motion : Motion
 
     Raises
     ------
@@ -480,14 +397,8 @@ class PanTilt(port.Closed):
     def pitch(self):
         """Where the head points now, rad, up positive, and whether it was measured (else it is dead reckoning).
 
-        Raises
-        ------
-        NoReply
-            If a head with feedback rests and does not answer.
-        LineLost
-            If the port vanished and did not come back.
-        DeviceError
-            If the head was closed, or the pitch of one without feedback is unknown after its line was lost.
+        NoReply if it rests and does not answer, LineLost if the port did not come back, DeviceError if the head was
+        closed, or the pitch of one without feedback is unknown after its line was lost.
         """
         self._need_open()
         if self.has_feedback:
@@ -566,7 +477,7 @@ class PanTilt(port.Closed):
                     if now() >= deadline:
                         raise
                     self._line.opened()
-            return motion.timed(pitch, deadline)
+            return motion.timed(pitch, seconds, deadline)
         except BaseException:
             self.emergency_stop()
             raise
@@ -603,12 +514,7 @@ class PanTilt(port.Closed):
     def finish_sweep(self, timeout=None):
         """Wait for the end of the sweep; its :attr:`track`.
 
-        Raises
-        ------
-        NoReply
-            If it goes on after `timeout` s; the head is stopped.
-        DeviceError
-            Why it ended too early.
+        NoReply if it goes on after `timeout` s (the head is stopped), DeviceError if it ended too early.
         """
         if self._thread is None:
             raise DeviceError("there was no sweep: start one")
@@ -622,9 +528,8 @@ class PanTilt(port.Closed):
 
     @property
     def track(self):
-        """Host time, pitch in rad and whether it was measured, of the sweep that runs or ran last.
+        """List of host time, pitch in rad and whether it was measured, of the sweep that runs or ran last.
 
-        list of (float, float, bool)
-            Between readings the pitch is dead reckoning, which is drawn to the readings.
+        Between readings the pitch is dead reckoning, which is drawn to the readings.
         """
         return drawn_to_readings(list(self.motion.rows))

@@ -53,8 +53,6 @@ class LMS2xx(Closed):
         As read last.
     configuration : Configuration
         As read last.
-    variant : tuple of float
-        Field of view and resolution, degrees.
 
     Raises
     ------
@@ -123,7 +121,7 @@ class LMS2xx(Closed):
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         self._link.senders = {0x80, 0x80 | self.status.address}
         model, *rest = self._told(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
@@ -164,12 +162,8 @@ class LMS2xx(Closed):
     def reconnect(self, deadline=10.0):
         """Find the device again after the line was lost or it restarted, within seconds, and set it as it was.
 
-        Raises
-        ------
-        LineLost
-            If the port did not come back.
-        NoReply, WrongDevice, Refused
-            If the port did, but the device does not work as before.
+        LineLost if the port did not come back; NoReply, WrongDevice or Refused if it did, but the device does not work
+        as before.
         """
         self._idle()
         self._mend(deadline)
@@ -198,9 +192,10 @@ class LMS2xx(Closed):
 
     # ------------------------------------------------------------------------------------------------- settings
 
-    def _read_status(self):
-        self.status = self._told(wire.STATUS, codec.parse_status)
-        self.variant = (self.status.scan_angle_deg, self.status.resolution_deg)
+    @property
+    def variant(self):
+        """Field of view and resolution, degrees."""
+        return self.status.scan_angle_deg, self.status.resolution_deg
 
     def _read_configuration(self):
         def parse(raw):
@@ -231,19 +226,13 @@ class LMS2xx(Closed):
             raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
 
     def set_variant(self, fov_deg, resolution_deg):
-        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg, if they differ.
-
-        Returns
-        -------
-        bool
-            Whether anything was changed.
-        """
+        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg; whether they differed."""
         self._idle()
         wanted = (float(fov_deg), float(resolution_deg))
         if wanted not in POINTS:
             known = ", ".join(f"{fov:g}/{step:g}" for fov, step in POINTS)
             raise ValueError(f"variants are {known} deg, got {fov_deg:g}/{resolution_deg:g}")
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         differs = self.variant != wanted
         if differs:
             self._set_variant(wanted)
@@ -256,33 +245,17 @@ class LMS2xx(Closed):
             self._opened().ask(wire.VARIANT, words)
         except NoReply as error:  # the reply may be lost and the variant set
             self._log.warning("%s; reading the variant", error)
-        self._read_status()
+        self.status = self._told(wire.STATUS, codec.parse_status)
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
             raise Refused(f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}")
 
     def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
-        """Change settings that are kept in flash (some thousand writes), only if they differ.
+        """Change settings that are kept in flash (some thousand writes), only if they differ; whether they did.
 
-        Parameters
-        ----------
-        unit : {'cm', 'mm'}, optional
-        measuring_mode : int, optional
-            Key of `lms2xx_codec.MODES`; tells the largest range, too.
-        realtime_indices : bool, optional
-            Whether scans carry their indices; without them dropped and repeated scans cannot be seen.
-
-        Returns
-        -------
-        bool
-            Whether anything was written.
-
-        Raises
-        ------
-        Refused
-            For a wrong password, or values that the device declines.
-        ValueError
-            For values that no LMS2xx has.
+        The unit is 'cm' or 'mm', the measuring mode a key of `lms2xx_codec.MODES` (it tells the largest range, too).
+        Without real-time indices dropped and repeated scans cannot be seen. Refused for a wrong password, or values
+        that the device declines; ValueError for those that no LMS2xx has.
         """
         self._idle()
         if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
@@ -363,12 +336,7 @@ class LMS2xx(Closed):
         """The newest scan of the stream, a Reading, within so many seconds.
 
         Its first beam is later than `after` by the host's clock; by default it is one that was not handed out before
-        and is not older than the stream needs.
-
-        Raises
-        ------
-        NoReply
-            If there is none in time; the message tells what is wrong with the stream.
+        and is not older than the stream needs. NoReply, which tells what is wrong with the stream, if there is none.
         """
         reader = self._streaming()
 
@@ -380,14 +348,10 @@ class LMS2xx(Closed):
         return reader.wait(find, timeout)
 
     def take(self, count, after=None, timeout=None):
-        """Consecutive scans of the stream, all later than an instant, by default that of the call.
+        """Consecutive scans of the stream, a list of Reading, later than an instant, by default that of the call.
 
         The last 256 scans are kept, so that with the instant of the last scan of one call the next call goes on
         without a gap. By default it lasts as long as the line needs and 2 s.
-
-        Returns
-        -------
-        list of Reading
         """
         reader, found = self._streaming(), []
         limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout

@@ -55,18 +55,9 @@ class Link:
     """An open port with an LMS2xx at its other end.
 
     `counts` has the numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up; address 0 reaches any device; once
-    the event `interrupted` is set, whoever waits here gets NoReply.
-
-    Attributes
-    ----------
-    senders : set of int or None
-        Address bytes that replies may have; None for any.
-    deadline : float
-        By ``host.now()``; no request lasts longer.
-    asked_s : float
-        By the clock, when the last request was sent for the first time.
-    heard : int
-        Bytes of any kind.
+    the event `interrupted` is set, whoever waits here gets NoReply. Replies count whose address byte is among `senders`
+    (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s` is the instant by the clock at which
+    the last one was sent for the first time, and `heard` counts bytes of any kind.
     """
 
     def __init__(self, path, baudrate, counts, *, address=0, clock=None, interrupted=None, host=REAL):
@@ -244,33 +235,15 @@ STUBBORN = 5  # so many implausible scan indices in a row: the device counts ane
 
 @dataclass(frozen=True)
 class Reading:
-    """A scan with the instants of its beams.
+    """A scan with the instants of its beams; neighbours of fine scans are 13.32 ms apart."""
 
-    Attributes
-    ----------
-    telegrams : tuple of bytes
-        As sent: one, or the four of a set of interlaced scans.
-    ranges : ndarray, shape (B,)
-        Metres, NaN where there is no range.
-    reasons : ndarray of uint8, shape (B,)
-        Index into `lms2xx.REASONS`, 0 for a range.
-    bearings : ndarray, shape (B,)
-        Radians in the LRF frame, ascending.
-    time_s : float
-        Clock of the host at the first beam.
-    beam_times_s : ndarray, shape (B,)
-        The same for every beam; neighbours of fine scans are 13.32 ms apart.
-    scan_index, telegram_index : int or None
-        Of the (first) telegram, modulo 256; None where the device does not send them.
-    """
-
-    telegrams: tuple[bytes, ...]
-    ranges: np.ndarray
-    reasons: np.ndarray
-    bearings: np.ndarray
-    time_s: float
-    beam_times_s: np.ndarray
-    scan_index: int | None
+    telegrams: tuple[bytes, ...]  # as sent: one, or the four of a set of interlaced scans
+    ranges: np.ndarray  # (B,), metres, NaN where there is no range
+    reasons: np.ndarray  # (B,) of uint8, index into `lms2xx_codec.REASONS`, 0 for a range
+    bearings: np.ndarray  # (B,), radians in the LRF frame, ascending
+    time_s: float  # clock of the host at the first beam
+    beam_times_s: np.ndarray  # (B,), the same for every beam
+    scan_index: int | None  # of the (first) telegram, modulo 256; None where the device does not send it
     telegram_index: int | None
 
 
@@ -392,18 +365,11 @@ AGAIN_S = 0.1
 
 
 class ScanReader:
-    """A thread that reads scans until the event `leave` is set.
+    """A thread that reads scans until the event `leave` is set; `readings`, the last 256, is replaced, never changed.
 
     ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
     ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
-    `interval_s` is that between two readings.
-
-    Attributes
-    ----------
-    readings : list of Reading
-        The last 256; replaced, never changed.
-    handed_s : float
-        Instant of the newest reading that somebody waited for.
+    `interval_s` is that between two readings, `handed_s` the instant of the newest one that somebody waited for.
     """
 
     def __init__(self, receive, recover, interval_s, leave, log, host):

@@ -47,20 +47,11 @@ class Reply:
 
 @dataclass(frozen=True)
 class Received:
-    """What came back after a frame was sent.
-
-    Attributes
-    ----------
-    replies : tuple of Reply
-    echoed : int
-        Bytes of the own frame that a two-wire adapter handed back.
-    skipped : int
-        Bytes that belong to nothing.
-    """
+    """What came back after a frame was sent."""
 
     replies: tuple
-    echoed: int
-    skipped: int
+    echoed: int  # bytes of the own frame that a two-wire adapter handed back
+    skipped: int  # bytes that belong to nothing
 
 
 def encode_frame(address, command1=0, command2=0, data1=0, data2=0):
@@ -78,14 +69,9 @@ def encode_extended(address, opcode, value=0):
 
 
 def split_frames(data):
-    """Find the frames in a stream of commands, whatever lies between them.
+    """The Frames in a stream of commands, of overlapping ones the first, and from where on bytes must be kept.
 
-    Returns
-    -------
-    frames : tuple of Frame
-        Of any address and opcode; of overlapping ones the first.
-    pending : int
-        Bytes from here on must be kept: a frame may begin there whose end has not come yet.
+    A frame may begin there whose end has not come yet.
     """
     data, frames, at = bytes(data), [], 0
     while (at := data.find(SYNC, at)) >= 0 and at + FRAME <= len(data):
@@ -110,24 +96,12 @@ def decode_tilt(value):
 
 
 def split_replies(data, sent=b"", *, complete=False):
-    """Find the replies in what a head, and an adapter that echoes, sent back after one frame.
+    """What a head, and an adapter that echoes, sent back after one frame, as Received.
 
     Every place is tried by length and checksum, the longer kinds first; a place that fits none is skipped. Frames of
-    other senders count as skipped.
-
-    Parameters
-    ----------
-    data : bytes-like
-        All bytes since the frame was sent, in order.
-    sent : bytes-like
-        The frame, length 7. The checksum of 4-byte replies continues its checksum, and its echo, whole or one end of
-        it, is told from replies by comparison with it. Without it none of these is found.
-    complete : bool
-        Nothing more will come: what could still grow is decided now. Otherwise it is left out.
-
-    Returns
-    -------
-    Received
+    other senders count as skipped. The checksum of 4-byte replies continues that of the frame `sent`, and its echo,
+    whole or one end of it, is told from replies by comparison with it. `complete`: nothing more will come, so that what
+    could still grow is decided now; otherwise it is left out.
     """
     data, sent = bytes(data), bytes(sent)
     replies, echoed, skipped = [], 0, 0
@@ -186,10 +160,7 @@ MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is 
 class HeadLine:
     """Line to one head; a lock keeps threads apart. Calls raise LineLost if the port vanished and did not come back.
 
-    Attributes
-    ----------
-    counts : dict
-        'frames' sent, 'echoed' and 'skipped' bytes, 'reconnects'.
+    `counts` has frames sent, bytes echoed and skipped, and reconnects.
     """
 
     def __init__(self, path, settings, log, host=REAL):

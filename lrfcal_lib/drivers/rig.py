@@ -95,33 +95,16 @@ class Rig(Closed):
     def open(cls, stated, *, log=LOG, clock=None, host=REAL, camera=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
-        Parameters
-        ----------
-        stated : RigFile
-        log : logging.Logger
-        clock : callable, optional
-            :func:`host_clock` by default.
-        host : Host
-            Machine that the drivers run on; tests have a VirtualHost.
-        camera : callable, optional
-            Opens a camera by its name, for images that come from elsewhere than the source stated.
-
-        Returns
-        -------
-        Rig
-
-        Raises
-        ------
-        DeviceError
-            With the device in the message; those opened before are closed again.
+        The host is the machine that the drivers run on, its clock :func:`host_clock` by default; ``camera(name)`` opens
+        cameras whose images come from elsewhere than the source stated. DeviceError, with the device in the message:
+        those opened before are closed again.
         """
         common, devices = {"log": log, "clock": clock or host_clock()}, stated.devices
-        lrf = devices.lrf.model_dump(exclude_none=True, exclude={"port", "interlaced"})
-        if devices.lrf.interlaced:  # such a stream chooses its own
-            lrf.pop("variant", None)
+        skipped = {"port", "interlaced"} | ({"variant"} if devices.lrf.interlaced else set())  # it chooses its own
+        asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
         openers = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host, **common),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **lrf, **common),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked, **common),
         }
         camera = camera or partial(_camera, stated, common)
         openers |= {f"camera '{name}'": partial(camera, name) for name in stated.cameras}
@@ -136,8 +119,9 @@ class Rig(Closed):
                 except ValueError as error:
                     raise RigFileError(f"{stated.path}: {name}: {error}") from error
                 stack.callback(opened[-1].close)
-            cameras = dict(zip(stated.cameras, opened[2:], strict=True))
-            rig = cls(stated, opened[1], opened[0], cameras, clock=common["clock"], host=host)
+            head, lrf, *cameras = opened
+            cameras = dict(zip(stated.cameras, cameras, strict=True))
+            rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
             rig._closing = stack.pop_all()
         return rig
 
@@ -184,22 +168,13 @@ class Rig(Closed):
     # ---------------------------------------------------------------------------------------------- recording
 
     def acquire(self, placement):
-        """Record one placement: a generator of events, in the order in which things happen.
+        """Record a Placement of the plan: a generator of Moved, Scanned, Photographed and Tracked, as they happen.
 
-        The Placement is of the plan, which also says how (stop-and-go or continuous).
-
-        Yields
-        ------
-        Moved, Scanned, Photographed or Tracked
-            Scans and images of a stop are later than the instant at which the head came to rest there. In a
-            continuous sweep every scan has the pitch at the instant of its middle beam, interpolated between the
-            head's readings (dead reckoning without them), and is handed out as soon as that is known.
-
-        Raises
-        ------
-        DeviceError
-            Whatever happens, also when the generator is closed: the head is stopped, and the scans are. After a sweep
-            with a head that tells nothing, if the scans are all alike: it did not move.
+        Scans and images of a stop are later than the instant at which the head came to rest there. In a continuous
+        sweep every scan has the pitch at the instant of its middle beam, interpolated between the head's readings (dead
+        reckoning without them), and is handed out as soon as that is known. Whatever happens, also when the generator
+        is closed, the head is stopped, and the scans are. DeviceError, too, after a sweep with a head that tells
+        nothing if the scans are all alike: it did not move.
         """
         sweep, seen = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go, []
         try:
@@ -338,17 +313,8 @@ def unchanged(scans):
 
     By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
     something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same wall
-    at any pitch: a head that moves is never accused, one that does not is believed where much else moves.
-
-    Parameters
-    ----------
-    scans : sequence of array_like, shape (B,)
-        Ranges in the order in which they were taken, metres; beams without a range in one of them do not count.
-
-    Returns
-    -------
-    bool
-        False where no beam has a range in all scans.
+    at any pitch: a head that moves is never accused, one that does not is believed where much else moves. Beams without
+    a range in one of the scans, (B,) each, do not count; False where all lack one.
     """
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]

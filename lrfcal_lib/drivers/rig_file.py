@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, StrictBool, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, StrictBool, StrictStr, model_validator
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.drivers.head import HeadSettings
-from lrfcal_lib.drivers.stated import Angle, Stated, Text, number, several, whole
+from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, from_json, parse_session, refused
 
@@ -22,6 +21,42 @@ STOPS = f"first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS
 
 class RigFileError(ValueError):
     """A rig file that cannot be used: the message names the file, the key, the value and what to do about it."""
+
+
+class Stated(BaseModel, frozen=True):
+    """An object of a rig file: null is as good as left out, and keys that it does not have are refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def known(cls, data):
+        """The values that are stated."""
+        for key in data if isinstance(data, dict) else ():
+            if key not in cls.model_fields:
+                raise ValueError(f"{key} is not known; known are {', '.join(cls.model_fields)}")
+        return {k: v for k, v in data.items() if v is not None} if isinstance(data, dict) else data
+
+
+def number(least, most, unit="", kinds=(int, float), what="a number"):
+    """A number within limits; NaN is in none, and true is no number."""
+    words = f"{what} from {least} to {most} {unit}".rstrip() + " is needed"
+    return Annotated[Any, refused(lambda value: type(value) not in kinds or not least <= value <= most, words)]
+
+
+def whole(least, most):
+    """A whole number within limits."""
+    return number(least, most, kinds=(int,), what="a whole number")
+
+
+def several(kind, count):
+    """So many values of a kind."""
+    return Annotated[tuple[kind, ...], refused(lambda values: len(values) != count, f"a list of {count} is needed")]
+
+
+Text = Annotated[StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")]
+Angle = number(-180, 180, "deg")
+Perhaps = Literal["auto", True, False]
+Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01, 360, "deg/s")
+ORDER = "the lower one comes first"
 
 
 class LrfDevice(Stated):
@@ -38,6 +73,57 @@ class LrfDevice(Stated):
     measuring_mode: whole(0, 6) = None
     realtime_indices: StrictBool = None
     interlaced: StrictBool = None
+
+
+class HeadSettings(Stated):
+    """Settings of a Pelco-D head; ValueError for values that no head can have.
+
+    Nothing is published about the Ya An YA3050, so all defaults are assumptions.
+    """
+
+    address: whole(0, 255) = 1  # the usual factory setting of the DIP switches
+    baudrate: whole(50, 4_000_000) = 2400  # the most common default; 9600 is the next
+    # Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not state
+    # it means true: a silent head may as well be one with another address or rate.
+    feedback: Perhaps = "auto"
+    # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
+    absolute: Perhaps = "auto"
+    # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed; true makes a missing
+    # one an error (the adapter is dead), false makes one a warning.
+    echo: Perhaps = "auto"
+    # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
+    pitch_limits_deg: Annotated[several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)] = (-60.0, 60.0)
+    position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
+    invert: StrictBool = False  # it hangs upside down or counts the other way: its "up" lowers the view
+    tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
+    # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed heads, until it was
+    # learnt, and the log says so.
+    degrees_per_second: Annotated[
+        several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
+    ] = None
+    # From the motion frame to the movement, less what it runs on after the stop.
+    start_delay_s: number(-10, 10, "s") = 0.0
+    start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
+    tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
+    arrival_deg: Near = 0.5  # a move that ends this near has arrived; its settled pitch counts
+    settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
+    stall_s: Seconds = 1.5  # rest elsewhere for this long: it does not get to where it was sent
+    poll_s: Seconds = 0.1  # between queries while it moves
+    reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
+    gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
+    retries: whole(0, 20) = 3  # queries repeated when no reply came
+    sends: whole(1, 20) = 1  # motion frames in a row: 2 on weak lines; stops are sent twice in any case
+    repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
+    reconnect_s: number(0, 3600, "s") = 3.0  # a call waits this long for a vanished port to come back
+
+    def elevation(self, pitch):
+        """What the head calls a pitch, rad."""
+        return math.radians(self.position_zero_deg) + (-pitch if self.invert else pitch)
+
+    def pitch(self, elevation):
+        """The pitch of an elevation that the head tells, rad, in [-pi, pi)."""
+        turn = (elevation - math.radians(self.position_zero_deg) + math.pi) % math.tau - math.pi
+        return -turn if self.invert else turn
 
 
 class HeadDevice(HeadSettings):
@@ -98,23 +184,12 @@ class ListedPlacement(Stated):
 
 @dataclass(frozen=True)
 class Placement:
-    """What is recorded while the board stays where it is.
-
-    Attributes
-    ----------
-    number : int
-    pitch : ndarray, shape (n,)
-        Where scans are taken, radians, in the order of motion; of a continuous sweep its ends.
-    image_pitch : tuple of float
-        Where images are taken, radians.
-    purpose : {'board', 'scene'}
-        Of the images.
-    """
+    """What is recorded while the board stays where it is."""
 
     number: int
-    pitch: np.ndarray
-    image_pitch: tuple[float, ...]
-    purpose: str = "board"
+    pitch: np.ndarray  # where scans are taken, radians, in the order of motion; of a continuous sweep its ends
+    image_pitch: tuple[float, ...]  # where images are taken, radians
+    purpose: str = "board"  # of the images, or "scene"
 
     @property
     def direction(self):
@@ -162,22 +237,14 @@ class Plan(Stated):
 
 @dataclass(frozen=True)
 class RigFile:
-    """A rig file; RigFileError if its head or its laser range finder cannot do the plan.
-
-    Attributes
-    ----------
-    about : dict
-        licence, source, simulated.
-    platform_sigma : (float, float)
-        How well the platform is known: direction (radians) and offset (metres).
-    """
+    """A rig file; RigFileError if its head or its laser range finder cannot do the plan."""
 
     path: Path
-    about: dict
+    about: dict  # licence, source, simulated
     board: Board
     lrf: LrfInfo
     T_head_lrf: RigidTransform | None
-    platform_sigma: tuple[float, float]
+    platform_sigma: tuple[float, float]  # how well the platform is known: direction (radians) and offset (metres)
     cameras: dict[str, CameraInfo]
     devices: Devices
     plan: Plan

@@ -32,17 +32,8 @@ CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 class MjpegStream:
     """Reads like cv2.VideoCapture; `timeout` in s, to connect and between any two bytes.
 
-    Attributes
-    ----------
-    multipart : bool
-        The answer is a stream of images; anything else is not read.
-    waited : bool
-        The frame grabbed last was waited for; otherwise it came at some time since the one before.
-
-    Raises
-    ------
-    OSError
-        If nothing answers, or the URL names no host.
+    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was
+    waited for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names none.
     """
 
     def __init__(self, url, timeout):
@@ -168,21 +159,11 @@ def find_source(source, silence_s):
 
 @dataclass(frozen=True)
 class Frame:
-    """One image.
+    """One image."""
 
-    Attributes
-    ----------
-    image : ndarray of uint8, shape (height, width, 3)
-        BGR.
-    time_s : float
-        Host time at which it was grabbed; the exposure was before it.
-    index : int
-        Frames grabbed before it; gaps are frames that nobody asked for in time.
-    """
-
-    image: np.ndarray
-    time_s: float
-    index: int
+    image: np.ndarray  # (height, width, 3) of uint8, BGR
+    time_s: float  # host time at which it was grabbed; the exposure was before it
+    index: int  # frames grabbed before it; gaps are frames that nobody asked for in time
 
 
 class Camera(Closed):

@@ -235,10 +235,9 @@ def minimise_in_rounds(freeze, state, retract, rounds, **options):
 
 def solve(
     evaluate, start, retract, *, names, method, read, scales=None, words=None, groups=None, freedom=None, shared=None,
-    loss=None, scale=1.0, max_iterations=60, tolerance=1e-8, required=True, n_observations=None, limit=1.0,
-    chi2_rest=0.0, earlier=(),
+    loss=None, scale=1.0, required=True, n_observations=None, limit=1.0, chi2_rest=0.0, earlier=(), **options,
 ):  # fmt: skip
-    """Minimise (see :func:`minimise`), then report covariances and what was not observed: a Solution.
+    """Minimise (see :func:`minimise` and its options), then report covariances and what was not observed: a Solution.
 
     `names` are those of the unknowns reported (with `shared`, the shared ones), `read` makes ``(transform or None,
     parameters)`` of a state, `scales` and `limit` are those of :func:`null_space`, `words` puts a direction (k,) into
@@ -253,8 +252,8 @@ def solve(
     axes = -1 if shared is None else (-2, -1)
     if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
         raise ValueError(f"{method}: residuals at the start value are not finite: check the observations and T0")
-    about = {"shared": shared, "loss": loss, "scale": scale, "max_iterations": max_iterations, "tolerance": tolerance}
-    state, converged, iterations, history = minimise(evaluate, start, retract, **about)
+    options |= {"shared": shared, "loss": loss, "scale": scale}
+    state, converged, iterations, history = minimise(evaluate, start, retract, **options)
     parts = [(*whiten(block), _weigh(block, loss, scale, axes)[0]) for block in _blocks(evaluate, state)]
     r, J, weights = (np.concatenate([p[i] for p in parts], axis=-1 if i != 1 else -2) for i in range(3))
     hessians, scores = _by_placement(r, J, weights, groups, shared)

@@ -28,7 +28,10 @@ def check_finite(record, whose="", missing=()):
 
 
 def rows(*shape, of, each=0.0):
-    """A field of arrays with a row for each member of a group; `each` row is this by default, None: its number."""
+    """A field of arrays with a row for each member of a group: `each` row is this by default, None: its number.
+
+    Of groups of which nothing is given there are no rows.
+    """
     return field(default=None, metadata={"shape": shape, "of": of, "each": each})
 
 
@@ -206,7 +209,7 @@ class CameraObservations(_Groups):
         return replace(out, placements=self.placements[known], **{name: getattr(self, name)[known] for name in boards})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlatformObservations(_Groups):
     """Edge points and face points of boards swept by the pitching LRF.
 
@@ -222,17 +225,18 @@ class PlatformObservations(_Groups):
         1 or 2: the two perpendicular edges of equations (7) to (14).
     """
 
-    edge_points: np.ndarray
-    edge_covariance: np.ndarray
-    edge_pitch: np.ndarray
-    edge_placement: np.ndarray
-    edge_number: np.ndarray
-    face_points: np.ndarray
-    face_covariance: np.ndarray
-    face_pitch: np.ndarray
-    face_placement: np.ndarray
+    edge_points: np.ndarray = rows(3, of="edge")
+    edge_covariance: np.ndarray = rows(3, 3, of="edge")
+    edge_pitch: np.ndarray = rows(of="edge")
+    edge_placement: np.ndarray = rows(of="edge", each=0)
+    edge_number: np.ndarray = rows(of="edge", each=1)
+    face_points: np.ndarray = rows(3, of="face")
+    face_covariance: np.ndarray = rows(3, 3, of="face")
+    face_pitch: np.ndarray = rows(of="face")
+    face_placement: np.ndarray = rows(of="face", each=0)
 
     def __post_init__(self):
+        self.fill()
         check_finite(self)
         if not np.isin(self.edge_number, (1, 2)).all():
             found = np.unique(self.edge_number)
@@ -242,7 +246,7 @@ class PlatformObservations(_Groups):
 GROUPS = ("face", "beam", "view")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JointObservations(_Groups):
     """Ranges on boards, beams about their edges and board poses in images, of all placements.
 
@@ -289,24 +293,24 @@ class JointObservations(_Groups):
     placements: np.ndarray
     direction: np.ndarray
     middle: np.ndarray
-    face_range: np.ndarray
-    face_bearing: np.ndarray
-    face_pitch: np.ndarray
-    face_sigma: np.ndarray
-    face_placement: np.ndarray
-    beam_bearing: np.ndarray
-    beam_pitch: np.ndarray
-    beam_hit: np.ndarray
-    beam_edge: np.ndarray
-    beam_radius: np.ndarray
-    beam_background: np.ndarray
-    beam_step: np.ndarray
-    beam_placement: np.ndarray
-    view_camera: np.ndarray
-    view_pitch: np.ndarray
-    view_pose: np.ndarray
-    view_covariance: np.ndarray
-    view_placement: np.ndarray
+    face_range: np.ndarray = rows(of="face")
+    face_bearing: np.ndarray = rows(of="face")
+    face_pitch: np.ndarray = rows(of="face")
+    face_sigma: np.ndarray = rows(of="face")
+    face_placement: np.ndarray = rows(of="face", each=0)
+    beam_bearing: np.ndarray = rows(of="beam")
+    beam_pitch: np.ndarray = rows(of="beam")
+    beam_hit: np.ndarray = rows(of="beam", each=False)
+    beam_edge: np.ndarray = rows(of="beam", each=0)
+    beam_radius: np.ndarray = rows(of="beam")
+    beam_background: np.ndarray = rows(of="beam")
+    beam_step: np.ndarray = rows(of="beam")
+    beam_placement: np.ndarray = rows(of="beam", each=0)
+    view_camera: np.ndarray = rows(of="view", each=0)
+    view_pitch: np.ndarray = rows(of="view")
+    view_pose: np.ndarray = rows(4, 4, of="view")
+    view_covariance: np.ndarray = rows(6, 6, of="view")
+    view_placement: np.ndarray = rows(of="view", each=0)
     edges: tuple
     corners: np.ndarray
     cameras: tuple
@@ -316,7 +320,7 @@ class JointObservations(_Groups):
     lens_covariance: np.ndarray = rows(9, 9, of="camera")
 
     def __post_init__(self):
-        self.fill(view=len(self.view_camera), camera=len(self.cameras))
+        self.fill(view=0 if self.view_pose is None else len(self.view_pose), camera=len(self.cameras))
         check_finite(self)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")

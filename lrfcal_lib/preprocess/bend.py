@@ -144,10 +144,7 @@ def board_bends(prepared, to_board=None):
 
 
 def face_of(scan, board=None, to_board=None):
-    """The face of a scanned board (BoardScan) in coordinates of its plane.
-
-    In board coordinates with `to_board` (see :func:`board_bends`), else in arbitrary ones of the plane.
-    """
+    """The face of a scanned board in board coordinates with `to_board`, else in arbitrary ones of its plane."""
     p_lrf, pitch, _ = face_points(scan, MOST_POINTS, MARGIN)
     points, origin = (lrf_to_platform(p, pitch, scan.T_head_lrf) for p in (p_lrf, np.zeros_like(p_lrf)))
     by_range = (points - origin) @ scan.normal / np.linalg.norm(p_lrf, axis=1)
@@ -169,10 +166,7 @@ def around_pattern(flat, board):
 
 
 def common_level(faces):
-    """How much farther the board around the pattern reads than the pattern: median over placements, and its sigma.
-
-    Metres; nan with fewer than four faces that show both materials.
-    """
+    """How much farther the board reads than its pattern, and the sigma of that, metres; nan below four faces."""
     levels = []
     for face in faces:
         known = np.isfinite(face.around)

@@ -225,10 +225,7 @@ def mirrored_pose(pose, pattern):
 
 
 def pose_from_edges(edges, board, model, start, covariance=None):
-    """Pose of a board from its image lines, its covariance, and chi-square.
-
-    Three or more edges, unless the start pose is an observation of its own (the pattern's corners) with a covariance.
-    """
+    """Pose from image lines (three, unless the start is an observation with a covariance), covariance, chi-square."""
     white = np.zeros((0, 6)) if covariance is None else np.linalg.inv(np.linalg.cholesky(covariance))
     start = pose = pose_array(start)
     step, rounds = np.ones(6), POSE_ROUNDS
@@ -286,10 +283,9 @@ def _views_plain(view, image, board, model, picks):
 
 
 def find_polygon(image, n_corners):
-    """Corners (n, 2) of the largest dark region that is a convex polygon, to about a pixel (recorded pixels).
+    """Corners (n, 2) of the largest dark convex polygon, to about a recorded pixel, in the turning sense right to down.
 
-    The turning sense is that of x to y in the image (right to down). OutlineNotFound if no dark region looks like such
-    a polygon, or if it is cut by the image border.
+    OutlineNotFound if no dark region looks like such a polygon, or if it is cut by the image border.
     """
     picture = cv2.GaussianBlur(grey(image), (0, 0), 1.0)
     level = cv2.threshold(picture, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]

@@ -38,8 +38,8 @@ def depth_jump(ranges, step):
 def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
     """Cut scan lines at depth discontinuities; step (i) of the paper's preprocessing.
 
-    A change of range above `jump` (times the number of steps between two returns) ends a piece, and so does a gap of
-    more than `bridge` beams. Returns the number of the piece, ascending along the lines, -1 where there is no return.
+    A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams. Returns the number
+    by beam, ascending along the lines, -1 where there is no return.
     """
     seen = np.isfinite(ranges)
     line, beam = np.nonzero(seen)

@@ -71,7 +71,7 @@ class OutlineNotSeen(ValueError):
 def sample(image, model, uv):
     """Colours (..., channels) at undistorted pixels (..., 2), bilinear; NaN outside the image.
 
-    `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid, so the weights are computed here.
+    `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
     image = image.reshape(*image.shape[:2], -1)
     normalised = (uv - [model.cx, model.cy]) / [model.fx, model.fy]
@@ -94,10 +94,9 @@ def sample(image, model, uv):
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
-    """Height of the step at every place of a strip (across, along, channels): derivative of a Gaussian across the edge.
+    """Height of the step at every place of a strip (across, along, channels), grey levels; 0 where it leaves the image.
 
-    `sigma` is that of the Gaussian in samples; `along` profiles are averaged along the edge. Norm over the colours,
-    grey levels; 0 where the profile leaves the image.
+    Derivative of a Gaussian of `sigma` samples across the edge, of `along` averaged profiles, norm over the colours.
     """
     gone = np.isnan(strip).any(axis=-1)
     filled = uniform_filter1d(np.where(gone[..., None], 0, strip), along, axis=1)
@@ -160,10 +159,7 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
 
 
 def correlation_factor(column, residual, window=3.0):
-    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``; gaps in the columns are allowed.
-
-    Sokal's window: lags are summed up to `window` times the integral itself. At least 1.
-    """
+    """Integrated autocorrelation of residuals along the edge (Sokal's window), ``1 + 2 sum rho``, at least 1."""
     column, length = column - column.min(), int(np.ptp(column)) + 1
     series, seen = np.zeros((2, length))
     series[column], seen[column] = residual, 1.0
@@ -261,10 +257,9 @@ def wide_distances(pattern):
 
 
 def edge_votes(image, board, model, pose):
-    """Share of the profiles that agree on an edge, by side of the pattern (SIDES) and distance outside it, (4, n).
+    """Share of the profiles that agree on an edge, by side of the pattern and :func:`wide_distances` of it, (4, n).
 
-    At :func:`wide_distances`; `pose` is ``T_camera_board``. NaN where less than 30 % of the profiles lie inside the
-    image.
+    NaN where less than 30 % of the profiles lie inside the image.
     """
     pattern, distances = board.pattern, wide_distances(board.pattern)
     size = np.array([pattern.columns - 1, pattern.rows - 1]) * pattern.square
@@ -291,10 +286,7 @@ def on_board(xy, pose, model):
 
 
 def common_lines(votes, board):
-    """Board lines (4, 3) of the edges that many views agree on, from votes (v, 4, n) that are turned alike.
-
-    OutlineNotSeen names an edge on which they do not agree.
-    """
+    """Board lines (4, 3) that views with votes (v, 4, n), turned alike, agree on; OutlineNotSeen names an edge."""
     # an edge moves by a few millimetres between placements
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), 7, axis=-1)
     wide[wide < 0] = np.nan
@@ -315,8 +307,7 @@ def common_lines(votes, board):
 def outer_peak(votes, least=0.5, quiet=0.2, width=6):
     """Place of the board's edge in the votes (n,) of one side: the last line before the clutter begins; -1 if none.
 
-    `least` is the share of profiles that makes a line; the board between two of its lines (the border of the sheet, the
-    edge) shows less than `quiet`; `width` samples around a line belong to it.
+    Two lines of a board (the border of the sheet, the edge) are `width` samples wide and `quiet` in between.
     """
     best, start = -1, 0
     for i in np.nonzero(votes >= least)[0]:

@@ -38,8 +38,7 @@ def beyond(scan, line, beam, step, beams=3):
 def background_odds(here, behind):
     """What the background adds to the log odds of the board's share of a spot at which readings flip.
 
-    ``2 ln(here / behind)`` for ranges of the board and of what stands behind it, the inverse square law; 0 where
-    nothing is seen behind, or so close behind that both give one echo.
+    ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both give one echo.
     """
     behind = np.asarray(behind, float)
     apart = np.isfinite(behind) & (behind - here >= MIXING)
@@ -343,10 +342,7 @@ def _warp(scan, line, beam, end):
 
 
 def _inflation(by_angle, sigma, side, sides):
-    """How much more the points of a side scatter about it than their spacing explains, at least 1, for each point.
-
-    `by_angle` is the derivative of the points by the angle that `sigma` belongs to, nominal platform frame.
-    """
+    """How much more the points of a side scatter than their spacing (along `by_angle`) explains, at least 1, (n,)."""
     out = np.ones(len(side))
     for s in sides:
         mine = side == s.side

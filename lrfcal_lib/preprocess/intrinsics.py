@@ -146,7 +146,7 @@ def moved(state, step):
 def adjust_robust(pixels, points, models, poses, mounting=None, **options):
     """As :func:`adjust`, without corners far off the rest (glare, a shadow): NaN in `residuals`.
 
-    Every corner is judged again after each adjustment, so that one that was pulled out by its neighbour comes back.
+    Every corner is judged again in every round, so that one that its neighbour pulled out comes back.
     """
     result = adjust(pixels, points, models, poses, mounting, **options)
     used = np.isfinite(result.residuals)
@@ -210,10 +210,7 @@ def estimate_intrinsics(pixels, pattern, size, *, relief=False):
 
 
 def estimate_relief(pixels, pattern, model):
-    """Shape of a wavy sheet from views by a camera with known intrinsics: an Adjustment.
-
-    Its `relief` is zero where the Bayesian information criterion prefers a flat sheet.
-    """
+    """Shape of a wavy sheet with known intrinsics: an Adjustment, without relief where the BIC prefers none."""
     poses = RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in pixels])
     pixels, points = np.asarray(pixels, float)[None], pattern.points()
     wavy = adjust_robust(pixels, points, [model], poses, basis=waves(points), intrinsics=False)

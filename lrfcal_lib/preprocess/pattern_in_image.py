@@ -56,9 +56,8 @@ class PatternFinder:
                 break
         corners = sectors(picture, size) if rough is None else _smoothest(picture, size, rough)
         if corners is None or not _ends_in_squares(picture, corners, size):
-            raise PatternNotFound(
-                f"no chessboard with {size[0]} x {size[1]} inner corners in the image: it must be whole, and not glare"
-            )
+            looks_for = f"no chessboard with {size[0]} x {size[1]} inner corners"
+            raise PatternNotFound(f"{looks_for} in the image: it must be whole, and not glare")
         grid = corners.reshape(size[1], size[0], 2)
         x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
         clockwise = x[0] * y[1] - x[1] * y[0] > 0
@@ -107,8 +106,7 @@ def _smoothest(picture, size, rough):
 def grid_noise(corners, size):
     """Root mean square distance of a chessboard's corners (row by row) from a smooth grid, pixels.
 
-    A homography (perspective) and polynomials of third order of what it leaves (lens distortion, a bent sheet) are
-    taken out; of second order where there are less than 16 corners.
+    Smooth are a homography and polynomials of third order (second below 16 corners): lens distortion, a bent sheet.
     """
     y, x = (np.mgrid[: size[1], : size[0]] / (max(size) - 1) * 2 - 1).reshape(2, -1)
     order = 3 if len(x) >= 16 else 2
@@ -159,10 +157,9 @@ def pattern_orders(pattern, mirrored=True):
 
 
 def spread_views(pixels, count):
-    """Which views of a pattern (their corners, k by 2) differ most: by place, size and tilt in the image.
+    """Which views of a pattern (their corners, k by 2) differ most: at most `count` places, the largest view first.
 
-    Returns at most `count` places in `pixels`, the largest view first. Each of the others is the one whose corners lie
-    farthest from those of all views before it.
+    Each of the others is the one whose corners lie farthest from those of all views before it.
     """
     if not len(pixels):
         return []

@@ -164,10 +164,7 @@ def board_hull(view, model):
 
 
 def steadiness_of(camera, images, reference_image, reference, model, hulls=None):
-    """The same as :func:`camera_steadiness` for (placement, image) pairs at hand, in the order of recording.
-
-    `reference_image` is that of the placement `reference`, `hulls` by placement are what to leave out, pixels.
-    """
+    """The same for (placement, image) pairs in the order of recording, the reference image, and hulls by placement."""
     hulls, motions, problems = hulls or {}, {reference: (np.zeros(3), 1.0, np.zeros((4, 4)))}, {}
     level, mask = even_contrast(reference_image), outside(hulls.get(reference), reference_image.shape[:2])
     features, order = find_features(reference_image, mask), []
@@ -263,8 +260,7 @@ def fit_motion(start, end, model):
 def motion_misses(first, second, turn, scale):
     """Observed minus predicted normalised coordinates (n, 2), and the derivative of the prediction (n, 2, 4).
 
-    `first` and `second` (n, 2) are without lens distortion; `turn` (a Rotation) is that of the background in the camera
-    frame, its derivative that of a further small turn from the left.
+    By a small turn of the background from the left, camera frame, and by the scale; without lens distortion.
     """
     rays = turn.apply(np.column_stack([first, np.ones(len(first))]))
     x, y = (rays[:, :2] / rays[:, 2:]).T

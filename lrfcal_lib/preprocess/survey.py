@@ -71,10 +71,7 @@ class Outline:
 
 
 def views_of(session, models=None, *, one_per_placement=False):
-    """The board in all images of a session: :func:`survey` of its records.
-
-    `models` (by camera) replace the session's intrinsics; a camera without any gets an estimate from its images.
-    """
+    """:func:`survey` of a session's images; `models` by camera replace its intrinsics, missing ones are estimated."""
     known = {name: info.model for name, info in session.cameras.items()} | dict(models or {})
     records = [r for r in session.images() if r.purpose in ("board", "intrinsics")]
     return survey(records, session.read_image, session.board, known, session.picks, one_per_placement=one_per_placement)
@@ -110,9 +107,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     read, marks = lru_cache(maxsize=REMEMBERED_IMAGES)(read), _marks(picks, board)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
-        raise ValueError(
-            f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with: state them"
-        )
+        lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
+        raise ValueError(f"{lost}: state them")
     finder = None if plain else PatternFinder(board.pattern)
 
     def look(r, view, models, **options):
@@ -148,7 +144,7 @@ def all_views(prepared):
     scans bear the names of that turn. Where every placement has one image these are the prepared views.
     """
     session, board, views = prepared.session, prepared.board, {camera: [] for camera in prepared.views}
-    records = [r for r in session.images(purpose="board") if r.placement >= 0 and r.camera in views]
+    records = [r for r in session.images(purpose="board") if r.placement in prepared.views.get(r.camera, {})]
     if len(records) <= sum(map(len, prepared.views.values())) or board.pattern is None:
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
     marks, finder, orders = _marks(session.picks, board), PatternFinder(board.pattern), pattern_orders(board.pattern)

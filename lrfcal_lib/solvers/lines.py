@@ -50,7 +50,7 @@ def point_block(pose, obs):
     return Block(errors.reshape(shape), rows, np.linalg.inv(np.linalg.cholesky(noise)), corrected=corrected)
 
 
-def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=True, **options):
+def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, **options):
     """The pose (..., 3, 4) of a camera by least squares, from ``residual(pose, obs) -> Block``.
 
     `uses` is the kind of observations that the residual has rows of. Without weights every residual counts the same:
@@ -76,7 +76,7 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, required=
     groups = getattr(obs, f"{uses}_placement")
     return solve(
         problem, pose, move_pose, names=geometry.POSE_NAMES, method=method, read=read_pose, groups=groups,
-        words=lambda d: geometry.motion_words(d, obs.camera), required=required, earlier=earlier, **options,
+        words=lambda d: geometry.motion_words(d, obs.camera), earlier=earlier, **options,
     )
 
 
@@ -141,7 +141,7 @@ def estimate_likely(residual, obs, pose, *, method, uses):
     `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The softness of the flips is
     estimated too, and held while the covariance is computed. Start value is the estimate from lines.
     """
-    pose = estimate_pose(line_block, obs, pose, method=method, uses=uses, required=False).state
+    pose = minimise(lambda pose: line_block(pose, obs), pose, move_pose)[0]
     sight, lengths = sight_normals(obs.crossing_lines, obs.model)
 
     def freeze(state, number):
