@@ -96,7 +96,7 @@ def test_the_joint_estimate_asks_for_errors_of_every_sweep(lms400):
 
 
 def test_the_cloud_is_coloured(lms400):
-    cloud = pipeline.color_cloud(lms400, every=50)
+    cloud = pipeline.color_cloud(lms400)
     assert cloud.seen.mean() > 0.9
     assert cloud.colors[cloud.seen].std() > 30  # the pattern shows
 

@@ -1,15 +1,36 @@
-"""Colouring, occlusion and measuring edges."""
+"""Reconstruction: occlusion, lenses, exposures, mixed pixels, normals, files, and measured boards."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct as rec
-from lrfcal_lib.calibrate.outline import measure_board
+from lrfcal_lib.calibrate.outline import as_recorded, measure_board
+from lrfcal_lib.evaluate.export import write_pcd
+from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.session.read import Sweep
+from lrfcal_lib.session.stated import LrfInfo
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
+WIDE = CameraModel(64, 48, 22.0, 22.0, 31.5, 23.5, np.array([-0.25, 0.02, 0.0, 0.0, 0.0]))  # 110 deg, folds
+STILL = RigidTransform.identity()
+AHEAD = RigidTransform.from_rotation(Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))  # looks along y
+STEP = np.radians(0.25)
+BEARINGS = np.radians(np.arange(60, 120.1, 0.25))
+PITCH = np.radians(np.arange(-6, 6.1, 0.25))
+LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), STEP, 0.005, spot_exit=0.016, spot_divergence=0.0119)
+
+
+def view(image, model=MODEL, pose=STILL, number=0, camera="left"):
+    return rec.View(number, camera, pose, model, np.asarray(image, np.uint8))
+
+
+def plain_image(level=90):
+    return np.full((48, 64, 3), level)
 
 
 def grid(z, half=0.2, n=40):
@@ -17,40 +38,239 @@ def grid(z, half=0.2, n=40):
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
 
 
+def paint(points, *views, step=0.04, noise=0.03):
+    painter = rec.Painter(views, step, noise)
+    painter.hide(points)
+    return painter.paint(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
+
+
+def plainly(points, normals, seen_from, step, noise):
+    """What the compiled loops do, in NumPy, for one view."""
+    model, p = seen_from.model, seen_from.T_camera_platform.apply(points)
+    uv, distance, cell = project(p, model), np.linalg.norm(p, axis=1), max(2.0, 2 * step * model.fx)
+    inside = np.all((uv >= -0.5) & (uv < [model.width - 0.5, model.height - 0.5]), axis=1)
+    inside &= (p[:, :2] ** 2).sum(axis=1) < rec.fold(model) * p[:, 2] ** 2
+    index = (np.where(inside[:, None], uv + 0.5, 0) // cell).astype(int) @ [1, 1000]
+    nearest = np.full(100_000, np.inf)
+    np.minimum.at(nearest, index[inside], distance[inside])
+    cosine = np.clip(np.abs(np.sum(seen_from.T_camera_platform.rotation.apply(normals) * p, axis=1)) / distance, 0.1, 1)
+    slack = noise + cell / model.fx * distance * np.sqrt(1 - cosine**2) / cosine
+    seen = inside & (distance <= nearest[index] + slack)
+    u, v = np.clip(uv[seen], 0, [model.width - 1, model.height - 1]).T
+    i, j = np.minimum(v.astype(int), model.height - 2), np.minimum(u.astype(int), model.width - 2)
+    f, g, image = (u - j)[:, None], (v - i)[:, None], seen_from.image.astype(float)
+    top, low = image[i, j] * (1 - f) + image[i, j + 1] * f, image[i + 1, j] * (1 - f) + image[i + 1, j + 1] * f
+    return seen, (top * (1 - g) + low * g)[:, ::-1]
+
+
+@pytest.mark.parametrize("model", [MODEL, WIDE])
+def test_compiled_loops_do_what_plain_numpy_does(model):
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-2, -2, -1], [2, 2, 4], (20_000, 3)).astype(np.float32).astype(float)
+    normals = rng.normal(size=points.shape).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.1, 0.2, 0]))
+    one = view(rng.integers(10, 240, (48, 64, 3)), model, turned)
+    painter = rec.Painter([one], 0.02, 0.03)
+    painter.hide(points)
+    colors, seen, source = painter.paint(points, normals)
+    expected, their_colors = plainly(points, normals, one, 0.02, 0.03)
+    assert (seen != expected).sum() <= 2  # a rounding at the border of a cell
+    both = seen[expected]
+    np.testing.assert_allclose(colors[expected][both], their_colors[both], atol=0.01)
+    assert (source[seen] == 0).all() and (source[~seen] == -1).all() and 500 < seen.sum() < 15_000
+
+
 def test_a_near_wall_hides_a_far_one():
     near, far = grid(1.0), grid(2.0, 0.3)
-    points = np.vstack([near, far])
-    colors, _ = rec.color_points(points, np.full((48, 64, 3), 7, np.uint8), RigidTransform.identity(), MODEL)
-    assert np.isfinite(colors[: len(near)]).all() and np.isnan(colors[len(near) :]).all()
+    _, seen, _ = paint(np.vstack([near, far]), view(plain_image()))
+    assert seen[: len(near)].all() and not seen[len(near) :].any()
+
+
+def test_a_slanted_floor_does_not_hide_itself():
+    x, z = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(0.8, 6, 400))
+    floor = np.column_stack([x.ravel(), np.full(x.size, 0.3), z.ravel()])
+    painter = rec.Painter([view(plain_image())], 0.04, 0.01)
+    painter.hide(floor)
+    inside = project(floor, MODEL)[:, 1] < 47
+    assert painter.paint(floor, np.tile([0.0, -1, 0], (len(floor), 1)))[1][inside].mean() > 0.99
 
 
 def test_colours_are_interpolated_and_turned_to_rgb():
     u, v = np.meshgrid(np.arange(64), np.arange(48))
-    image = np.stack([u, 2 * v, np.full_like(u, 9)], -1).astype(np.uint8)
-    colors, uv = rec.color_points(np.array([[0.01, 0.02, 1.0]]), image, RigidTransform.identity(), MODEL)
-    np.testing.assert_allclose(colors[0], [9, 2 * uv[0, 1], uv[0, 0]], atol=0.6)
+    points = np.array([[0.01, 0.02, 1.0]])
+    colors, _, _ = paint(points, view(np.stack([u, 2 * v, np.full_like(u, 9)], -1)))
+    at = project(points, MODEL)[0]
+    np.testing.assert_allclose(colors[0], [9, 2 * at[1], at[0]], atol=0.01)
 
 
-def test_points_outside_or_behind_are_not_coloured():
-    points = np.array([[5.0, 0, 1], [0, 0, -1]])
-    colors, _ = rec.color_points(points, np.zeros((48, 64, 3), np.uint8), RigidTransform.identity(), MODEL)
-    assert np.isnan(colors).all()
+@pytest.mark.parametrize("point", [[5.0, 0, 1], [0, 0, -1], [np.nan, 0, 1]])
+def test_points_outside_behind_or_unknown_are_not_coloured(point):
+    colors, seen, source = paint(np.array([point]), view(plain_image()))
+    assert not seen.any() and np.isnan(colors).all() and (source == -1).all()
 
 
-def test_blend_averages_only_what_is_seen():
-    a, b = np.array([[10.0] * 3, [np.nan] * 3, [np.nan] * 3]), np.array([[20.0] * 3, [30.0] * 3, [np.nan] * 3])
-    colors, seen = rec.blend([a, b])
-    assert colors[:, 0].tolist() == [15, 30, 128] and seen.tolist() == [True, True, False]
+def test_nothing_is_coloured_beyond_the_fold_of_a_lens():
+    angle = np.radians(np.arange(0, 89, 0.5))
+    fan = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    ghosts = (project(fan, WIDE)[:, 0] < 64) & (np.tan(angle) ** 2 > rec.fold(WIDE))
+    _, seen, _ = paint(fan, view(plain_image(), WIDE), step=0.001)
+    assert ghosts.sum() > 10 and not seen[ghosts].any() and seen[angle < np.radians(40)].all()
+    assert rec.fold(MODEL) == np.inf
 
 
-def test_ply_round_trip(tmp_path):
+def test_exposures_are_compared_and_taken_off():
+    rng, points = np.random.default_rng(0), grid(1.0, 0.25, 60)
+    base = np.repeat(rng.uniform(60, 90, (6, 8)).repeat(8, 0).repeat(8, 1)[..., None], 3, -1)
+    v, u = np.mgrid[:48, :64]
+    fall = 1 - 0.2 * ((u - 31.5) ** 2 + (v - 23.5) ** 2)[..., None] / (0.25 * (48**2 + 64**2))
+    shifts = np.array([[0, 0], [0.2, 0.05], [-0.2, 0.1], [0.1, -0.1]])
+    views = []
+    for k, ((x, y), gain) in enumerate(zip(shifts, (1.0, 1.5, 0.7, 2.0), strict=True)):
+        at = np.roll(base, np.rint([50 * y, 50 * x]).astype(int), (0, 1))
+        views.append(view(np.rint(at * fall * gain), pose=RigidTransform.from_translation([x, y, 0]), number=k))
+    painter, ahead = rec.Painter(views, 0.02, 0.03), np.tile([0.0, 0, -1], (len(points), 1))
+    painter.hide(points)
+    painter.compare_exposures(points, ahead)
+    gains = np.exp(painter.exposures[:, 0])
+    np.testing.assert_allclose(gains / gains[0], [1.0, 1.5, 0.7, 2.0], rtol=0.03)
+    assert painter.exposures[0, 1] == pytest.approx(-0.21, abs=0.05)
+
+
+def scan(surface, spot=True, seed=0):
+    """A sweep of ``surface(direction) -> metres`` by a sensor at the origin: its noise-free and noisy Sweep."""
+    offsets = np.linspace(-1, 1, 15) if spot else np.zeros(1)
+    weights = np.sqrt(np.maximum(1 - offsets**2, 1e-3))
+    bearing, pitch = np.meshgrid(BEARINGS, PITCH)
+    radius = 0.5 * (0.016 / 2 + 0.0119)  # of the spot at two metres
+    clean = sum(w * surface(bearing + o * radius, pitch) for o, w in zip(offsets, weights, strict=True)) / weights.sum()
+    noisy = clean + np.random.default_rng(seed).normal(0, LRF.sigma_range, clean.shape)
+    return [Sweep(1, ranges, BEARINGS, PITCH, np.arange(len(PITCH)) * 0.5) for ranges in (clean, noisy)]
+
+
+def wall(distance):
+    return lambda bearing, pitch: distance / (np.sin(bearing) * np.cos(pitch))
+
+
+def step_edge(bearing, pitch):
+    """A wall at 1.8 m to the right, one at 2.3 m to the left."""
+    return np.where(bearing < np.radians(90.1), wall(1.8)(bearing, pitch), wall(2.3)(bearing, pitch))
+
+
+def whole(sweep, views=(), **options):
+    return rec.join(rec.reconstruct(sweep, views, STILL, as_recorded, lrf=LRF, **options))
+
+
+def test_mixed_pixels_go_and_sound_points_stay():
+    clean, noisy = scan(step_edge)
+    y = clean.ranges * np.sin(BEARINGS) * np.cos(PITCH)[:, None]
+    air = np.minimum(np.abs(y - 1.8), np.abs(y - 2.3))
+    gone = rec.mixed(noisy.ranges, (STEP, STEP), LRF)
+    assert (gone[air > 0.03] > 0).mean() > 0.8 and (gone[air < 0.003] > 0).mean() < 0.01
+    flagged = (gone > 0) & (air > 0.03)
+    assert np.abs((noisy.ranges - gone)[flagged] - 1.8).mean() < 0.1  # they hide from about where the nearer one is
+    cloud = whole(noisy)
+    assert cloud.removed == (gone > 0).sum() and len(cloud.points) + cloud.removed == noisy.ranges.size
+
+
+def test_a_plain_wall_loses_next_to_nothing_and_a_pinpoint_sensor_nothing():
+    _, noisy = scan(wall(2.0))
+    assert whole(noisy).removed < 0.001 * noisy.ranges.size
+    _, edge = scan(step_edge)
+    info = replace(LRF, spot_exit=None, spot_divergence=None)
+    assert rec.join(rec.reconstruct(edge, (), STILL, as_recorded, lrf=info)).removed == 0
+
+
+def test_normals_point_to_the_sensor_up_to_the_edge():
+    cloud = whole(scan(step_edge)[1])
+    off = np.degrees(np.arccos(np.clip(-cloud.normals[:, 1], -1, 1)))
+    assert np.median(off) < 2.5 and np.quantile(off, 0.98) < 10
+
+
+def test_blocks_are_the_whole(monkeypatch, tmp_path):
+    _, noisy = scan(step_edge)
+    views = [view(plain_image(), pose=AHEAD), view(plain_image(140), pose=AHEAD, number=1)]
+    at_once = whole(noisy, views)
+    monkeypatch.setattr(rec, "BLOCK", 9 * len(BEARINGS))
+    blocks = list(rec.reconstruct(noisy, views, STILL, as_recorded, lrf=LRF))
+    assert len(blocks) == 6
+    for name in rec.ROWS:
+        np.testing.assert_allclose(getattr(rec.join(blocks), name), getattr(at_once, name), atol=1e-6, err_msg=name)
+    assert rec.write_ply(tmp_path / "blocks.ply", iter(blocks)) == len(at_once.points)
+    rec.write_ply(tmp_path / "whole.ply", rec.join(blocks))
+    assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+def test_what_no_image_saw_is_flagged_and_points_tell_where_they_come_from():
+    _, noisy = scan(step_edge)
+    noisy = replace(noisy, intensities=np.full(noisy.ranges.shape, 7.0))
+    cloud = whole(noisy, [view(plain_image(), pose=AHEAD, number=5)])
+    assert 0.2 < cloud.seen.mean() < 1 and (cloud.colors[~cloud.seen] == rec.GREY).all()
+    assert set(np.unique(cloud.image)) == {-1, 5} and (cloud.intensity == 7).all()
+    back = np.stack([np.cos(cloud.bearing), np.sin(cloud.bearing)], -1) * cloud.range[:, None]
+    np.testing.assert_allclose(cloud.points[:, 0], back[:, 0], atol=1e-9)
+    np.testing.assert_allclose(cloud.points[:, 2], back[:, 1] * np.sin(cloud.pitch), atol=1e-9)
+
+
+def test_a_moving_head_has_a_pitch_for_every_beam():
+    _, noisy = scan(wall(2.0), spot=False)
+    still, moving = whole(noisy), whole(noisy, continuous=True)
+    rise = np.arctan2(moving.points[:, 2], moving.points[:, 1]) - np.arctan2(still.points[:, 2], still.points[:, 1])
+    rate, turn = STEP / 0.5, rec.MIRROR_TURN
+    assert np.abs(rise).max() < rate * 6 * turn and np.abs(rise[still.bearing == BEARINGS[120]]).max() < 1e-9
+    later = (BEARINGS[124] - BEARINGS[120]) / (2 * np.pi) * turn  # a degree on: the same turn of the mirror
+    np.testing.assert_allclose(rise[still.bearing == BEARINGS[124]], rate * later, rtol=1e-6)
+
+
+BAD = {
+    "an empty sweep": (lambda s: replace(s, ranges=s.ranges * np.nan), "placement 1: an empty sweep .49 scan lines"),
+    "no scan line": (lambda s: replace(s, ranges=s.ranges[:0], pitch=s.pitch[:0]), "an empty sweep .0 scan lines"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_sweeps_are_refused(case):
+    change, words = BAD[case]
+    with pytest.raises(ValueError, match=words):
+        whole(change(scan(wall(2.0))[1]))
+
+
+def test_one_scan_line_makes_a_cloud():
+    one = scan(wall(2.0))[1]
+    one = replace(one, ranges=one.ranges[:1], pitch=one.pitch[:1], time_s=one.time_s[:1])
+    cloud = whole(one, [view(plain_image(), pose=AHEAD)])
+    assert len(cloud.points) + cloud.removed == len(BEARINGS) and cloud.seen.any()
+
+
+def test_an_image_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="camera 'left' has 64 x 48 pixels, its image 32 x 24"):
+        view(np.zeros((24, 32, 3)))
+
+
+def test_files_hold_everything_and_say_frame_and_units(tmp_path):
     import open3d as o3d
 
-    cloud = rec.Cloud(grid(1.0, n=3), np.arange(27, dtype=np.uint8).reshape(9, 3), np.ones(9, bool), np.zeros(9, int))
-    rec.write_ply(tmp_path / "deep" / "c.ply", rec.join([cloud, cloud]))
-    back = o3d.t.io.read_point_cloud(str(tmp_path / "deep" / "c.ply"))
-    np.testing.assert_allclose(back.point.positions.numpy()[:9], cloud.points, atol=1e-6)
-    assert (back.point.colors.numpy()[9:] == cloud.colors).all()
+    cloud = whole(scan(step_edge)[1], [view(plain_image(), pose=AHEAD)])
+    rec.write_ply(tmp_path / "deep" / "c.ply", cloud, ["session made up"])
+    head = (tmp_path / "deep" / "c.ply").read_bytes().split(b"end_header")[0].decode()
+    assert all(f"comment {words}" in head for words in (rec.FRAME, rec.UNITS, "session made up"))
+    write_pcd(tmp_path / "c.pcd", tmp_path / "deep" / "c.ply")
+    for file in ("deep/c.ply", "c.pcd"):
+        back = o3d.t.io.read_point_cloud(str(tmp_path / file))
+        np.testing.assert_allclose(back.point.positions.numpy(), cloud.points, atol=1e-6)
+        np.testing.assert_allclose(back.point.normals.numpy(), cloud.normals, atol=1e-6)
+        assert (back.point.colors.numpy() == cloud.colors).all()
+    back = o3d.t.io.read_point_cloud(str(tmp_path / "deep" / "c.ply")).point
+    for name in ("seen", "placement", "image", "pitch", "bearing", "range", "sigma"):
+        np.testing.assert_allclose(back[name].numpy().ravel(), getattr(cloud, name), rtol=1e-6, err_msg=name)
+
+
+def test_a_bent_wall_is_not_flat():
+    cloud = whole(scan(wall(2.0))[1])
+    assert largest_plane(cloud).mean() > 0.97
+    flat = flatness(cloud.points)[1]
+    bent = flatness(cloud.points + np.array([[0, 0.05, 0]]) * cloud.points[:, :1] ** 2)[1]
+    assert flat < 0.001 and 0.01 < bent < 0.03
 
 
 def test_exact_edge_points_give_exact_lengths():

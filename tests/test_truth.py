@@ -51,5 +51,5 @@ def test_the_session_calibrates_without_its_truth(tmp_path):
     truth = tables.read_truth(open_session(QUICK))
     errors = [tables.camera_errors(found.solutions[c, "zhang_pless"], truth, c) for c in ("left", "right")]
     assert max(e["rotation_error_deg"] for e in errors) < 8.0  # four placements of a small board: loose
-    assert np.isfinite(pipeline.color_cloud(found, every=5).points).all()
-    assert pipeline.color_cloud(found, every=5, scene=True).seen.mean() > 0.3
+    assert np.isfinite(pipeline.color_cloud(found).points).all()
+    assert pipeline.color_cloud(found, scene=True).seen.mean() > 0.3

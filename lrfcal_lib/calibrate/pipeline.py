@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
@@ -373,21 +374,24 @@ def stereo_reference(prepared):
     return pair, T_second_first, covariance
 
 
-def color_cloud(calibration, method="line", every=1, scene=False):
-    """Sweeps of a session as one coloured cloud in the platform frame.
+def color_cloud(calibration, method="line", scene=False):
+    """Sweeps of a session as one coloured Cloud in the platform frame, see :func:`cloud_blocks`."""
+    return reconstruct.join(cloud_blocks(calibration, method, scene))
+
+
+def cloud_blocks(calibration, method="line", scene=False):
+    """Coloured points of a session, block by block.
 
     Parameters
     ----------
     calibration : Calibration
     method : str
-        Whose camera poses colour the cloud.
-    every : int
-        Take every n-th point of a sweep.
+        Whose camera poses and axis make the cloud.
     scene : bool
         The sweeps of scenes, with all their returns, instead of the boards.
 
-    Returns
-    -------
+    Yields
+    ------
     Cloud
         Each sweep takes its colours from the images of its own placement, of all cameras that see the point.
 
@@ -398,24 +402,38 @@ def color_cloud(calibration, method="line", every=1, scene=False):
     """
     session, masks = calibration.prepared.session, {p: scan.mask for p, scan in calibration.prepared.scans.items()}
     if scene:
-        masks = {p: np.isfinite(session.sweep(p).ranges) for p in session.scene_placements}
+        masks = dict.fromkeys(session.scene_placements)
     if not masks:
         raise ValueError(f"{session.name}: no sweep of {'a scene' if scene else 'the board'} to colour")
-    clouds, axis, poses = [], calibration.platform.axis_with(method), calibration.solutions
-    T_head_lrf = calibration.platform.transform(axis)
-    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
+    axis = calibration.platform.axis_with(method)
+    settings = {
+        "T_head_lrf": calibration.platform.transform(axis), "lrf": session.lrf,
+        "correct": calibration.joint.solution.correct if axis == "joint" else as_recorded,
+        "continuous": str(session.reference.get("recording", "")).startswith("continuous"),
+    }  # fmt: skip
     for placement, mask in masks.items():
-        sweep, (line, beam) = session.sweep(placement), (index[::every] for index in np.nonzero(mask))
-        points = geometry.polar_to_points(sweep.ranges[line, beam], sweep.bearings[beam])
-        p_lrf, pitch = correct(placement, points, sweep.pitch[line])
-        layers = [np.full(p_lrf.shape, np.nan)]
-        for record in session.images(placement=placement):
-            camera, mount = record.camera, session.cameras[record.camera].mount
-            if (camera, method) in poses and (mount == "platform" or np.isfinite(record.pitch)):
-                at = 0.0 if mount == "platform" else float(correct(placement, np.zeros(3), record.pitch)[1])
-                points = geometry.lrf_to_source(p_lrf, pitch, T_head_lrf, mount, at)
-                seen = session.read_image(record), poses[camera, method].transform, calibration.prepared.models[camera]
-                layers.append(reconstruct.color_points(points, *seen)[0])
-        placed = geometry.lrf_to_platform(p_lrf, pitch, T_head_lrf), *reconstruct.blend(layers)
-        clouds.append(reconstruct.Cloud(*placed, np.full(len(pitch), placement)))
-    return reconstruct.join(clouds)
+        sweep, views = session.sweep(placement), views_of(calibration, method, placement)
+        if mask is not None:  # the board and what is around it
+            lines, beams = (slice(max(0, at.min() - 20), at.max() + 21) for at in np.nonzero(mask))
+            part = {"pitch": sweep.pitch[lines], "time_s": sweep.time_s[lines], "bearings": sweep.bearings[beams]}
+            echoes = None if sweep.intensities is None else sweep.intensities[lines, beams]
+            sweep = replace(sweep, ranges=sweep.ranges[lines, beams], intensities=echoes, **part)
+            mask = mask[lines, beams]
+        yield from reconstruct.reconstruct(sweep, views, **settings, mask=mask)
+
+
+def views_of(calibration, method, placement):
+    """The images of a placement as a method poses them, a list of View; without those of which no pitch is known."""
+    session, axis, views = calibration.prepared.session, calibration.platform.axis_with(method), []
+    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
+    back = calibration.platform.transform(axis).inv()
+    for record in session.images(placement=placement):
+        name, mount = record.camera, session.cameras[record.camera].mount
+        if (name, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
+            pose = calibration.solutions[name, method].transform
+            if mount == "head":  # while the head stood at this pitch
+                at = float(correct(placement, np.zeros(3), record.pitch)[1])
+                pose = pose * back * RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0.0, 0.0]))
+            number, model = session.image_records.index(record), calibration.prepared.models[name]
+            views.append(reconstruct.View(number, name, pose, model, session.read_image(record)))
+    return views

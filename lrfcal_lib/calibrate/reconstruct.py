@@ -1,113 +1,402 @@
-"""Sweeps, images and a calibration make a coloured cloud."""
+"""Sweeps, images and a calibration make a coloured cloud, block by block: any number of points in bounded memory."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
+from scipy.ndimage import uniform_filter
 
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.camera import CameraModel, project
 
-GREY = np.array([128, 128, 128], np.uint8)  # colour of points that no camera sees
-CELL = 4  # pixels, side of a cell of the depth buffer: about the spacing of the projected points
-BEHIND = 0.02  # a point this share of its depth behind the nearest one in its cell still counts as the same surface
+GREY = 128  # colour of points that no camera sees
+BLOCK = 1 << 18  # points worked on at once
+WINDOW = 4  # beams and scan lines on either side of a point that make its normal
+PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)
+SIGMAS = 2.5  # by which a reading must miss the surfaces on both sides
+MIRROR_TURN = 1 / 75.08  # s, of an LMS2xx
+GAIN_POINTS = 30_000  # that compare the exposures of images
+FRAME = "frame: platform (x = tilt axis, y ahead, z up at pitch 0)"
+UNITS = "units: metres, radians; sigma in metres, image is the number of the image that counts most (-1: none)"
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # of pairs of neighbours: lines and beams
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Coloured points in the platform frame.
+    """Coloured points in the platform frame, a row each.
 
     Attributes
     ----------
-    points : ndarray, shape (n, 3)
-        Metres.
+    points, normals : ndarray, shape (n, 3)
+        Metres; unit vectors towards the sensor, NaN where the surroundings are too small for one.
     colors : ndarray of uint8, shape (n, 3)
         Red, green, blue; grey where no camera sees the point.
     seen : ndarray of bool, shape (n,)
         Whether any camera sees the point.
-    placement : ndarray of int, shape (n,)
+    placement, image : ndarray of int, shape (n,)
+        The sweep, and the number in `Session.image_records` of the image that counts most, -1 for none.
+    pitch, bearing, range, intensity : ndarray, shape (n,)
+        As measured (radians, radians, metres; NaN where no intensity was recorded).
+    sigma : ndarray, shape (n,)
+        Predicted standard deviation, metres.
+    removed : int
+        Mixed pixels that were left out.
     """
 
     points: np.ndarray
+    normals: np.ndarray
     colors: np.ndarray
     seen: np.ndarray
     placement: np.ndarray
+    image: np.ndarray
+    pitch: np.ndarray
+    bearing: np.ndarray
+    range: np.ndarray
+    intensity: np.ndarray
+    sigma: np.ndarray
+    removed: int = 0
 
     def __repr__(self):
         share = 100 * self.seen.mean() if len(self.seen) else 0.0
-        return (
-            f"Cloud({len(self.points)} points of {len(np.unique(self.placement))} placements, {share:.1f} % coloured)"
-        )
+        return f"Cloud({len(self.points)} points of {len(set(self.placement))} placements, {share:.1f} % coloured)"
+
+    def rows(self, index):
+        """Some of the points."""
+        return replace(self, **{name: getattr(self, name)[index] for name in ROWS})
 
 
-def visible(uv, depth, width, height):
-    """Which points (pixels (n, 2), NaN behind the camera; distances (n,)) lie in the image and behind no other one."""
-    with np.errstate(invalid="ignore"):
-        inside = np.all((uv >= -0.5) & (uv < [width - 0.5, height - 0.5]), axis=1)
-    columns = width // CELL + 1
-    index = ((uv[inside] + 0.5) // CELL).astype(int) @ [1, columns]
-    nearest = np.full(columns * (height // CELL + 1), np.inf)
-    np.minimum.at(nearest, index, depth[inside])
-    seen = inside.copy()
-    seen[inside] = depth[inside] <= nearest[index] * (1 + BEHIND)
-    return seen
-
-
-def color_points(points, image, T_camera_source, model):
-    """Colour points from one image, with the lens distortion and with occlusion.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        In the camera's source frame, metres.
-    image : ndarray of uint8, shape (height, width, 3)
-        Blue, green, red as OpenCV reads it.
-    T_camera_source : RigidTransform
-    model : CameraModel
-
-    Returns
-    -------
-    colors : ndarray of float, shape (n, 3)
-        Red, green, blue in 0..255; NaN where the camera does not see the point.
-    uv : ndarray, shape (n, 2)
-        Pixels the points project to.
-    """
-    p_camera = T_camera_source.apply(points)
-    uv = project(p_camera, model)
-    seen = visible(uv, np.linalg.norm(p_camera, axis=1), model.width, model.height)
-    colors = np.full((len(points), 3), np.nan)
-    if seen.any():
-        maps = np.zeros((-(-seen.sum() // 4096) * 4096, 2), np.float32)  # remap wants maps narrower than 32768
-        maps[: seen.sum()] = uv[seen]
-        u, v = np.ascontiguousarray(maps.reshape(-1, 4096, 2).transpose(2, 0, 1))
-        bgr = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, 3)
-        colors[seen] = bgr[: seen.sum(), ::-1]
-    return colors, uv
-
-
-def blend(colors):
-    """Mean colours (n, 3) over layers with NaN where a camera does not see a point, and whether any does."""
-    stack = np.stack(colors)
-    count = np.isfinite(stack[..., 0]).sum(axis=0)
-    mean = np.nansum(stack, axis=0) / np.maximum(count, 1)[:, None]
-    seen = count > 0
-    return np.where(seen[:, None], np.rint(mean), GREY).astype(np.uint8), seen
+ROWS = tuple(f.name for f in fields(Cloud) if f.name != "removed")
 
 
 def join(clouds):
     """One cloud of several."""
-    names = ("points", "colors", "seen", "placement")
-    return Cloud(*(np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names))
+    clouds = list(clouds)
+    rows = (np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ROWS)
+    return Cloud(*rows, sum(cloud.removed for cloud in clouds))
 
 
-def write_ply(path, cloud):
-    """Write a cloud as a binary coloured PLY. Raises OSError if the file cannot be written."""
-    import open3d as o3d
+@dataclass(frozen=True)
+class View:
+    """An image as it sees the platform frame.
 
-    geometry = o3d.t.geometry.PointCloud(o3d.core.Tensor(cloud.points.astype(np.float32)))
-    geometry.point.colors = o3d.core.Tensor(np.ascontiguousarray(cloud.colors))
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    if not o3d.t.io.write_point_cloud(str(path), geometry):
-        raise OSError(f"{path}: the cloud could not be written; is the disk full?")
+    Attributes
+    ----------
+    number : int
+        What points coloured from it remember.
+    camera : str
+    T_camera_platform : RigidTransform
+    model : CameraModel
+    image : ndarray of uint8, shape (height, width, 3)
+        Blue, green, red as OpenCV reads it. ValueError if it has another size than the model.
+    """
+
+    number: int
+    camera: str
+    T_camera_platform: object
+    model: CameraModel
+    image: np.ndarray
+
+    def __post_init__(self):
+        size, m = self.image.shape[1::-1], self.model
+        if size != (m.width, m.height):
+            asked = f"camera '{self.camera}' has {m.width} x {m.height} pixels"
+            raise ValueError(f"{asked}, its image {size[0]} x {size[1]}: intrinsics hold for one image size only")
+
+    @property
+    def pose(self):
+        """Top three rows of the transform."""
+        return np.ascontiguousarray(geometry.pose_array(self.T_camera_platform))
+
+    @property
+    def lens(self):
+        """Intrinsics, and the squared distance from the axis at which the lens folds, for the compiled loops."""
+        return np.r_[self.model.parameters, fold(self.model)]
+
+
+def fold(model):
+    """Squared distance ``(x^2 + y^2) / z^2`` at which radial distortion turns back: points beyond are not in the image.
+
+    Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of equation (18).
+    """
+    k1, k2, _, _, k5 = model.distortion
+    roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    return float(min(real[real > 0], default=np.inf))
+
+
+class Painter:
+    """Colours points from images: first everything that may hide something goes through :meth:`hide`.
+
+    Parameters
+    ----------
+    views : sequence of View
+    step : float
+        Radians between neighbouring points as the sensor sees them: the resolution at which points hide others.
+    noise : float
+        Metres by which a point may lie behind another one of the same surface.
+    """
+
+    def __init__(self, views, step, noise):
+        from lrfcal_lib.calibrate import colouring  # numba, which nothing else needs
+
+        self.loops, self.views, self.noise, self.exposures = colouring, views, noise, np.zeros((len(views), 2))
+        self.cells = [max(2.0, 2 * step * view.model.fx) for view in self.views]
+        self.nearest = []
+        for view, cell in zip(self.views, self.cells, strict=True):
+            size = int(view.model.height / cell) + 1, int(view.model.width / cell) + 1
+            self.nearest.append(np.full(size, np.inf, np.float32))
+
+    def hide(self, points):
+        """Let points (n, 3) hide what is behind them."""
+        for view, cell, nearest in zip(self.views, self.cells, self.nearest, strict=True):
+            self.loops.hide(_single(points), view.pose, view.lens, view.model.width, view.model.height, cell, nearest)
+
+    def paint(self, points, normals, only=slice(None)):
+        """Colours (n, 3), whether any image sees the points (n,), and the number of the one that counts most."""
+        points, normals, n = _single(points), _single(np.nan_to_num(normals)), len(points)
+        sums, best, source = np.zeros((n, 4), np.float32), np.zeros(n, np.float32), np.full(n, -1, np.int32)
+        for k in range(len(self.views))[only]:
+            v, loops = self.views[k], (sums, best, source, self.views[k].number)
+            near = self.cells[k], self.nearest[k], self.noise, self.exposures[k]
+            self.loops.paint(points, normals, v.pose, v.lens, np.ascontiguousarray(v.image), *near, *loops)
+        seen = sums[:, 3] > 0
+        mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-30)
+        return np.where(seen[:, None], mean, np.nan), seen, source
+
+    def compare_exposures(self, points, normals):
+        """Estimate gain and fall-off towards the corners of every image from points that several images see.
+
+        The log of a brightness is that of the surface, plus one number an image, plus one a camera times the squared
+        distance from the principal point. Robust least squares; the gains are one in the mean.
+        """
+        if len(self.views) < 2 or not len(points):
+            return
+        names, which = np.unique([view.camera for view in self.views], return_inverse=True)
+        logs, radii = (np.full((len(self.views), len(points)), np.nan) for _ in range(2))
+        for k, view in enumerate(self.views):
+            grey = self.paint(points, normals, slice(k, k + 1))[0].mean(axis=1)
+            logs[k] = np.log(np.where((grey > 12) & (grey < 230), grey, np.nan))
+            uv = project(view.T_camera_platform.apply(points), view.model) - [view.model.cx, view.model.cy]
+            radii[k] = np.sum(uv**2, axis=1) / (0.25 * (view.model.width**2 + view.model.height**2))
+        use, found = np.isfinite(logs), np.zeros(len(self.views) + len(names))
+        for _ in range(4):
+            use &= use.sum(axis=0) > 1
+            k, i = np.nonzero(use)
+            rows = np.hstack([np.eye(len(self.views))[k], radii[use][:, None] * np.eye(len(names))[which[k]]])
+            both, count = np.column_stack([rows, logs[use]]), np.maximum(use.sum(axis=0), 1)
+            means = np.stack([np.bincount(i, column, len(points)) for column in both.T], axis=1) / count[:, None]
+            both -= means[i]  # the brightness of the surface itself is nobody's concern
+            J, y = both[:, :-1], both[:, -1]
+            found = np.linalg.solve(J.T @ J + 1e-3 * np.eye(len(found)), J.T @ y)  # zero for what no point compares
+            miss = y - J @ found
+            use[use] = np.abs(miss) < 3 * max(1.4826 * np.median(np.abs(miss)), 1e-3) if len(miss) else True
+        self.exposures[:, 0] = found[: len(self.views)] - found[: len(self.views)].mean()
+        self.exposures[:, 1] = np.minimum(found[len(self.views) :], 0.0)[which]
+
+
+def _single(points):
+    return np.ascontiguousarray(points, np.float32)
+
+
+def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mask=None):
+    """Turn a sweep of any size into coloured points of the platform frame.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    views : sequence of View
+        Images that may colour it.
+    T_head_lrf : RigidTransform
+    correct : callable
+        ``(placement, points, pitch)`` as they should have been, for instance `JointSolution.correct`.
+    lrf : LrfInfo
+        Its spot and noise tell mixed pixels.
+    continuous : bool
+        The head moved on within a scan line: its pitch is that of the middle beam.
+    mask : ndarray of bool, shape (L, B), optional
+        Points to hand out; all that came back unless given. All points hide others in any case.
+
+    Yields
+    ------
+    Cloud
+        Blocks of whole scan lines. Mixed pixels are left out, and hide what is behind the nearer of their surfaces.
+    """
+    if not np.isfinite(sweep.ranges).any():
+        raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range)")
+    turns = np.abs(np.diff(sweep.pitch))
+    steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
+    painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
+    blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
+    blocks = list(blocks) if sweep.ranges.size <= 4 * BLOCK else blocks  # they are gone through twice
+    some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
+    for points, normals, hiding, good, _ in blocks:
+        painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
+        some.append([part[good][::every] for part in (points, normals)])
+    painter.compare_exposures(*(np.concatenate(part) for part in zip(*some, strict=True)))
+    for points, normals, _, good, rows in blocks:
+        wanted = np.isfinite(sweep.ranges[rows]) if mask is None else mask[rows]
+        take = good & wanted
+        line, beam = np.nonzero(take)
+        colors, seen, source = painter.paint(points[take], normals[take])
+        colors = np.where(seen[:, None], np.clip(np.rint(np.nan_to_num(colors)), 0, 255), GREY).astype(np.uint8)
+        ranges, echo = sweep.ranges[rows][take], np.full(len(line), np.nan)
+        if sweep.intensities is not None:
+            echo = sweep.intensities[rows][take].astype(float)
+        number, sigma = np.full(len(line), sweep.placement), np.full(len(line), lrf.sigma_range)
+        measured = sweep.pitch[rows][line], sweep.bearings[beam], ranges, echo
+        at = points[take], normals[take], colors, seen, number, source, *measured, sigma
+        yield Cloud(*at, removed=int((wanted & ~good).sum()))
+
+
+class _Blocks:
+    """Points, normals, what hides others, which are no mixed pixels, and the scan lines, block by block."""
+
+    def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
+        self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
+        self.rate = np.gradient(sweep.pitch, sweep.time_s) if continuous and len(sweep.pitch) > 1 else None
+
+    def __iter__(self):
+        sweep, (lines, beams) = self.sweep, self.sweep.ranges.shape
+        size, margin = max(1, BLOCK // beams), 4 * WINDOW
+        for start in range(0, lines, size):
+            rows = slice(start, min(start + size, lines))
+            low, high = max(0, start - margin), min(lines, rows.stop + margin)
+            inner = slice(start - low, rows.stop - low)
+            ranges, pitch = sweep.ranges[low:high].astype(float), self._pitch(slice(low, high))
+            p_lrf, pitch = self.correct(sweep.placement, geometry.polar_to_points(ranges, sweep.bearings), pitch)
+            points = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
+            nearer = np.zeros(ranges.shape)
+            if self.lrf.spot_divergence is not None:
+                nearer = mixed(ranges, self.steps, self.lrf)
+            good, toward = np.isfinite(ranges) & (nearer == 0), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
+            hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
+            origin = geometry.lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
+            normals = grid_normals(np.where(good[..., None], points, np.nan), origin)
+            yield points[inner], normals[inner], hiding[inner], good[inner], rows
+
+    def _pitch(self, rows):
+        """Recorded pitch of every beam, shape (l, B): between scan lines the mirror turns while the head moves."""
+        pitch, bearings = self.sweep.pitch[rows, None], self.sweep.bearings
+        if self.rate is None:
+            return np.broadcast_to(pitch, (len(pitch), len(bearings))).copy()
+        turns = max(1, round(np.radians(1.0) / self.lrf.bearing_step))  # of the mirror, for lines finer than a degree
+        first, last = self.lrf.field_of_view
+        beams = np.rint((np.r_[bearings, last] - first) / self.lrf.bearing_step)
+        beams[-1] //= 2  # the middle one
+        after = (beams * self.lrf.bearing_step / (2 * np.pi) + beams % turns) * MIRROR_TURN
+        return pitch + self.rate[rows, None] * (after[:-1] - after[-1])
+
+
+def mixed(ranges, steps, lrf):
+    """How far behind the nearer of two surfaces readings hang that mix them; 0 for sound ones.
+
+    A spot that meets two surfaces within one pulse reads between them: a ramp as wide as the spot joins them. So half a
+    spot farther on, on either side, are the surfaces themselves. A reading is sound in a direction if one of the two,
+    continued straight (a plane is straight in inverse range), meets it, or if it is not between or in front of them.
+    Unsound in two of four directions, beside another such one, it is mixed.
+
+    Parameters
+    ----------
+    ranges : ndarray, shape (l, b)
+        Metres, NaN where nothing came back.
+    steps : (float, float)
+        Between scan lines and between beams, radians.
+    lrf : LrfInfo
+        With `spot_exit` and `spot_divergence`.
+    """
+    valid = np.isfinite(ranges)
+    r = np.where(valid, ranges, 1.0)
+    share = uniform_filter(valid.astype(float), 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        smooth = np.where(share > 0.3, uniform_filter(np.where(valid, 1 / r, 0.0), 3) / share, np.nan)
+    spot = 0.4 * (lrf.spot_exit / r + lrf.spot_divergence)
+    far = [np.clip(np.ceil(spot / s), 2, 2 * WINDOW).astype(int) if s > 0 else np.zeros(r.shape, int) for s in steps]
+    place, size, tol = np.indices(r.shape), np.array(r.shape)[:, None, None], SIGMAS * lrf.sigma_range
+    votes, nearer = np.zeros(r.shape, int), np.full(r.shape, np.inf)
+    for a, b in DIRECTIONS:
+        way, misses, behind = np.stack([a * far[0], b * far[1]]), [], []
+        for side in (1, -1):
+            there = [place + side * k * way for k in (1, 2)]
+            out = [((at < 0) | (at >= size)).any(axis=0) for at in there]
+            first, second = (
+                np.where(o, np.nan, smooth[tuple(np.clip(at, 0, size - 1))]) for at, o in zip(there, out, strict=True)
+            )
+            with np.errstate(divide="ignore", invalid="ignore"):
+                misses.append(np.abs(r - 1 / (2 * first - second)))
+                behind.append(r - 1 / first)
+        low, high = np.minimum(*behind), np.maximum(*behind)  # NaN where a side shows nothing: no verdict
+        astray = np.minimum(*misses) > tol * np.sqrt(14 / 9)  # the reading's own noise and that of means of nine
+        between = (low < -tol) & (high > tol) & (high - low < PULSE)
+        thin = (high < -tol) & (high > -PULSE)  # something narrower than the spot before a background
+        found = astray & (between | thin) & valid
+        votes += found
+        nearer = np.where(found, np.minimum(nearer, np.maximum(high, 1e-6)), nearer)
+    unsound = votes >= 2
+    company = uniform_filter(unsound.astype(float), 5) * 25 > 1.5
+    return np.where(unsound & company, nearer, 0.0)
+
+
+def grid_normals(points, origins):
+    """Unit normals (l, b, 3) towards `origins` of points on a grid (l, b, 3): of the flattest window that holds them.
+
+    Nine windows, the point in the middle, on a side or in a corner of them, so that an edge spoils none of its sides.
+    NaN where less than a third of every window is there.
+    """
+    valid, n = np.isfinite(points).all(axis=-1), 2 * WINDOW + 1
+    centre = np.nanmean(points[valid], axis=0) if valid.any() else np.zeros(3)
+    p = np.where(valid[..., None], points - centre, 0.0)
+    size = (n, n, 1)
+    share = uniform_filter(valid.astype(float)[..., None], size, mode="constant")
+    whole = np.maximum(share, 0.5 / n**2)
+    mean = uniform_filter(p, size, mode="constant") / whole
+    square = uniform_filter((p[..., :, None] * p[..., None, :]).reshape(p.shape[:2] + (9,)), size, mode="constant")
+    spread = (square / whole).reshape(p.shape + (3,)) - mean[..., :, None] * mean[..., None, :]
+    values, vectors = np.linalg.eigh(spread)
+    rough = np.where((share[..., 0] > 1 / 3) & (values[..., 1] > 0), np.maximum(values[..., 0], 0.0), np.inf)
+    best, normals = np.full(valid.shape, np.inf), np.full(p.shape, np.nan)
+    i, j = np.indices(valid.shape)
+    for a, b in np.ndindex(3, 3):
+        at = np.clip(i + (a - 1) * WINDOW, 0, len(i) - 1), np.clip(j + (b - 1) * WINDOW, 0, j.shape[1] - 1)
+        flatter = valid & (rough[at] < best)
+        best = np.where(flatter, rough[at], best)
+        normals = np.where(flatter[..., None], vectors[at][..., :, 0], normals)
+    away = np.sum(normals * (points - origins), axis=-1, keepdims=True) > 0
+    return np.where(away, -normals, normals)
+
+
+COLUMNS = {  # of a PLY file, of attributes that are no single float by the attribute's own name
+    "points": ("<f4", "x y z"), "normals": ("<f4", "nx ny nz"), "colors": ("u1", "red green blue"),
+    "seen": ("u1", "seen"), "placement": ("<i4", "placement"), "image": ("<i4", "image"),
+}  # fmt: skip
+COLUMNS |= {name: ("<f4", name) for name in ("pitch", "bearing", "range", "intensity", "sigma")}
+KINDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
+
+
+def write_ply(path, clouds, comments=()):
+    """Write a cloud, or blocks of one as they come, as binary PLY with all attributes; frame and units are comments.
+
+    Returns the number of points; OSError if the file cannot be written.
+    """
+    clouds, path, count = [clouds] if isinstance(clouds, Cloud) else clouds, Path(path), 0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in (FRAME, UNITS, *comments))]
+    body = [f"property {KINDS[kind]} {name}" for kind, names in COLUMNS.values() for name in names.split()]
+    table = np.dtype([(field, kind, (len(names.split()),)) for field, (kind, names) in COLUMNS.items()])
+
+    def header(number):
+        """The same length for every number of points."""
+        return "\n".join([*head, f"element vertex {number:<12d}", *body, "end_header", ""]).encode()
+
+    with open(path, "wb") as file:
+        file.write(header(0))
+        for cloud in clouds:
+            rows = np.empty(len(cloud.points), table)
+            for field in COLUMNS:
+                rows[field] = getattr(cloud, field).reshape(len(rows), -1)
+            rows.tofile(file)
+            count += len(rows)
+        file.seek(0)
+        file.write(header(count))
+    return count

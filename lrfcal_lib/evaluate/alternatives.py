@@ -17,6 +17,7 @@ MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
+LEVER = 0.2  # metres, weighs turns against shifts
 LARGER = ("larger", "smaller")
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
 
@@ -150,12 +151,17 @@ def far_from_stated(joint):
         own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
         if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
             far.append((f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}", found[0]))
-    for camera, pose in solution.transforms.items():
-        guess = session.cameras[camera].guess
-        if guess is not None:
-            turn, shift = transform_difference(pose, guess)
-            if turn > FAR_TURN or shift > FAR_SHIFT:
-                far.append((f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn))
+    guesses = {name: found.guess for name, found in session.cameras.items() if found.guess is not None}
+    for camera in (name for name in solution.transforms if name in guesses):
+        apart = {name: transform_difference(solution.transforms[camera], guess) for name, guess in guesses.items()}
+        turn, shift = apart[camera]
+        nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
+        if turn > FAR_TURN or shift > FAR_SHIFT:
+            far.append((f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn))
+        elif nearest != camera:
+            far.append(
+                (f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?", turn)
+            )
     return far
 
 

@@ -1,4 +1,4 @@
-"""Calibrations on disk: the native ``calibration.json``."""
+"""Calibrations and clouds on disk: ``calibration.json``, PLY, PCD."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, color_cloud
+from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks
 from lrfcal_lib.calibrate.reconstruct import write_ply
+from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import edge_misses_px, handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
@@ -109,8 +110,35 @@ def write_calibration(path, record):
     path.write_text(json.dumps(plain(record), indent=1, allow_nan=False) + "\n")
 
 
+def write_clouds(folder, calibration, method):
+    """Write ``cloud.ply`` (the boards) and, of a session with scenes, ``scene.ply`` and ``scene.pcd``: their paths.
+
+    A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
+    """
+    session, folder, files = calibration.prepared.session, Path(folder), []
+    for name, scene in (("cloud", False), ("scene", True)):
+        if session.scene_placements if scene else calibration.prepared.scans:
+            blocks = cloud_blocks(calibration, method, scene)
+            if method == "joint":
+                blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
+            files.append(folder / f"{name}.ply")
+            write_ply(files[-1], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
+    if session.scene_placements:
+        files.append(folder / "scene.pcd")
+        write_pcd(files[-1], files[-2])
+    return files
+
+
+def write_pcd(path, ply):
+    """Write what a PLY of :func:`write_ply` holds as PCD. Raises OSError if the file cannot be written."""
+    import open3d as o3d
+
+    if not o3d.t.io.write_point_cloud(str(path), o3d.t.io.read_point_cloud(str(ply))):
+        raise OSError(f"{path}: the cloud could not be written; is the disk full?")
+
+
 def calibrate_session(path, out=None):
-    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and ``cloud.ply``.
+    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and clouds.
 
     They go to `out`, ``reports/<name>`` under the current folder when left out. Returns 0, or 3 where the verdict is
     'no' (also when no camera could be calibrated and nothing is written).
@@ -126,8 +154,7 @@ def calibrate_session(path, out=None):
     judged = judge(found)
     print(*judged.sentences(), sep="\n")
     if judged.errors:  # otherwise nothing can be handed over
-        method, file, cloud = handed_over(found), folder / "calibration.json", folder / "cloud.ply"
+        method, file = handed_over(found), folder / "calibration.json"
         write_calibration(file, calibration_record(found, method, judged))
-        write_ply(cloud, color_cloud(found, method))
-        print(f"written: {file}, {cloud}")
+        print("written:", *(f"{path}," for path in write_clouds(folder, found, method)), file)
     return UNTRUSTED if judged.answer == NO else 0

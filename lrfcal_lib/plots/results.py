@@ -243,3 +243,17 @@ def board_bend(ax, bends):
     many = f"{bent.sum()} of {len(found)} boards bend in the scan, by up to {size[bent].max(initial=0.0):.0f} mm"
     ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=many if bent.any() else "no board bends")
     ax.legend(ncols=3, fontsize="small", loc="upper left")
+
+
+def over_view(ax, cloud, values, limit):
+    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees; what was drawn.
+
+    Colours end at `limit`, and at its negative where there are negative values.
+    """
+    signed = np.nanmin(values, initial=0.0) < 0
+    shades = {"cmap": "RdBu_r" if signed else "magma", "vmin": -limit if signed else 0.0, "vmax": limit}
+    place = np.degrees(cloud.bearing), np.degrees(cloud.pitch)
+    drawn = ax.scatter(*place, c=values, s=2.5, marker="s", linewidths=0, rasterized=True, **shades)
+    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
+    ax.set(xlim=(place[0].max(), place[0].min()), ylim=(place[1].min(), place[1].max()))
+    return drawn

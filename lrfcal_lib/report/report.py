@@ -41,7 +41,10 @@ from lrfcal_lib.session.stated import SessionError
 
 NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
-OWN_FILES = ("figures", "tables", "parts", "findings.json", "calibration.json", "cloud.ply", "index.html")
+OWN_FILES = (  # folders, files to link to, the page itself
+    "figures", "tables", "parts", "calibration.json", "scene.html", "cloud.ply", "scene.ply", "scene.pcd",
+    "findings.json", "index.html",
+)  # fmt: skip
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
@@ -298,7 +301,7 @@ def _write_index(out, session, runs, found, seconds):
         verdicts=[entry for run in runs for entry in found[run.name]["verdicts"]],
         thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
         rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
-        files=[name for name in ("calibration.json", "cloud.ply", "findings.json") if (out / name).is_file()],
+        files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )  # fmt: skip
     (out / "index.html").write_text(page, encoding="utf-8")

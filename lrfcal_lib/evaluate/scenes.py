@@ -1,0 +1,125 @@
+"""How good a coloured scene is: predicted sigma of its points, flatness of a wall, errors against a simulated room."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
+from lrfcal_lib.calibrate.outline import as_recorded
+from lrfcal_lib.calibrate.pipeline import views_of
+from lrfcal_lib.calibrate.reconstruct import join, reconstruct
+from lrfcal_lib.evaluate.tables import read_truth
+from lrfcal_lib.evaluate.uncertainty import point_sigma
+from lrfcal_lib.model.geometry import fit_plane, tilt
+from lrfcal_lib.session.stated import read_json
+
+PATCH = 40  # points that average the noise out of a patch of a wall
+
+
+def with_sigma(cloud, solution):
+    """A Cloud with the standard deviations (metres) that a JointSolution predicts: its own and the range noise."""
+    axes = [np.linspace(np.min(v), np.max(v) + 1e-6, n) for v, n in ((cloud.pitch, 9), (cloud.bearing, 9))]
+    distances = np.geomspace(max(cloud.range.min(), 0.05), cloud.range.max() + 1e-6, 12)
+    found = point_sigma(solution, axes[1], axes[0], distances)
+    whole = np.hypot(found.sigma, found.parts["range noise"])
+    at = np.stack([np.maximum(cloud.range, distances[0]), cloud.pitch, cloud.bearing], axis=1)
+    return replace(cloud, sigma=RegularGridInterpolator((distances, *axes), whole)(at))
+
+
+def largest_plane(cloud, tolerance=0.04):
+    """Which points of a Cloud lie on its largest plane: within a tolerance (metres), facing as it does to 15 deg."""
+    import open3d as o3d
+
+    o3d.utility.random.seed(0)
+    geometry = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
+    plane, _ = geometry.segment_plane(tolerance, 3, 500)
+    near = np.abs(cloud.points @ plane[:3] + plane[3]) < tolerance
+    return near & (np.abs(cloud.normals @ plane[:3]) > np.cos(np.radians(15)))
+
+
+def flatness(points):
+    """How far a wall (n, 3) is from a plane, metres: the signed distance of each point, and the flatness.
+
+    The flatness is the root mean square of the mean distances of patches of `PATCH` points, without their noise.
+    """
+    normal, offset, _ = fit_plane(points)
+    miss = points @ normal - offset
+    across = np.linalg.svd(normal[None])[2][1:]
+    u, v = ((points - points.mean(axis=0)) @ across.T).T
+    side = np.sqrt(PATCH * np.ptp(u) * np.ptp(v) / len(points))
+    cell = np.rint(u / side).astype(int) * 100_000 + np.rint(v / side).astype(int)
+    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean = (np.bincount(which, miss) / count)[count >= PATCH / 2]
+    noise = np.var(miss - (np.bincount(which, miss) / count)[which]) / PATCH
+    return miss, float(np.sqrt(max(np.mean(mean**2) - noise, 0.0)))
+
+
+@dataclass(frozen=True)
+class SceneErrors:
+    """What a simulated room says about a Cloud of it, a row a point.
+
+    Attributes
+    ----------
+    depth : ndarray, shape (n,)
+        Signed, along the beam, metres; NaN where the truth shows nothing.
+    normal : ndarray, shape (n,)
+        The same along the normal of the true surface.
+    color : ndarray, shape (n,)
+        Mean over red, green, blue of the absolute difference to the true light at one exposure; NaN where unseen.
+    blocked : ndarray of bool, shape (n,)
+        Coloured from an image in which something hides the point.
+    """
+
+    depth: np.ndarray
+    normal: np.ndarray
+    color: np.ndarray
+    blocked: np.ndarray
+
+
+def scene_errors(cloud, calibration, method):
+    """Errors of a Cloud of one scene, made by a method, against the simulator: SceneErrors; None for a recording.
+
+    A turn about the tilt axis and a shift along it, which no data can show, do not count.
+    """
+    session, truth = calibration.prepared.session, read_truth(calibration.prepared.session)
+    if truth is None:
+        return None
+    from lrfcal_lib.simulate.record import world_of
+    from lrfcal_lib.simulate.rig import SETUPS
+
+    world = world_of(SETUPS[read_json(session.path / "truth.json", session.path)["setup"]](), None)
+    T_head_lrf = calibration.platform.transform(calibration.platform.axis_with(method))
+    gauge = truth.T_head_lrf * T_head_lrf.inv()
+    turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
+    placement = int(cloud.placement[0])
+    sweep = session.sweep(placement)
+    order = np.argsort(sweep.pitch)
+    pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])
+    points = tilt(cloud.points, turn) + shift
+    origins = tilt(np.broadcast_to(truth.T_head_lrf.translation, points.shape), pitch)
+    length = np.linalg.norm(points - origins, axis=1)
+    directions = (points - origins) / length[:, None]
+    hits = world.cast(origins, directions)
+    depth = np.where(np.isfinite(hits.distance), length - hits.distance, np.nan)
+    normal = depth * np.abs(np.sum(world.normals[hits.face] * directions, axis=1))
+    light = 255 * world.radiance(origins, directions, hits)
+    ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
+    light = np.clip(light * np.median(ratio), 0, 255)
+    color = np.where(cloud.seen, np.abs(cloud.colors - light).mean(axis=1), np.nan)
+    blocked, true = np.zeros(len(points), bool), origins + hits.distance[:, None] * directions
+    for view in views_of(calibration, method, placement):
+        mine = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
+        eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
+        way = true[mine] - eye
+        far = np.linalg.norm(way, axis=1)
+        blocked[mine] = world.cast(np.broadcast_to(eye, way.shape), way / far[:, None]).distance < far - 0.02
+    return SceneErrors(depth, normal, color, blocked)
+
+
+def as_stated(calibration):
+    """The first scene with the platform as it is stated, ranges and pitch as recorded, and no colours; a Cloud."""
+    session = calibration.prepared.session
+    sweep, T_head_lrf = session.sweep(session.scene_placements[0]), calibration.platform.transform("stated")
+    return join(reconstruct(sweep, [], T_head_lrf, as_recorded, lrf=session.lrf))

@@ -1,0 +1,51 @@
+"""No wrong answer passes: whatever is falsified is named in the verdict, or changes nothing beyond chance."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from falsified import FALSIFIED
+from joint_draws import draw, rng
+
+from lrfcal_lib.evaluate.monte_carlo import state_errors
+from lrfcal_lib.evaluate.verdict import contradicts_stated, verdict
+from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.solvers.joint import solve_joint
+
+STATED = np.radians(3.0), 0.03
+SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
+
+
+def judged(change, seed, mount="head"):
+    """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
+    obs, truth, rig = draw(rng(seed), 16, mount=mount)
+    prior = PlatformPrior(rig.T_head_lrf, *STATED)
+    settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
+    solution = solve_joint(change(replace(obs, T_head_lrf=rig.T_head_lrf)), required=False, **settings)
+    cameras = {name: SimpleNamespace(guess=pose) for name, pose in rig.cameras.items()}
+    lrf = LrfInfo("home-made", (0.9, 2.2), 0.002, 0.005)
+    session = SimpleNamespace(lrf=lrf, T_head_lrf=rig.T_head_lrf, platform_sigma=STATED, cameras=cameras)
+    joint = SimpleNamespace(prepared=SimpleNamespace(session=session), solution=solution, settings=settings)
+    reasons, doubt = contradicts_stated(joint)
+    reasons += verdict(solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt).reasons
+    whole = len(solution.boards) == len(truth.boards)
+    return reasons, state_errors(solution.state, truth, solution.unknowns)[:16] if whole else None, solution
+
+
+@pytest.mark.parametrize("name", FALSIFIED)
+def test_what_is_falsified_is_named(name):
+    change, kinds = FALSIFIED[name]
+    reasons, errors, solution = judged(change, 7)
+    named = {reason.kind for reason in reasons} & set(kinds)
+    harmless = errors is not None and np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 3.5
+    assert named or (harmless and not kinds), [reason.words for reason in reasons]
+
+
+@pytest.mark.parametrize("mount", ["head", "platform"])
+@pytest.mark.parametrize("seed", [11, 12])
+def test_an_honest_recording_gives_no_alarm(seed, mount):
+    reasons, errors, solution = judged(lambda obs: obs, seed, mount)
+    assert [reason.kind for reason in reasons if reason.kind not in ("error", "distance")] == []
+    assert np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 4.0

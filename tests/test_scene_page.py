@@ -1,0 +1,58 @@
+"""The page that shows a scene: one file, offline, and a browser draws it."""
+
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.plots import interactive
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+OPTIONS = [
+    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader", "--window-size=900,700", "--virtual-time-budget=10000",
+]  # fmt: skip
+
+
+def page(folder, count=2000):
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, 2, -1], [1, 3, 1], (count, 3))
+    camera = RigidTransform.from_rotation(Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    boards = {"board 1": np.array([[0, 2.5, 0], [0.3, 2.5, 0], [0, 2.5, 0.4]])}
+    views = {"left": (camera, CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5))}
+    lines = interactive.rig_lines(RigidTransform.identity(), views, boards)
+    colors = np.tile(np.uint8([230, 20, 20]), (count, 1))
+    interactive.scene_page(folder / "scene.html", points, colors, points[:, 0] < 0.8, lines)
+    return folder / "scene.html"
+
+
+def test_the_page_holds_everything_itself(tmp_path):
+    text = page(tmp_path).read_text()
+    shown = ("points", "points that no image saw", "tilt axis", "view of left", "board 1", "x of lrf, left")
+    assert all(f'"name":"{name}"' in text for name in shown)
+    assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "nothing comes from the network"
+
+
+def test_too_many_points_are_thinned(tmp_path, monkeypatch):
+    whole = page(tmp_path).stat().st_size
+    monkeypatch.setattr(interactive, "MOST_POINTS", 500)
+    assert page(tmp_path).stat().st_size < whole - 1500 * 16
+
+
+def test_a_browser_draws_it(tmp_path):
+    import cv2
+
+    if CHROMIUM is None:
+        give_up = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
+        give_up("there is no Chromium: run 'sudo apt-get install -y chromium'")
+    picture, profile = tmp_path / "page.png", f"--user-data-dir={tmp_path / 'profile'}"
+    command = [CHROMIUM, *OPTIONS, profile, f"--screenshot={picture}", page(tmp_path).as_uri()]
+    subprocess.run(command, capture_output=True, timeout=280, check=True)
+    blue, green, red = cv2.imread(str(picture)).astype(int).transpose(2, 0, 1)
+    assert ((red > 180) & (green < 80) & (blue < 80)).sum() > 500, "no red points in the picture"
+    assert len(np.unique(np.stack([blue, green, red], -1).reshape(-1, 3), axis=0)) > 50
