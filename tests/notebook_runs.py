@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -34,6 +35,12 @@ def code_cells(notebook):
 WITH_SESSION = [p for p in NOTEBOOKS if any("notebook.start(" in cell.source for cell in code_cells(read(p)))]
 
 
+def solutions(path):
+    """Code of the exercises' solutions, folded away in the text of a notebook."""
+    texts = [cell.source for cell in read(path).cells if cell.cell_type == "markdown"]
+    return [code for text in texts for code in re.findall(r"<details>.*?```python\n(.*?)```", text, re.S)]
+
+
 def run_nbval(path, report):
     """Run a notebook under nbval, which compares its outputs. Its tables go to the folder `report`."""
     command = [sys.executable, "-c", NBVAL, "-q", "-p", "nbval.plugin", "-p", "no:cacheprovider", "--tb=short"]
@@ -46,7 +53,10 @@ def run_nbval(path, report):
 
 
 def run_plainly(path, session, folder, report):
-    """Run the cells of a notebook on a session in this process, without a kernel; what it printed."""
+    """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
+
+    After them the solutions of its exercises.
+    """
     told, names = io.StringIO(), {"display": lambda shown: None}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
@@ -54,6 +64,8 @@ def run_plainly(path, session, folder, report):
             patch.setenv(name, str(value))
         for number, cell in enumerate(code_cells(read(path))):
             exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
+        for number, code in enumerate(solutions(path), start=1):
+            exec(compile(code, f"{path.stem}, solution {number}", "exec"), names)
     return told.getvalue()
 
 

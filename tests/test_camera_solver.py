@@ -14,7 +14,7 @@ from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residu
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
-from lrfcal_lib.solvers.lines import cost_readings, distance_block, point_block, start_from_lines, start_from_scene
+from lrfcal_lib.solvers.lines import distance_block, point_block, start_from_lines, start_from_scene
 from lrfcal_lib.solvers.planes import start_from_planes
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -90,7 +90,7 @@ def test_every_method_refuses_one_placement_only(name):
         *((name, "crossing_", n, f"{n} crossings of scan lines with edges, at least {n + 1} needed")
           for name, n in (("line", 5), ("line_ml", 6), ("wasielewski_strauss", 5))),
         ("bauermann", "scene_", 2, "2 scene points, at least 3 needed"),
-        ("lines", "scene_", 2, "unknown method 'lines': use one of line_last_beam, line,"),
+        ("lines", "scene_", 2, "unknown method 'lines': use one of line_printed, line_last_beam, line,"),
     ],
 )
 def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words):
@@ -109,7 +109,8 @@ def test_error_falls_with_more_placements_and_agrees_with_the_covariance(name):
             found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
             e = increment(found.transform, rig.T_camera_lrf)
             errors[count].append(np.linalg.norm(e[3:]))
-            scores.append(e @ np.linalg.solve(found.covariance[:6, :6], e) / 6)
+            known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
+            scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
     assert np.median(errors[32]) < 0.75 * np.median(errors[8])
     assert 0.6 < np.mean(scores) < 1.6
 
@@ -231,18 +232,6 @@ def test_points_on_one_line_leave_a_rotation_open():
     q = rig.T_camera_lrf.apply(points) @ rig.model.matrix.T
     with pytest.raises(DegenerateGeometry, match="do not determine rotation about"):
         solve_camera(replace(obs, scene_points=points, scene_pixels=q[:, :2] / q[:, 2:]), "bauermann", rig.T_camera_lrf)
-
-
-def test_a_product_of_distances_vanishes_when_one_edge_fits():
-    rig, obs = camera_case(21)
-    lines = obs.crossing_lines.copy()
-    lines[np.unique(obs.crossing_placement, return_index=True)[1], 2] += 10.0
-    costs = cost_readings(replace(obs, crossing_lines=lines), rig.T_camera_lrf, [0, 0, 0, 1, 0, 0], [0.0, 0.01])
-    assert costs["squared product"][0] < 1e-12 < costs["sum of squares"][0]
-    assert all(values.shape == (2,) for values in costs.values())
-    single = replace(obs, crossing_edge=np.full(len(obs.crossing_edge), "left"))
-    with pytest.raises(ValueError, match="crossings on two edges"):
-        cost_readings(single, rig.T_camera_lrf, np.ones(6), [0.0])
 
 
 def test_outlying_placements_are_found_untold():

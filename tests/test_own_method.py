@@ -27,8 +27,9 @@ def test_a_residual_and_a_row_are_a_method(monkeypatch):
     row = Method(variant="half_step", uses="crossing", fewest=6, label="angles to sight", residual=angles_to_sight)
     monkeypatch.setitem(METHODS, "angles", row)
     rig, obs = camera_case(1, noise=1.0)
-    solutions, problems = calibrate_cameras({("left", variant): obs for variant in ("half_step", "last_beam")})
-    table = method_comparison({("left", "half_step"): obs, ("left", "last_beam"): obs}, solutions).set_index("method")
+    observations = {("left", variant): obs for variant in ("half_step", "last_beam", "one_scan")}
+    solutions, problems = calibrate_cameras(observations)
+    table = method_comparison(observations, solutions).set_index("method")
     assert list(table.index) == list(METHODS) and problems == {}
     assert table.loc["angles", "left_out_edge_rms_px"] < 1.5 * table.loc["line", "left_out_edge_rms_px"]
     error = solutions["left", "angles"].transform * rig.T_camera_lrf.inv()

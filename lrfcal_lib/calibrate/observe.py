@@ -98,7 +98,7 @@ def observe(
 
 def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
-    keys = [(camera, variant) for camera in prepared.views for variant in VARIANTS]
+    keys = [(camera, variant) for camera in prepared.views for variant in (*VARIANTS, ONE_SCAN)]
     return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
 
 
@@ -121,7 +121,8 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
     middle = np.mean(prepared.scans[placement].sweep.pitch)
     sides = list(named_sides(prepared, placement, variant))
     if one_scan:
-        sides = [part for part in sides if part[0] in prepared.board.features and not part[3]]
+        features = [name for name in prepared.board.features if view.edge(name) is not None]
+        sides = [part for part in sides if part[0] in features and not part[3]]
         lines = [found.line[found.side == side] for _, found, side, _ in sides]
         both = np.intersect1d(*lines) if len(lines) == 2 else np.zeros(0, int)
     for name, found, side, across in sides:

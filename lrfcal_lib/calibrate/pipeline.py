@@ -41,7 +41,7 @@ class PlatformCalibration:
         the one to use: the stated platform, corrected by what the data know better. Rotation about the axis and shift
         along it, which no data can show, are the stated ones.
     solutions : dict of str to PlatformSolution
-        ``projected_last_beam`` (the paper), ``line_3d``.
+        ``projected_printed`` (the paper), ``projected_last_beam`` (the same in the chart used here), ``line_3d``.
     problems : dict of str to str
         Why a method has no result.
     stated_sigma : tuple of float
@@ -226,8 +226,12 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     T0, sigma = prepared.session.T_head_lrf, prepared.session.platform_sigma
     stated = None if T0 is None else (T0, stated_covariance(sigma))
     solutions, problems = {}, {}
-    fit = partial(solve_platform, sigma_pitch=sigma_pitch)
-    for name, variant, solve in (("projected_last_beam", "last_beam", solve_projected), ("line_3d", "half_step", fit)):
+    methods = {
+        "projected_printed": ("last_beam", partial(solve_projected, printed=True)),
+        "projected_last_beam": ("last_beam", solve_projected),
+        "line_3d": ("half_step", partial(solve_platform, sigma_pitch=sigma_pitch)),
+    }
+    for name, (variant, solve) in methods.items():
         try:
             solutions[name] = solve(platform_observations(prepared, variant), T0)
         except DegenerateGeometry as error:

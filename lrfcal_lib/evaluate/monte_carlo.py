@@ -270,11 +270,11 @@ def _outer(v):
     return v[..., :, None] * v[..., None, :]
 
 
-def solve_shots(shots, setup, T0):
-    """All trials by every method from start values `T0`, one a trial: dict of str to Solution with a trial axis."""
+def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):
+    """All trials from start values `T0`, one a trial: Solutions with a trial axis by method, 'line_last_beam' first."""
     half, last = observations(shots, setup), observations(shots, setup, last_beam=True)
     found = {"line_last_beam": solve_camera(last, "line", T0)}
-    return found | {method: solve_camera(half, method, T0) for method in ("line", "line_ml", "zhang_pless")}
+    return found | {method: solve_camera(half, method, T0) for method in methods}
 
 
 def shots_table(shots, setup, solutions):

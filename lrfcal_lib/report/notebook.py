@@ -120,6 +120,7 @@ def table(df, name, digits=3, caption=""):
     places = digits if isinstance(digits, dict) else dict.fromkeys(df.columns, digits)
     # none shows a minus before a zero
     shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
+    shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
     _record("tables", name, {"name": name, "caption": caption, "formats": shapes})
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")

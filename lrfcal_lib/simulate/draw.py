@@ -58,10 +58,11 @@ class Bench(Devices):
 
 @dataclass(frozen=True, kw_only=True)
 class ShotSetup(Devices):
-    """What single shots are drawn from: the paper's devices, boards at `distances` (metres); see :class:`Devices`."""
+    """What single shots are drawn from: devices like the paper's, boards at `distances` (metres)."""
 
     board: Board = field(default_factory=lambda: triangle_board(pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))))
     softness: float = 0.03
+    spread: float = 0.0  # standard deviation of `bias` from edge to edge of every placement: uneven backgrounds
     distances: tuple[float, float] = (1.0, 2.5)
 
     def bearings(self):
@@ -238,7 +239,9 @@ def _candidates(setup, rng, rig):
     shift = centre - turn @ np.append(board.corners.mean(axis=0), 0.0)
     u, ranges = _beside(board, -(shift[:, None] @ turn), polar_to_points(np.ones(len(bearings)), bearings) @ turn)
     radius = setup.radius(ranges)
-    hit = u.max(axis=-1) < (setup.bias + setup.softness * rng.standard_normal(ranges.shape)) * radius
+    own = setup.spread * rng.standard_normal((count, 1, u.shape[-1])) if setup.spread else 0.0
+    soft = (setup.bias + setup.softness * rng.standard_normal(ranges.shape)) * radius
+    hit = (u - own * radius[..., None]).max(axis=-1) < soft
     hit &= ranges > 0
     ends = np.stack([hit.argmax(axis=1), hit.shape[1] - 1 - hit[:, ::-1].argmax(axis=1)], axis=1)
     across = np.take_along_axis(u / radius[..., None], ends[..., None], axis=1)

@@ -20,7 +20,7 @@ class Method:
     Attributes
     ----------
     variant : str
-        The edge-point rule its observations are made with ('half_step' or 'last_beam').
+        Of :func:`lrfcal_lib.calibrate.observe.observe`: 'half_step', 'last_beam' or 'one_scan'.
     uses : str
         What it needs of the observations: 'crossing', 'plane' or 'scene'.
     fewest : int
@@ -49,19 +49,26 @@ class Method:
 
 PLAIN = {"weighted": False}  # as published: every residual counts the same
 METHODS = {
+    "line_printed": Method("one_scan", "crossing", 6, "lines as the paper prints them", line_block, options=PLAIN),
     "line_last_beam": Method(
-        "last_beam", "crossing", 6, "lines, last beam (the paper)", line_block, options=PLAIN, along=True
+        "last_beam", "crossing", 6, "lines, last beam, all edges", line_block, options=PLAIN, along=True
     ),
     "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
     "line_ml": Method("half_step", "crossing", 7, "lines, likelihood", lines.interval_block, lines.estimate_likely),
+    "zhang_pless_printed": Method(
+        "half_step", "plane", 3, "Zhang-Pless, unweighted", planes.plane_block, planes.estimate_from_planes, PLAIN
+    ),
     "zhang_pless": Method("half_step", "plane", 3, "Zhang-Pless", planes.plane_block, planes.estimate_from_planes),
+    "zhang_pless_k": Method(
+        "half_step", "plane", 3, "Zhang-Pless with K", planes.planes_and_pattern, planes.estimate_with_lens, {"lens": 4}
+    ),
     "zhang_pless_joint": Method(
-        "half_step", "plane", 3, "Zhang-Pless with intrinsics", planes.planes_and_pattern, planes.estimate_with_lens
+        "half_step", "plane", 3, "Zhang-Pless with K and lens", planes.planes_and_pattern, planes.estimate_with_lens
     ),
     "wasielewski_strauss": Method(
-        "half_step", "crossing", 6, "Wasielewski-Strauss", lines.distance_block, options=PLAIN
+        "half_step", "crossing", 6, "Wasielewski-Strauss, in space", lines.distance_block, options=PLAIN
     ),
-    "bauermann": Method("half_step", "scene", 3, "Bauermann", lines.point_block),
+    "bauermann": Method("half_step", "scene", 3, "after Bauermann, outline corners", lines.point_block),
 }
 STARTS = {
     "crossing": (planes.start_from_planes, lines.start_from_lines, lines.start_from_scene),

@@ -80,49 +80,6 @@ def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, **options
     )
 
 
-def cost_readings(obs, transform, direction, steps):
-    """Three readings of the garbled equation (21) along a line of parameters, for the notebook (not an estimator).
-
-    Parameters
-    ----------
-    obs : CameraObservations
-    transform : RigidTransform
-        The pose at step 0.
-    direction : array_like, shape (6,)
-        ``[w, v]``.
-    steps : array_like, shape (s,)
-        Multiples of `direction`.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (s,)
-        ``'sum of squares'`` d1^2 + d2^2, ``'squared sum'`` (d1 + d2)^2 and ``'squared product'`` (d1 d2)^2, each
-        summed over the placements; d1 and d2 are the root mean square distances at a placement's first two edges.
-        The product is zero as soon as one of the two edges fits.
-
-    Raises
-    ------
-    ValueError
-        When no placement has crossings on two edges.
-    """
-    pairs = []
-    for placement in np.unique(obs.crossing_placement):
-        here = obs.crossing_placement == placement
-        names = np.unique(obs.crossing_edge[here])[:2]
-        if len(names) == 2:
-            pairs.append([here & (obs.crossing_edge == name) for name in names])
-    if not pairs:
-        raise ValueError(f"no placement of camera '{obs.camera}' has crossings on two edges: equation (21) needs pairs")
-    poses = move_pose(geometry.pose_array(transform), np.multiply.outer(steps, np.asarray(direction, float)))
-    squares = line_block(poses, obs).residuals ** 2
-    first, second = (np.stack([squares[:, rows[i]].mean(axis=1) for rows in pairs], axis=1) for i in range(2))
-    return {
-        "sum of squares": np.sum(first + second, axis=1),
-        "squared sum": np.sum((np.sqrt(first) + np.sqrt(second)) ** 2, axis=1),
-        "squared product": np.sum(first * second, axis=1),
-    }
-
-
 SOFTNESS = 0.2  # spot radii, start value
 LEAST_STEP = 0.1  # of a beam step: with a harder flip all places between two beams are alike, and none is the middle
 LEAST_INFORMATION = 0.02  # of that of a uniform distribution over the interval; keeps steps finite where it is flat

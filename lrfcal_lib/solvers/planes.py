@@ -345,20 +345,24 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     p, count, error = len(obs.placements), len(obs.pattern_points), plane_error(obs, solution)
     common = np.diag(np.repeat([error / TILT_LEVER, error], 3) ** 2)  # of a board's pose: tilt over a lever, offset
     numbers = int(sets.number.sum() + np.isfinite(obs.pattern_pixels).sum())
-    pose, fixed = geometry.pose_array(solution.transform), np.zeros(9 - lens)
-    triangles, offset, rest = correct_and_compress(sets, pose)
-    whitener = board_whitener(pose, triangles, sets.boards, common)
-    planes = np.zeros((p, 4, 4)), np.zeros((p, 4)), np.zeros((p, 4, 4))
-    for every, scanned in zip(planes, (triangles, offset, whitener), strict=True):
-        every[sets.rows] = scanned
-    solution = solve(
-        lambda state: residual(state, planes, obs, lens), (pose, obs.model.parameters, obs.board_poses[:, :3]),
-        lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + np.r_[step[0][6:], fixed], move_pose(s[2], step[1])),
-        read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1][:lens]])),
-        names=POSE_NAMES + INTRINSIC_NAMES[:lens], method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES[:lens],
-        shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, chi2_rest=rest, n_observations=numbers,
-        **options,
-    )
+    state = geometry.pose_array(solution.transform), obs.model.parameters, obs.board_poses[:, :3]
+    fixed, earlier = np.zeros(9 - lens), []
+    for _ in range(2):
+        sets = sets._replace(boards=state[2][sets.rows])
+        triangles, offset, rest = correct_and_compress(sets, state[0])
+        whitener = board_whitener(state[0], triangles, sets.boards, common)
+        planes = np.zeros((p, 4, 4)), np.zeros((p, 4)), np.zeros((p, 4, 4))
+        for every, scanned in zip(planes, (triangles, offset, whitener), strict=True):
+            every[sets.rows] = scanned
+        solution = solve(
+            lambda state, planes=planes: residual(state, planes, obs, lens), state,
+            lambda s, step: (move_pose(s[0], step[0][:6]), s[1] + np.r_[step[0][6:], fixed], move_pose(s[2], step[1])),
+            read=lambda s: (pose_transform(s[0]), np.concatenate([read_pose(s[0])[1], s[1][:lens]])),
+            names=POSE_NAMES + INTRINSIC_NAMES[:lens], method=method, scales=(1.0,) * 6 + INTRINSIC_SCALES[:lens],
+            shared=6 + lens, freedom=numbers - 6 - lens - 6 * p, chi2_rest=rest, n_observations=numbers,
+            earlier=earlier, **options,
+        )
+        state, earlier = solution.state, [solution.cost_history]
     errors = solution.residuals[:, -2 * count :] * obs.pattern_sigma_px
     rms = float(np.sqrt(2 * np.sum(errors**2) / np.isfinite(obs.pattern_pixels).sum()))  # per corner, as OpenCV has it
     model = obs.model.with_parameters(solution.state[1], np.pad(solution.covariance[6:, 6:], (0, 9 - lens)), rms)

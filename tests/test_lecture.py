@@ -1,0 +1,54 @@
+"""The notebooks as a lecture: every equation of the paper once, short cells, exercises whose solutions run."""
+
+import ast
+import re
+
+import pytest
+from notebook_runs import NOTEBOOKS, code_cells, read, solutions
+
+LECTURE = [path for path in NOTEBOOKS if path.stem[:2] in ("00", "01", "02", "03", "04", "05")]
+WITH_EXERCISES = [path for path in NOTEBOOKS if path.stem[:2] in ("02", "03", "04", "05")]
+LONGEST_CELL = 12  # lines, imports not counted
+
+
+def texts(path):
+    return [cell.source for cell in read(path).cells if cell.cell_type == "markdown"]
+
+
+def test_every_equation_of_the_paper_stands_once():
+    tags = [int(n) for path in LECTURE for text in texts(path) for n in re.findall(r"\\tag\{(\d+)\}", text)]
+    assert sorted(tags) == list(range(1, 22))
+
+
+@pytest.mark.parametrize("path", LECTURE, ids=lambda p: p.stem)
+def test_equations_stand_before_code_that_checks_them(path):
+    """After the last equation of a text, some code asserts that it agrees with the library."""
+    cells = read(path).cells
+    numbered = [i for i, cell in enumerate(cells) if cell.cell_type == "markdown" and r"\tag{" in cell.source]
+    for first in numbered:
+        following = [cell.source for cell in cells[first + 1 :] if cell.cell_type == "code"][:12]
+        assert any("assert np." in source for source in following), cells[first].source.splitlines()[0]
+
+
+@pytest.mark.parametrize("path", LECTURE, ids=lambda p: p.stem)
+def test_cells_are_short(path):
+    for cell in code_cells(read(path)):
+        lines = [line for line in cell.source.strip().splitlines() if not line.startswith(("import ", "from "))]
+        assert len(lines) <= LONGEST_CELL, f"{len(lines)} lines: {lines[0]}"
+
+
+@pytest.mark.parametrize("path", WITH_EXERCISES, ids=lambda p: p.stem)
+def test_exercises_are_folded_and_their_solutions_are_code(path):
+    """That they run is shown where the notebooks run on a small session (test_golden.py)."""
+    folded = [text for text in texts(path) if "<details>" in text]
+    assert folded and all(text.count("<details>") == text.count("</details>") for text in folded)
+    assert 2 <= len(solutions(path)) <= 3
+    for code in solutions(path):
+        ast.parse(code)
+
+
+@pytest.mark.parametrize("stem", ["03", "04", "05"])
+def test_loops_are_visible(stem):
+    (path,) = (path for path in LECTURE if path.stem.startswith(stem))
+    sources = [cell.source for cell in code_cells(read(path))]
+    assert any("for iteration in range" in source and "np.linalg.lstsq(J, -r)" in source for source in sources)
