@@ -200,6 +200,15 @@ def test_single_lines_near_by_are_no_sweeps(seed):
     assert len(find_outlying_placements(obs)[0]) == 36
 
 
+@pytest.mark.parametrize(("method", "source"), [("zhang_pless", "lrf"), ("zhang_pless", "platform"), ("line", "lrf")])
+def test_any_start_value_reaches_the_best_minimum(method, source):
+    rng, (_, obs) = np.random.default_rng(5), camera_case(6, 20, source=source, noise=1.0)
+    best = solve_camera(obs, method).transform
+    for turn in Rotation.random(12, rng=rng):
+        far = RigidTransform.from_components(best.translation + rng.normal(0, 0.5, 3), turn * best.rotation)
+        assert transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
+
+
 @pytest.mark.parametrize("source", ["lrf", "platform"])
 @pytest.mark.parametrize("seed", range(6))
 def test_weights_never_hold_a_bad_start(seed, source):

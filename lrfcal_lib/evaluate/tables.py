@@ -179,7 +179,7 @@ def left_out(obs, judge, method, full):
     for placement in judge.all_placements:
         with suppress(DegenerateGeometry):
             rest = obs.select(obs.all_placements[obs.all_placements != placement])
-            yield judge.select([placement]), solve_camera(rest, method, full.transform)
+            yield judge.select([placement]), solve_camera(rest, method, full.transform, search=False)
 
 
 def jointly_left_out(joint, camera):

@@ -91,7 +91,7 @@ def starting_transform(obs, uses="crossing"):
     raise DegenerateGeometry("no start value, give T0. " + " | ".join(reasons))
 
 
-def solve_camera(observations, method="line", T0=None, **options):
+def solve_camera(observations, method="line", T0=None, *, search=True, **options):
     """The pose of a camera by one of the methods.
 
     Parameters
@@ -102,6 +102,8 @@ def solve_camera(observations, method="line", T0=None, **options):
         Of `METHODS`.
     T0 : RigidTransform, optional
         Start value of ``T_camera_source``, one or one a trial; found by :func:`starting_transform` when left out.
+    search : bool
+        A single T0 competes with the start value found: the better minimum is handed back. False: T0 is near it.
     **options
         ``loss`` (None or 'cauchy') of single crossings, points or whole placements, with its ``scale``
         (standard deviations, or 'auto'); ``weighted`` (False: every residual counts the same, True: by the propagated
@@ -125,10 +127,31 @@ def solve_camera(observations, method="line", T0=None, **options):
     row = METHODS[method]
     obs = observations.along() if row.along else observations
     obs.require(row.uses, row.fewest)
-    pose = pose_array(starting_transform(obs, row.uses) if T0 is None else T0)
-    trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
-    options = {"method": method, "uses": row.uses} | row.options | options
-    return row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options)
+    options, found, problem = {"method": method, "uses": row.uses} | row.options | options, [], None
+    starts = [] if T0 is None else [T0]
+    if T0 is None or (search and T0.single and getattr(obs, f"{row.uses}_points").ndim == 2):
+        try:
+            starts.append(starting_transform(obs, row.uses))
+        except DegenerateGeometry:
+            if T0 is None:
+                raise
+    for pose in map(pose_array, starts):
+        trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
+        try:
+            found.append(row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options))
+        except DegenerateGeometry as error:
+            problem = error
+    if not found:
+        raise problem
+    return found[0] if len(found) == 1 else min(found, key=lambda solution: misfit(obs, row.uses, solution.transform))
+
+
+def misfit(obs, uses, transform):
+    """What tells one minimum from another: whether the board is seen from behind the camera, then the median miss."""
+    points = getattr(obs, f"{uses}_points")
+    block = {"crossing": line_block, "scene": lines.point_block}.get(uses)
+    misses = plane_residuals_m(obs, transform) if block is None else block(pose_array(transform), obs).residuals
+    return bool(np.mean(transform.apply(points)[:, 2] < 0) > 0.5), float(np.nanmedian(np.abs(misses)))
 
 
 ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal
@@ -167,5 +190,5 @@ def find_outlying_placements(obs):
         if np.array_equal(before, keep):
             break
         some = obs.select(placements[keep])
-        T = solve_camera(some, "zhang_pless", T, **options).transform
+        T = solve_camera(some, "zhang_pless", T, search=False, **options).transform
     return placements[keep].tolist(), dict(zip(placements[~keep].tolist(), np.sqrt(mean[~keep]).tolist(), strict=True))
