@@ -139,8 +139,8 @@ def solve_camera(observations, method="line", T0=None, *, search=True, **options
         trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
         try:
             found.append(row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options))
-        except DegenerateGeometry as error:
-            problem = error
+        except (DegenerateGeometry, np.linalg.LinAlgError) as error:
+            problem = problem or error
     if not found:
         raise problem
     return found[0] if len(found) == 1 else min(found, key=lambda solution: misfit(obs, row.uses, solution.transform))
