@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.pipeline import largest_range
-from lrfcal_lib.evaluate.alternatives import doubtful, far_from_stated, places_of_cameras
+from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.solvers.joint import solve_joint
 
 YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
@@ -41,6 +43,12 @@ BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
 LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
 SAID = ("not converged", "the data do not determine")  # warnings of the solver that are findings of their own
+
+LIES = {
+    "as recorded": {}, "squares 2 % too large": {"squares": 0.02}, "squares 5 % too small": {"squares": -0.05},
+    "outline 3 % too large": {"outline": 0.03}, "all sizes 5 % too large": {"outline": 0.05, "squares": 0.05},
+    "ranges 2 % too long": {"ranges": 0.02}, "angular step 3 % too large": {"bearings": 0.03},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -254,13 +262,6 @@ def contradicts_stated(joint):
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    if abs(offset) > admitted + margin:
-        words = (
-            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
-            f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
-        )
-        reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
-        doubt = abs(offset)
     asked = doubtful(joint.solution, admitted)
     if asked:
         best = asked[0]
@@ -269,6 +270,13 @@ def contradicts_stated(joint):
         reasons.append(Reason(NO if large else CARE, best.kind, words))
         off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
         doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
+    if abs(offset) > admitted + margin:
+        words = (
+            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
+            f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
+        )
+        reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
+        doubt = max(doubt, abs(offset))
     scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (
@@ -279,6 +287,26 @@ def contradicts_stated(joint):
     for words, angle in far_from_stated(joint):
         reasons.append(Reason(NO if angle > np.pi / 2 else CARE, "far from stated", words))
     return reasons, doubt
+
+
+def falsified(joint):
+    """Statements falsified on purpose, everything estimated again (JointCalibration): what is doubted first.
+
+    Columns falsified, range_offset_mm (that the estimate finds), doubted (words).
+    """
+    rows = []
+    for name, sizes in LIES.items():
+        obs, offset = joint.observations, np.nan
+        for kind, value in sizes.items():
+            obs = ALTERNATIVES[kind].change(obs, value)
+        try:
+            solution = solve_joint(obs, required=False, **joint.settings)
+            offset, reasons = solution.sensor["range_offset"], contradicts_stated(replace(joint, solution=solution))[0]
+            words = reasons[0].words if reasons else "nothing"
+        except DegenerateGeometry as error:
+            words = f"refused: {error}"
+        rows.append((name, 1000 * offset, words))
+    return pd.DataFrame(rows, columns=["falsified", "range_offset_mm", "doubted"])
 
 
 def _left_out(calibration, method):
