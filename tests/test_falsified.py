@@ -27,7 +27,8 @@ def judged(change, seed, mount="head"):
     cameras = {name: SimpleNamespace(guess=pose) for name, pose in rig.cameras.items()}
     lrf = LrfInfo("home-made", (0.9, 2.2), 0.002, 0.005)
     session = SimpleNamespace(lrf=lrf, T_head_lrf=rig.T_head_lrf, platform_sigma=STATED, cameras=cameras)
-    joint = SimpleNamespace(prepared=SimpleNamespace(session=session), solution=solution, settings=settings)
+    prepared = SimpleNamespace(session=session, board=SimpleNamespace(pattern="a chessboard"))
+    joint = SimpleNamespace(prepared=prepared, solution=solution, settings=settings)
     reasons, doubt = contradicts_stated(joint)
     reasons += verdict(solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt).reasons
     whole = len(solution.boards) == len(truth.boards)

@@ -10,13 +10,13 @@ from scipy.ndimage import uniform_filter
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)
 SIGMAS = 2.5  # by which a reading must miss the surfaces on both sides
-MIRROR_TURN = 1 / 75.08  # s, of an LMS2xx
 GAIN_POINTS = 30_000  # that compare the exposures of images
 FRAME = "frame: platform (x = tilt axis, y ahead, z up at pitch 0)"
 UNITS = "units: metres, radians; sigma in metres, image is the number of the image that counts most (-1: none)"

@@ -10,8 +10,8 @@ import numpy as np
 
 from lrfcal_lib.emulators.line import Clock, SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import UNITS, Configuration, encode_telegram
-from lrfcal_lib.simulate.beam import MIRROR_TURN, VARIANTS
+from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN, UNITS, Configuration, encode_telegram
+from lrfcal_lib.simulate.beam import VARIANTS
 
 LOG = logging.getLogger(__name__)
 ACK, NAK = b"\x06", b"\x15"

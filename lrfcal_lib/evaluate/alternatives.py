@@ -15,6 +15,7 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
+UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
 LEVER = 0.2  # metres, weighs turns against shifts
@@ -103,7 +104,8 @@ def weigh(solution, admitted_offset):
         Of the range finder's maker, metres.
     """
     state, unknowns, obs = solution.state, solution.unknowns, solution.observations
-    before, c = named_blocks(state, gather(obs, **solution.data.levels), unknowns), solution.unknowns.shared
+    before, c = named_blocks(state, gather(obs, **solution.data.levels), unknowns), unknowns.shared
+    before = {name: whiten(block) for name, block in before.items()}
     prior, pull = np.zeros((2, c + 1))
     if "range_offset" in unknowns.sensor:
         where = unknowns.columns["range_offset"]
@@ -113,8 +115,7 @@ def weigh(solution, admitted_offset):
     for kind, alternative in ALTERNATIVES.items():
         after = named_blocks(state, gather(alternative.change(obs, STEP), **solution.data.levels), unknowns)
         hessian = gradient = 0.0
-        for name, block in before.items():
-            r, J = whiten(block)
+        for name, (r, J) in before.items():
             J = np.insert(J, c, (whiten(after[name], False)[0] - r) / STEP, axis=-1)
             back = np.swapaxes(J, -1, -2)
             hessian, gradient = hessian + back @ J, gradient + (back @ r[..., None])[..., 0]
@@ -123,7 +124,7 @@ def weigh(solution, admitted_offset):
         step = -covariance @ (score.sum(axis=0) + pull)
         own = (score + reduced @ step) @ covariance[-1]  # what each placement still pulls at the value found
         sigma = np.sqrt(max(covariance[-1, -1], np.sum(own**2) * len(own) / max(len(own) - 1, 1)))
-        if covariance[-1, -1] > 0 and sigma < alternative.worth * 100:
+        if 0 < sigma < UNKNOWN * alternative.worth:
             size, spread = (f"{x * alternative.unit:.2g}" for x in (abs(step[-1]), sigma))
             words = alternative.words.format(size=size, sigma=spread, sign=alternative.signs[int(step[-1] < 0)])
             words = f"{words}: {alternative.remedy}"
@@ -131,9 +132,12 @@ def weigh(solution, admitted_offset):
     return sorted(found, key=lambda doubt: -doubt.ratio)
 
 
-def doubtful(solution, admitted_offset):
-    """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well."""
-    found = weigh(solution, admitted_offset)
+def doubtful(solution, admitted_offset, without=()):
+    """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well.
+
+    Kinds named in `without` are not there to be wrong: the squares of a plain board.
+    """
+    found = [doubt for doubt in weigh(solution, admitted_offset) if doubt.kind not in without]
     asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
     return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
 

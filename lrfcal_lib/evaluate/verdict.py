@@ -213,7 +213,7 @@ def judge(calibration, method=None, **options):
     if reasons:  # with the words of those that the estimate excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
-    places = [] if joint is None else places_of_cameras(joint.solution)
+    places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
     return replace(_answered(found, sizes + reasons), notes=notes)
 
@@ -254,15 +254,15 @@ def _without_joint(calibration, method, doubt):
 
 
 def contradicts_stated(joint):
-    """Reasons to doubt what is stated of sizes, and by how much all ranges are off if they are wrong (metres).
+    """Reasons to doubt what session.json states, and by how much all ranges are off if a size is wrong (metres).
 
-    The reasons are a range offset that no maker admits, and what :mod:`lrfcal_lib.evaluate.alternatives` finds.
+    What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
     """
     solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    asked = doubtful(joint.solution, admitted)
+    asked = doubtful(joint.solution, admitted, () if joint.prepared.board.pattern else ("squares",))
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)

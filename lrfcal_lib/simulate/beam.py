@@ -10,7 +10,6 @@ from lrfcal_lib.session.lms2xx_codec import MODES, REASONS, encode_values
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import need
 
-MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
 NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
 VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))  # deg, 1/100 deg: of telegram 0x3B
 RAYS_AT_ONCE = 1 << 19
