@@ -8,11 +8,11 @@ import re
 
 import numpy as np
 from matplotlib.text import Text
-
-from lrfcal_lib.report import notebook
+from mpl_toolkits.mplot3d.art3d import Text3D
 
 REPORT_WIDTH, SMALLEST = 10.8, 8.0  # inches at which a report shows a wide figure: 68 rem less the margins; points
-COUNTS = ("iteration", "placement", "placements", "scan line", "edge", "chi-square per degree of freedom")
+COUNTS = {"iteration", "placement", "placements", "scan line"}
+COUNTS |= {"chi-square per degree of freedom", "probability density"}  # have no unit
 SLACK = 1.0  # pixels
 
 
@@ -20,13 +20,14 @@ def complaints(fig, renderer):
     """What is wrong with a figure as a renderer has just drawn it, a list of words."""
     shown = [ax for ax in fig.axes if ax.get_visible() and ax.has_data()]
     ticks = {axis: tick_labels(axis) for ax in fig.axes for axis in axes_of(ax)}
-    texts = [*fig.findobj(lambda a: isinstance(a, Text) and not of_axis(a) and is_drawn(a)), *itertools.chain(*ticks.values())]
-    texts += [axis.label for axis in ticks if axis.label.get_text().strip() and is_drawn(axis.label)]
+    apart = {text for ax in fig.axes for axis in ax._axis_map.values() for text in every_text(axis)}
+    texts = fig.findobj(lambda a: isinstance(a, Text) and not isinstance(a, Text3D) and a not in apart and is_drawn(a))
+    texts += [*itertools.chain(*ticks.values()), *(axis.label for axis in ticks if is_drawn(axis.label))]
     boxes = {text: text.get_window_extent(renderer) for text in texts}
     found = [] if any(titles(ax) for ax in shown) or fig.get_suptitle() else ["no title says what the figure claims"]
     for number, ax in enumerate(shown):
         found += [f"axes {number}: {words}" for words in about_axes(ax, ticks)]
-    return found + [*about_texts(fig, boxes, {label: axis for axis, labels in ticks.items() for label in labels})]
+    return found + [*about_texts(fig, boxes)]
 
 
 def axes_of(ax):
@@ -42,22 +43,17 @@ def is_drawn(text):
     return bool(text.get_visible() and text.get_text().strip() and (text.axes is None or text.axes.get_visible()))
 
 
-def of_axis(text):
-    """Whether it is a label of an axis or of a tick."""
-    axes = text.axes._axis_map.values() if text.axes else ()
-    return any(text is axis.label or text is axis.offsetText or text in every_label(axis) for axis in axes)
-
-
-def every_label(axis):
-    return [label for tick in [*axis.majorTicks, *axis.minorTicks] for label in (tick.label1, tick.label2)]
+def every_text(axis):
+    """Labels of an axis and of all its ticks, also of those out of view."""
+    ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+    return [axis.label, axis.offsetText, *itertools.chain(*((tick.label1, tick.label2) for tick in ticks))]
 
 
 def tick_labels(axis):
-    """The labels of ticks within view, along the axis."""
+    """The labels of ticks within view."""
     low, high = sorted(axis.get_view_interval())
-    margin = 1e-6 * (high - low)
-    ticks = [t for t in [*axis.majorTicks, *axis.minorTicks] if low - margin <= t.get_loc() <= high + margin]
-    ticks = sorted((t for t in ticks if t.get_visible()), key=lambda tick: tick.get_loc())
+    margin, ticks = 1e-6 * (high - low), [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+    ticks = [t for t in ticks if t.get_visible() and low - margin <= t.get_loc() <= high + margin]
     return [label for t in ticks for label in (t.label1, t.label2) if label.get_visible() and label.get_text().strip()]
 
 
@@ -75,13 +71,13 @@ def about_axes(ax, ticks):
         yield "an image without a title"
 
 
-def about_texts(fig, boxes, axis_of):
+def about_texts(fig, boxes):
     """Text that is too small, outside the canvas, or over other text."""
     factor = min(1.0, REPORT_WIDTH / fig.get_figwidth())
     for text, box in boxes.items():
         if text.get_fontsize() * factor < SMALLEST - 0.01:
             yield f"'{text.get_text()}' is {text.get_fontsize() * factor:.1f} pt in the report"
-        hidden = text.get_clip_on() and text.axes and not text.axes.bbox.overlaps(box)
+        hidden = text.get_clip_on() and text.get_clip_path() and not text.axes.bbox.overlaps(box)
         if not hidden and not ((box.min >= fig.bbox.min - SLACK).all() and (box.max <= fig.bbox.max + SLACK).all()):
             yield f"'{text.get_text()}' is cut off"
     level = [text for text in boxes if text.get_rotation() % 90 == 0]
@@ -96,9 +92,9 @@ def checked(save, told=None):
 
     def save_and_look(fig, name, caption, *, main=True):
         found = []
-        fig.canvas.mpl_connect("draw_event", lambda drawn: found.__setitem__(slice(None), complaints(fig, drawn.renderer)))
+        fig.canvas.mpl_connect("draw_event", lambda drawn: found.append(complaints(fig, drawn.renderer)))
         save(fig, name, caption, main=main)
-        words = [f"{name}: {complaint}" for complaint in found]
+        words = [f"{name}: {complaint}" for complaint in found[-1]] if found else []
         assert told is not None or not words, "\n".join(words)
         told is None or told.extend(words)
 

@@ -13,8 +13,10 @@ import matplotlib
 import nbformat
 import pandas as pd
 import pytest
+from figure_checks import checked
 from shared import ROOT, stages
 
+from lrfcal_lib.report import notebook
 from lrfcal_lib.session import cache
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -55,17 +57,19 @@ def run_nbval(path, report):
 def run_plainly(path, session, folder, report):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
-    After them the solutions of its exercises.
+    After them the solutions of its exercises. Its figures must be legible, with titles and units.
     """
-    told, names = io.StringIO(), {"display": lambda shown: None}
+    told, names, complaints = io.StringIO(), {"display": lambda shown: None}, []
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
+        patch.setattr(notebook, "save", checked(notebook.save, complaints))
         for number, cell in enumerate(code_cells(read(path))):
             exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
         for number, code in enumerate(solutions(path), start=1):
             exec(compile(code, f"{path.stem}, solution {number}", "exec"), names)
+    assert not complaints, "\n".join(complaints)
     return told.getvalue()
 
 

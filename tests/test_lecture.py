@@ -30,6 +30,27 @@ def test_equations_stand_before_code_that_checks_them(path):
         assert any("assert np." in source for source in following), cells[first].source.splitlines()[0]
 
 
+COUNTERPARTS = {
+    "00": ("Fig. 2", "Fig. 3"), "02": ("Fig. 5 (b)",), "03": ("Fig. 4 (a) to (d)",), "04": ("Fig. 1", "Fig. 6"),
+    "05": ("Fig. 7",), "06": ("Fig. 4 (e)", "Fig. 8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("stem", COUNTERPARTS)
+def test_figures_of_the_paper_have_counterparts(stem):
+    (path,) = (path for path in NOTEBOOKS if path.stem.startswith(stem))
+    source = "\n".join(cell.source for cell in code_cells(read(path)))
+    captions = re.findall(r'"(Fig\. \d[ ()a-z]*?) of the paper: ', source)
+    assert sorted(captions) == sorted(COUNTERPARTS[stem])
+
+
+def test_program_and_table_of_the_paper_have_counterparts():
+    by_stem = {path.stem[:2]: read(path) for path in NOTEBOOKS}
+    shown = next(cell for cell in by_stem["09"].cells if "Fig. 5 (a) of the paper" in cell.source)
+    assert "attachment:panel.jpg" in shown.source and "panel.jpg" in shown.attachments
+    assert any('"edge_table"' in cell.source for cell in code_cells(by_stem["06"]))
+
+
 @pytest.mark.parametrize("path", LECTURE, ids=lambda p: p.stem)
 def test_cells_are_short(path):
     for cell in code_cells(read(path)):

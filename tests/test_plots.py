@@ -7,9 +7,11 @@ from unittest.mock import Mock
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from figure_checks import complaints
 from matplotlib.colors import to_hex
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.evaluate.next_placement import Direction
 from lrfcal_lib.evaluate.uncertainty import SigmaMap
 from lrfcal_lib.model.board import Board, Chessboard, outline_lines
@@ -85,8 +87,15 @@ def test_range_image_numbers_lines_when_the_head_stands_still(ax, scan):
     assert labels(ax)[1] == "scan line"
 
 
+def test_range_images_that_share_colours_are_cut_to_the_board(ax, scan):
+    drawn = recording.range_image(ax, scan.sweep, scan.mask, (0.0, 2.5))
+    assert drawn.get_clim() == (0.0, 2.5) and len(ax.figure.axes) == 1, "the colour bar is the caller's"
+    assert ax.get_xlim() == pytest.approx((105, 74)), "6 deg beside the board, which is seen from 80 to 99 deg"
+
+
 def test_scan_line_is_to_scale_with_the_board_in_the_colour_of_the_lrf(ax, scan):
-    recording.scan_line(ax, scan.sweep, 2, scan.mask)
+    recording.scan_line(ax, scan.sweep, 2, scan.mask, scan.fitted)
+    np.testing.assert_allclose(np.linalg.norm(lines_of(ax, "fit")[0].get_xydata(), axis=1), 2.001)
     np.testing.assert_allclose(np.linalg.norm(lines_of(ax, "lrf")[0].get_xydata(), axis=1), 2.0)
     assert ax.get_aspect() == 1 and labels(ax) == ("x [m]", "y [m]")
 
@@ -146,12 +155,26 @@ def test_points_of_two_methods_stay_apart(ax):
     view = a_view(image_edge((200.0, 180.0), (201.0, 220.0)))
     recording.seen_points(ax, view, np.zeros((480, 640, 3), np.uint8), MODEL, uv, 30)
     assert legend(ax) == ["edge in the image", "line", "zhang_pless"]
+    assert [line.get_marker() for line in ax.lines[1:]] == ["o", "x"]
     assert ax.get_xlim() == (70.0, 434.0) and ax.get_title() == "right, placement 3"
 
 
 def test_pictures_are_shown_in_their_colours(ax):
     recording.picture(ax, np.full((2, 2, 3), [255, 0, 0], np.uint8))  # blue first
     assert ax.images[0].get_array()[0, 0].tolist() == [0, 0, 255]
+
+
+def test_dark_pictures_are_brightened_and_say_so(ax):
+    recording.picture(ax, np.full((8, 8, 3), [10, 20, 50], np.uint8))
+    assert ax.images[0].get_array()[0, 0].tolist() == [150, 60, 30] and texts(ax.texts) == ["brightened 3.0 times"]
+
+
+def test_board_plan_has_sizes_and_squares_where_they_are(ax):
+    board = Board("b", ("ab", "bc", "ca"), np.array([[0, 0], [0.3, 0], [0, 0.4]]), Chessboard(3, 2, 0.05, (0.06, 0.06)))
+    recording.board_plan(ax, board)
+    assert texts(ax.texts) == ["AB 300.0 mm", "BC 500.0 mm", "CA 400.0 mm"] and ax.get_aspect() == 1
+    squares = np.array([p.get_xy() for p in ax.patches[1:]])
+    assert len(squares) == 6 and np.allclose(squares.min(axis=0), 0.01), "half of 4 x 3, one square before the first"
 
 
 def test_outline_tells_lengths_and_exaggerated_spread(ax):
@@ -189,9 +212,9 @@ def test_parameter_comparison_draws_bars_only_where_a_sigma_is_known(ax):
 
 
 def test_edge_errors_show_each_edge_and_the_mean(ax):
-    results.edge_errors(ax, {"last_beam": [-5.0, -3.0], "half_step": [1.0, 2.0, 0.0]})
-    means = [line.get_ydata()[0] for line in ax.lines if line.get_linewidth() == 2.5]
-    assert means == pytest.approx([-4.0, 1.0]) and texts(ax.get_xticklabels()) == ["last beam", "half step"]
+    results.edge_errors(ax, {"last beam": [-5.0, -3.0], "half step": [1.0, 2.0, 0.0]})
+    means = [line.get_xdata()[0] for line in ax.lines if line.get_linewidth() == 2.5]
+    assert means == pytest.approx([-4.0, 1.0]) and texts(ax.get_yticklabels()) == ["last beam", "half step"]
 
 
 @IN_SPACE
@@ -232,6 +255,24 @@ def test_render_puts_a_point_where_the_pinhole_does():
     picture = rig.render([[0.2, -0.1, 2.0]], [[10, 20, 30]], IDENTITY, (40, 60), focal=50, splat=0)
     (v,), (u,) = np.nonzero((picture != 255).any(axis=2))
     assert (u, v) == (round(29.5 + 5), round(19.5 - 2.5)) and picture[v, u].tolist() == [10, 20, 30]
+
+
+def test_measured_edges_lie_on_the_rendered_corners(ax):
+    T = np.eye(4)
+    T[:3, 3] = 0.05, 0.05, 2.0
+    corners = {"ab": np.array([0.0, 0.0]), "bc": np.array([0.3, 0.0]), "ca": np.array([0.0, 0.4])}
+    measured = MeasuredBoard(T, {}, corners, {"bc": 0.499})
+    rig.measured_edges(ax, measured, {"ab": 0.3, "bc": 0.5, "ca": 0.4}, IDENTITY, (100, 120), 150)
+    cloud = [measured.corner_point("bc"), measured.corner_point("ca")]
+    picture = rig.render(cloud, np.zeros((2, 3)), IDENTITY, (100, 120), 150, splat=0)
+    drawn = np.rint(ax.lines[0].get_xydata()).astype(int)
+    assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == ["BC 499.0 mm\ntrue 500.0 mm"]
+
+
+@IN_SPACE
+def test_lines_in_space_are_named(ax):
+    rig.lines(ax, {"tilt axis": ("red", np.array([[0.0, 0, 0], [1, 0, 0]]))})
+    assert [line.get_label() for line in ax.lines] == ["tilt axis"]
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
@@ -326,3 +367,28 @@ def test_residuals_by_region_are_arrows(ax):
 def test_residuals_of_a_camera_without_boards(ax):
     results.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
     assert ax.get_title() == "right: no board in any image"
+
+
+FAULTS = {
+    "no title": ({"xlabel": "x [m]"}, "no title says what the figure claims"),
+    "no unit": ({"xlabel": "length", "title": "t"}, "'length' of the x axis has no unit"),
+    "small": ({"xlabel": "x [m]", "title": "t"}, "'tiny' is 5.0 pt in the report"),
+    "cut off": ({"xlabel": "x [m]", "title": "far too long " * 20}, "is cut off"),
+    "overlap": ({"xlabel": "x [m]", "title": "t", "xticks": [0.5, 0.501]}, "lies over"),
+    "scales": ({"xlabel": "x [m]", "ylabel": "y [m]", "title": "t"}, "x [m] and y [m] are drawn at different scales"),
+    "none": ({"xlabel": "x [m]", "title": "t"}, ""),
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_faults_of_a_figure_are_found(kind):
+    looks, told = FAULTS[kind]
+    fig, ax = plt.subplots()
+    ax.plot([0, 1], [0, 1])
+    ax.set(**{"ylabel": "time [s]"} | looks)
+    if kind == "small":
+        ax.text(0.5, 0.2, "tiny", fontsize=5)
+    fig.canvas.draw()
+    words = complaints(fig, fig.canvas.get_renderer())
+    plt.close(fig)
+    assert bool(words) == bool(told) and any(told in word for word in words or [""])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.patches import Rectangle
 
-from lrfcal_lib.model.board import corners_of_lines
+from lrfcal_lib.model.board import corners_of_lines, outline_lines
 from lrfcal_lib.model.camera import distort
 from lrfcal_lib.model.geometry import polar_to_points
 
@@ -23,36 +24,48 @@ def color_of(name, index=0):
 
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
+ABOUT = 6.0  # degrees shown on either side of a board
+BRIGHT, GAIN = 150, 5.0  # a picture whose brightest hundredth is darker is brightened, by this factor at most
 
 
-def range_image(ax, sweep, mask=None):
-    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch.
+def range_image(ax, sweep, mask=None, limits=None):
+    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch; what was drawn.
 
     With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found to be the board; it
-    is outlined.
+    is outlined, and bearings far from it are cut off. With `limits` (two ranges, metres) several sweeps share their
+    colours, and the colour bar is left to the caller.
     """
     moves, bearing, order = np.ptp(sweep.pitch) > 0, np.degrees(sweep.bearings), np.argsort(sweep.pitch, kind="stable")
     height = np.degrees(sweep.pitch) if moves else np.arange(len(sweep.pitch))
-    drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], shading="nearest", rasterized=True)
-    ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
+    looks = {"shading": "nearest", "rasterized": True} | dict(zip(("vmin", "vmax"), limits or (), strict=False))
+    drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], **looks)
+    if limits is None:
+        ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
     if mask is not None and mask.any() and len(mask) == 1:
         ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
     elif mask is not None and mask.any():
         ax.contour(bearing, height[order], mask[order].astype(float), levels=[0.5], colors="white", linewidths=1)
-    seen = bearing[np.isfinite(sweep.ranges).any(axis=0)]
-    step = np.ptp(bearing) / max(len(bearing) - 1, 1)
-    if seen.size:
-        ax.set_xlim(seen.max() + step, seen.min() - step)
+    shown, step = np.isfinite(sweep.ranges).any(axis=0), np.ptp(bearing) / max(len(bearing) - 1, 1)
+    if mask is not None and mask.any():
+        shown &= np.abs(bearing - bearing[mask.any(axis=0)].mean()) < np.ptp(bearing[mask.any(axis=0)]) / 2 + ABOUT
+    if shown.any():
+        ax.set_xlim(bearing[shown].max() + step, bearing[shown].min() - step)
     ax.grid(False)
     ax.set_aspect("equal" if moves else "auto")
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]" if moves else "scan line")
+    return drawn
 
 
-def scan_line(ax, sweep, line, mask):
-    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on the board."""
+def scan_line(ax, sweep, line, mask, fitted=None):
+    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on the board.
+
+    `fitted` (L, B) are the ranges of a fitted line, see BoardScan.
+    """
     points, on = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2], mask[line]
     ax.plot(*points[~on].T, ".", color=COLORS["raw"], label="scene" if on.any() else "returns")
     ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
+    if fitted is not None:
+        ax.plot(*polar_to_points(fitted[line], sweep.bearings)[on, :2].T, color=COLORS["fit"], label="fitted line")
     ax.plot(0, 0, marker="^", color=COLORS["lrf"], markersize=8, linestyle="none", label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
@@ -130,9 +143,13 @@ def projection(ax, edges, plane, lines=None):
 
 
 def picture(ax, image):
-    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes."""
-    color = image[..., ::-1] if image.ndim == 3 else image
-    ax.imshow(color, cmap=None if image.ndim == 3 else "gray", interpolation="antialiased")
+    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes; a dark one brightened."""
+    gain = np.clip(BRIGHT / max(np.quantile(image[::4, ::4], 0.99), 1.0), 1.0, GAIN)
+    color = np.clip(gain * image[..., ::-1], 0, 255).astype(np.uint8) if image.ndim == 3 else gain * image
+    ax.imshow(color, cmap=None if image.ndim == 3 else "gray", interpolation="antialiased", vmin=0, vmax=255)
+    if gain > 1:
+        looks = {"color": "white", "va": "bottom", "bbox": {"facecolor": "#333333", "edgecolor": "none", "pad": 2}}
+        ax.text(0.01, 0.015, f"brightened {gain:.1f} times", transform=ax.transAxes, **looks)
     ax.set_axis_off()
 
 
@@ -148,7 +165,7 @@ def board_view(ax, image, view, model, margin=60):
         ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8)
         drawn.append(view.pixels)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2", "alpha": 0.85}
-    looks = {"color": "white", "fontsize": 7, "ha": "center", "va": "center", "bbox": box, "clip_on": True}
+    looks = {"color": "white", "fontsize": 8, "ha": "center", "va": "center", "bbox": box, "clip_on": True}
     for edge in view.edges:
         drawn.append(stretch_in_image(edge, model))
         ax.plot(*drawn[-1].T, "-", color=color, linewidth=1.6)
@@ -158,8 +175,8 @@ def board_view(ax, image, view, model, margin=60):
     _cut(ax, drawn, image, margin)
 
 
-def seen_points(ax, view, image, model, points, margin=60):
-    """LRF edge points by method beside the edges of the board in the image of a view, figure 7.
+def seen_points(ax, view, image, model, points, margin=60, styles=("o", "x", "s", "+", "d", "^")):
+    """LRF points by method beside the edges of the board in the image of a view, figure 7.
 
     Parameters
     ----------
@@ -172,14 +189,16 @@ def seen_points(ax, view, image, model, points, margin=60):
         Recorded pixels by method; NaN rows are left out.
     margin : float
         Pixels around all that is drawn.
+    styles : sequence of str
+        Markers or line styles, one a method.
     """
     picture(ax, image)
     lines = [stretch_in_image(edge, model) for edge in view.edges]
     for index, stretch in enumerate(lines):
         ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=None if index else "edge in the image")
     for index, (method, uv) in enumerate(points.items()):
-        marker, color = "oxs+d^"[index % 6], SERIES[(index + 1) % len(SERIES)]
-        ax.plot(*uv.T, marker, color=color, markersize=4.5, label=method, markerfacecolor="none")
+        looks = {"color": SERIES[(index + 1) % len(SERIES)], "markersize": 4.5, "markerfacecolor": "none"}
+        ax.plot(*uv.T, styles[index % len(styles)], label=method, **looks)
     ax.legend(facecolor="#333333", labelcolor="white", frameon=True, framealpha=0.8, edgecolor="none")
     _cut(ax, [*points.values(), *lines], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
@@ -199,6 +218,24 @@ def _cut(ax, drawn, image, margin):
     box = [points.min(axis=0) - margin, points.max(axis=0) + margin] if len(points) else [[-0.5, -0.5], size]
     (left, top), (right, bottom) = np.clip(box, -0.5, size - 0.5)
     ax.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def board_plan(ax, board):
+    """A Board with its sizes, corners A, B, ... and printed squares, in its own frame."""
+    corners, turn = board.known_corners(), outline_lines(board.known_corners())[:, :2]
+    ax.fill(*corners.T, color="#333333", linewidth=0)
+    if board.pattern is not None:
+        size, start = board.pattern.square, np.subtract(board.pattern.origin, board.pattern.square)
+        for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
+            if (row + column) % 2:
+                ax.add_patch(Rectangle(start + size * np.array([column, row]), size, size, color="white", linewidth=0))
+    for index, (name, length) in enumerate(board.lengths().items()):
+        ends = corners[[index, (index + 1) % len(corners)]]
+        at, angle = ends.mean(axis=0) + 0.03 * turn[index], np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1]))
+        looks = {"ha": "center", "va": "center", "rotation": (angle + 90) % 180 - 90, "rotation_mode": "anchor"}
+        ax.text(*at, f"{name.upper()} {1000 * length:.1f} mm", **looks)
+    ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
+    to_scale(ax, "x [m]", "y [m]")
 
 
 def outline(ax, measured, exaggerate=20):

@@ -49,19 +49,20 @@ def parameter_comparison(ax, values, sigmas, label):
     for row, (method, value) in enumerate(values.items()):
         looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
         ax.errorbar(value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks)
-    names, bottom = [method.replace("_", " ") for method in values], len(values) - 0.5
-    ax.set(yticks=np.arange(len(values)), yticklabels=names, xlabel=label, ylim=(bottom, -0.5))
+    ax.set(yticks=np.arange(len(values)), yticklabels=list(values), xlabel=label, ylim=(len(values) - 0.5, -0.5))
 
 
 def edge_errors(ax, errors):
     """Errors of edge lengths (measured minus true, mm) by rule or method, one dot an edge, the mean as a bar."""
-    for column, values in enumerate(errors.values()):
+    for row, values in enumerate(errors.values()):
         spread = (np.arange(len(values)) + 0.5) / max(len(values), 1) - 0.5
-        color = SERIES[column % len(SERIES)]
-        ax.plot(column + 0.5 * spread, values, "o", color=color, markersize=3.5, alpha=0.8)
-        ax.plot([column - 0.36, column + 0.36], [np.mean(values)] * 2, color=color, linewidth=2.5)
-    by_placement(ax, [name.replace("_", " ") for name in errors], "measured - true [mm]")
-    ax.set_xlabel("")
+        color = SERIES[row % len(SERIES)]
+        ax.plot(values, row + 0.5 * spread, "o", color=color, markersize=3.5, alpha=0.8)
+        ax.plot([np.mean(values)] * 2, [row - 0.36, row + 0.36], color=color, linewidth=2.5)
+    ax.axvline(0, color=COLORS["truth"], linewidth=0.8)
+    ax.grid(False, axis="y")
+    ax.set(yticks=np.arange(len(errors)), yticklabels=list(errors), ylim=(len(errors) - 0.5, -0.5))
+    ax.set_xlabel("measured - true length [mm]")
 
 
 def method_bars(ax, table, column, label):
@@ -73,6 +74,8 @@ def method_bars(ax, table, column, label):
         ax.barh(rows + i * height, part, height=0.95 * height, color=color_of(camera, i), label=camera)
     ticks = rows + height * (len(cameras) - 1) / 2
     ax.set(yticks=ticks, yticklabels=methods, xlabel=label, ylim=(len(methods) - 0.5 * height, -height))
+    best = table.groupby("method", sort=False)[column].mean()
+    ax.set_title(f"least: {best.idxmin()}" if best.notna().any() else "no method could be judged")
     ax.legend()
 
 
@@ -100,7 +103,7 @@ def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
     mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
     ax.grid(False)
     if good.count() and good.max() > 1.05 * good.min():
-        ax.clabel(ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize="x-small", fmt="%.3g")
+        ax.clabel(ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize=8, fmt="%.3g")
     ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8, format="%.3g")
     ax.set_aspect("equal")
     rms = scale * found.rms()[index]
@@ -117,6 +120,7 @@ def point_parts(ax, found):
         color = COLORS["truth"] if name == "calibration" else SERIES[index % len(SERIES)]
         ax.plot(found.distances, 1000 * value, style, marker="o", markersize=3.5, color=color, label=name)
     ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, None))
+    ax.set_title(f"calibration: {1000 * found.rms()[-1]:.2g} mm at {found.distances[-1]:g} m")
     ax.legend()
 
 
@@ -132,7 +136,7 @@ def observability_bars(ax, directions):
     lost = f"{(~known).sum()} motions are not determined"
     ax.set_title(f"least known: {sigma[0]:.2g} mm at 2 m" if known.all() else lost)
     ax.set(ylim=(len(shown) - 0.5, -0.5), xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
-    ax.set_yticks(np.arange(len(shown)), [textwrap.fill(d.words, 46) for d in shown], fontsize="small")
+    ax.set_yticks(np.arange(len(shown)), [textwrap.fill(d.words, 64) for d in shown], fontsize=8)
     ax.grid(False, axis="y")
 
 
@@ -219,7 +223,7 @@ def background_motion(ax, steadiness):
     still = "the background stood still" + " in all cameras" * (len(judged) > 1)
     turn = np.rad2deg(np.mean([step.angle for step in steps])) if steps else 0.0
     ax.set_title(f"moved by {turn:.3f} deg between placements {where}" if steps else still)
-    ax.legend(ncols=2, fontsize="small", loc="lower right")
+    ax.legend(ncols=2, fontsize=8, loc="lower right")
 
 
 def board_bend(ax, bends):
@@ -242,7 +246,7 @@ def board_bend(ax, bends):
     by_placement(ax, [b.placement for b in found], "highest to lowest point [mm]")
     many = f"{bent.sum()} of {len(found)} boards bend in the scan, by up to {size[bent].max(initial=0.0):.0f} mm"
     ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=many if bent.any() else "no board bends")
-    ax.legend(ncols=3, fontsize="small", loc="upper left")
+    ax.legend(ncols=3, fontsize=8, loc="upper left")
 
 
 def over_view(ax, cloud, values, limit):

@@ -35,6 +35,12 @@ def rays(ax, origin, points):
     ax.plot(*np.asarray(points).T, ".", color=color, markersize=2.5)
 
 
+def lines(ax, drawn):
+    """Lines in space by their name in the legend: a colour and points (n, 3), NaN rows where a line breaks."""
+    for name, (color, points) in drawn.items():
+        ax.plot(*np.transpose(points), color=color, linewidth=1.6, label=name)
+
+
 def space(ax, points, elev=22.0, azim=-60.0, zoom=1.0, labels=True):
     """Equal scales and a view for axes in space, limits from the points (n, 3) to show, metres.
 
@@ -97,7 +103,7 @@ def render(points, colors, T_view, size, focal=None, splat=1):
     keep = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 1e-6))
     keep = keep[np.argsort(-seen[keep, 2], kind="stable")]  # far to near: of equal pixels the last one written stays
     seen, colors = seen[keep], np.asarray(colors, np.uint8)[keep]
-    uv = np.rint((focal or width) * seen[:, :2] / seen[:, 2:] + [(width - 1) / 2, (height - 1) / 2]).astype(int)
+    uv = np.rint(pixels(seen, (height, width), focal)).astype(int)
     winner = np.full((height, width), -1)
     for dv, du in np.ndindex(2 * splat + 1, 2 * splat + 1):
         u, v = uv[:, 0] + du - splat, uv[:, 1] + dv - splat
@@ -106,6 +112,11 @@ def render(points, colors, T_view, size, focal=None, splat=1):
         layer[v[inside], u[inside]] = inside
         winner = np.maximum(winner, layer)  # a larger index is nearer
     return np.vstack([colors, np.full((1, 3), 255, np.uint8)])[winner]  # the last row where no point is
+
+
+def pixels(seen, size, focal=None):
+    """Where points of the view (n, 3) stand in a picture of :func:`render`, shape (n, 2)."""
+    return (focal or size[1]) * seen[:, :2] / seen[:, 2:] + [(size[1] - 1) / 2, (size[0] - 1) / 2]
 
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)):
@@ -120,3 +131,14 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)):
     right, ahead = right / np.linalg.norm(right), ahead / np.linalg.norm(ahead)
     rotation = Rotation.from_matrix(np.stack([right, np.cross(ahead, right), ahead]))
     return RigidTransform.from_components(-rotation.apply(eye), rotation)
+
+
+def measured_edges(ax, measured, known, T_view, size, focal=None):
+    """Edges of a MeasuredBoard over a picture of :func:`render`, with their lengths and the `known` ones, metres."""
+    names, middle = list(known), pixels(T_view.apply(measured.T_platform_plane[None, :3, 3]), size, focal)[0]
+    for name, length in measured.lengths.items():
+        ends = [measured.corner_point(n) for n in (name, names[(names.index(name) + 1) % len(names)])]
+        uv = pixels(T_view.apply(np.array(ends)), size, focal)
+        ax.plot(*uv.T, "o-", color=COLORS["fit"])
+        at, words = uv.mean(axis=0) + 0.5 * (uv.mean(axis=0) - middle), f"{name.upper()} {1000 * length:.1f} mm"
+        ax.text(*at, f"{words}\ntrue {1000 * known[name]:.1f} mm", ha="center", va="center", color=COLORS["fit"])
