@@ -9,11 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import figure_checks
 import matplotlib
 import nbformat
 import pandas as pd
 import pytest
-from figure_checks import checked
 from shared import ROOT, stages
 
 from lrfcal_lib.report import notebook
@@ -51,6 +51,7 @@ def run_nbval(path, report):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
     environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem}
+    environment |= {"PYTHONSTARTUP": figure_checks.__file__}  # kernels look at the figures they save
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 
@@ -64,7 +65,7 @@ def run_plainly(path, session, folder, report):
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
-        patch.setattr(notebook, "save", checked(notebook.save, complaints))
+        patch.setattr(notebook, "save", figure_checks.checked(notebook.save, complaints))
         for number, cell in enumerate(code_cells(read(path))):
             exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
         for number, code in enumerate(solutions(path), start=1):
