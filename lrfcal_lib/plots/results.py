@@ -119,9 +119,9 @@ def point_parts(ax, found):
         style = {"range noise": ":", "calibration": "-"}.get(name, "--")
         color = COLORS["truth"] if name == "calibration" else SERIES[index % len(SERIES)]
         ax.plot(found.distances, 1000 * value, style, marker="o", markersize=3.5, color=color, label=name)
-    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, None))
+    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, 1.35 * ax.get_ylim()[1]))
     ax.set_title(f"calibration: {1000 * found.rms()[-1]:.2g} mm at {found.distances[-1]:g} m")
-    ax.legend()
+    ax.legend(ncols=2, loc="upper left")
 
 
 def observability_bars(ax, directions):

@@ -140,5 +140,6 @@ def measured_edges(ax, measured, known, T_view, size, focal=None):
         ends = [measured.corner_point(n) for n in (name, names[(names.index(name) + 1) % len(names)])]
         uv = pixels(T_view.apply(np.array(ends)), size, focal)
         ax.plot(*uv.T, "o-", color=COLORS["fit"])
-        at, words = uv.mean(axis=0) + 0.5 * (uv.mean(axis=0) - middle), f"{name.upper()} {1000 * length:.1f} mm"
-        ax.text(*at, f"{words}\ntrue {1000 * known[name]:.1f} mm", ha="center", va="center", color=COLORS["fit"])
+        away, words = uv.mean(axis=0) - middle, f"{1000 * length:.1f} mm\ntrue {1000 * known[name]:.1f} mm"
+        at, looks = uv.mean(axis=0) + 0.07 * size[1] * away / np.linalg.norm(away), {"ha": "center", "va": "center"}
+        ax.text(*at, f"{name.upper()} {words}", color=COLORS["fit"], **looks)
