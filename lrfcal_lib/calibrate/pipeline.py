@@ -345,6 +345,7 @@ def with_joint(calibration):
     return replace(calibration, platform=replace(platform, axes=axes), joint=joint, **found)
 
 
+@cached
 def leave_out(joint, groups=8):
     """The estimate without each placement: `groups` of them are left out in turn.
 
