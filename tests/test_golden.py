@@ -1,19 +1,11 @@
-"""The tables of a small session and of a recording, to the sixth digit; those of a third where its notebooks run."""
+"""The tables of a small session, to the sixth digit; those of two others are compared where their notebooks run."""
 
 import pytest
 from notebook_runs import GOLDEN, NOTEBOOKS, WITH_SESSION, check_tables, run_plainly, tables_of
 from shared import QUICK, stages
 
-each_notebook = pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
 
-
-@each_notebook
-def test_tables_of_the_recording(path, lms400_session, tmp_path):
-    run_plainly(path, lms400_session, stages(), tmp_path)
-    check_tables(tmp_path, "lms400_zed", path)
-
-
-@each_notebook
+@pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
 def test_tables_of_the_small_session(path, tmp_path):
     run_plainly(path, QUICK, stages(), tmp_path)
     check_tables(tmp_path, "sim_quick", path)

@@ -314,6 +314,7 @@ def joint_settings(prepared, observations):
     return settings
 
 
+@cached
 def calibrate_jointly(prepared):
     """Estimate everything about a session's rig at once.
 

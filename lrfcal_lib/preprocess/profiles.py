@@ -19,18 +19,19 @@ def bilinear(image, uv, lens, out):
         x, y = (uv[i, 0] - cx) / fx, (uv[i, 1] - cy) / fy
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
-        u = (x * radial + 2 * k3 * x * y + k4 * (r2 + 2 * x * x)) * fx + cx
-        v = (y * radial + k3 * (r2 + 2 * y * y) + 2 * k4 * x * y) * fy + cy
+        u = (x * radial + (2 * k3 * x * y + k4 * (r2 + 2 * x * x))) * fx + cx
+        v = (y * radial + (k3 * (r2 + 2 * y * y) + 2 * k4 * x * y)) * fy + cy
         grows = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
         if not (grows and 0 <= u < width - 1 and 0 <= v < height - 1):
             out[i] = np.nan
             continue
         column, row = int(u), int(v)
-        u, v = u - column, v - row
+        right, down = np.float32(u - column), np.float32(v - row)
+        left, up = np.float32(1) - right, np.float32(1) - down
         for c in range(channels):
-            top = image[row, column, c] * (1 - u) + image[row, column + 1, c] * u
-            bottom = image[row + 1, column, c] * (1 - u) + image[row + 1, column + 1, c] * u
-            out[i, c] = top * (1 - v) + bottom * v
+            top = np.float32(image[row, column, c]) * left + np.float32(image[row, column + 1, c]) * right
+            bottom = np.float32(image[row + 1, column, c]) * left + np.float32(image[row + 1, column + 1, c]) * right
+            out[i, c] = top * up + bottom * down
 
 
 @njit(**COMPILED)

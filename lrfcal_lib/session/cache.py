@@ -29,8 +29,8 @@ def cached(stage):
     Parameters
     ----------
     stage : callable
-        ``stage(session, ...)`` or of what has a `prepared` session; the same arguments always give the same result, and
-        nobody changes it in place.
+        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments always give the same
+        result, and nobody changes it in place.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def cached(stage):
         """The kept result of the same call, or else what the stage makes now."""
         if not os.environ.get(VARIABLE):
             return stage(of, *args, **options)
-        folder, session = Path(os.environ[VARIABLE]), of.prepared.session if hasattr(of, "prepared") else of
+        folder, session = Path(os.environ[VARIABLE]), getattr(getattr(of, "prepared", of), "session", of)
         found = folder.stat() if folder.exists() else None
         if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
             may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
