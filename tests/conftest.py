@@ -71,8 +71,8 @@ def lms400(lms400_session):
 
 
 LONGEST = (
-    "test_notebooks", "test_notebooks_recording", "test_golden", "test_record_emulated", "test_notebooks_scant", "test_image", "test_report",
-    "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
+    "test_notebooks", "test_notebooks_recording", "test_golden", "test_record_emulated", "test_notebooks_scant",
+    "test_image", "test_report", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
 )  # fmt: skip
 ALONE = ("test_stored_outputs_and_golden_tables", "test_tables_of")  # a notebook each
 
