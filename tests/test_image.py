@@ -48,7 +48,8 @@ def render(pose, board=SHEET, background=170.0, noise=1.5, seed=0):
     inverse = np.linalg.inv(pose.as_matrix()[:3, [0, 1, 3]]).astype(np.float32)
     plane = rays() @ inverse[:, :2].T + inverse[:, 2]
     x, y = plane[..., 0] / plane[..., 2], plane[..., 1] / plane[..., 2]
-    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines().astype(np.float32)], axis=0) & (plane[..., 2] > 0)
+    lines = board.lines().astype(np.float32)
+    inside = np.all([a * x + b * y + c < 0 for a, b, c in lines], axis=0) & (plane[..., 2] > 0)
     shade = np.where(inside, face(x, y, board), background)
     small = cv2.GaussianBlur(shade.reshape(MODEL.height, SAMPLES, MODEL.width, SAMPLES).mean(axis=(1, 3)), (0, 0), 0.7)
     noisy = np.clip(small + np.random.default_rng(seed).normal(0, noise, small.shape), 0, 255)
