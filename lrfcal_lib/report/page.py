@@ -128,5 +128,5 @@ def turned(text):
             for head, cell in zip(heads, row(["th", "td"]), strict=False):
                 cell["data-label"] = head.string
                 if re.fullmatch(r"[-+]?[\d.]+(e[-+]\d+)?|–|nan", cell.get_text().strip()):
-                    cell["class"] = "number"
+                    head["class"] = cell["class"] = "number"
     return str(soup)
