@@ -37,19 +37,18 @@ class Renderer(IPythonRenderer):
 
 def formula(latex, display=False):
     """A formula as MathML; a displayed one in parts, so that lines can break where it says = or +, or leaves a gap."""
-    ElementTree.register_namespace("", "http://www.w3.org/1998/Math/MathML")
-    row = ElementTree.fromstring(convert(latex))[0]
+    row = ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", convert(latex)))[0]
     parts = [[]]
     # what stands between \left and \right may be broken too
-    for node in chain.from_iterable(node if display and node.tag == row.tag else [node] for node in row):
-        if display and parts[-1] and node.tag.endswith("}mo") and node.text in ("=", "+"):
+    for node in chain.from_iterable(node if display and node.tag == "mrow" else [node] for node in row):
+        if display and parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
             node.set("form", "infix")
             parts.append([])
-        parts[-1].append(re.sub(' xmlns="[^"]*"', "", ElementTree.tostring(node, "unicode")))
-        if display and node.tag.endswith("}mspace") and float(node.get("width").removesuffix("em")) >= 1:
+        parts[-1].append(ElementTree.tostring(node, "unicode"))
+        if display and node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
             parts.append([])
-    style = ' displaystyle="true"' if display else ""
-    return " ".join(f"<math{style}><mrow>{''.join(part)}</mrow></math>" for part in parts)
+    drawn = '<math displaystyle="true">' if display else "<math>"
+    return " ".join(f"{drawn}<mrow>{''.join(part)}</mrow></math>" for part in parts)
 
 
 def render(notebook, found, number, folder):
@@ -57,11 +56,9 @@ def render(notebook, found, number, folder):
 
     `found` are the entries of :mod:`lrfcal_lib.report.notebook`; figures are taken from the report's `folder`.
     """
-    figures = {entry["name"]: entry["caption"] for entry in found["figures"]}
-    figures = {name: _figure(folder / "figures" / f"{name}.png", f"Figure {number}.{n}", caption)
-               for n, (name, caption) in enumerate(figures.items(), start=1)}  # fmt: skip
-    tables = {entry["name"]: entry for entry in found["tables"]}
-    tables = {name: _table(entry, f"Table {number}.{n}") for n, (name, entry) in enumerate(tables.items(), start=1)}
+    figures = {entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
+               for n, entry in enumerate(found["figures"], start=1)}  # fmt: skip
+    tables = {e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)}
     body, color = [], Highlight2HTML(pygments_lexer="ipython3")
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
@@ -94,11 +91,11 @@ def _output(output):
     return f"<pre>{html.escape(output.get('text') or data.get('text/plain', ''))}</pre>"
 
 
-def _figure(file, label, caption):
+def _figure(folder, entry, label):
     """A figure that holds its picture, as large as it was drawn; '' where its notebook failed before drawing it."""
-    if not file.is_file():
+    if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
         return ""
-    data, caption = file.read_bytes(), html.escape(caption)
+    data, caption = file.read_bytes(), html.escape(entry["caption"])
     width = round(int.from_bytes(data[16:20]) * PIXELS_PER_INCH)
     picture = f'<img alt="{caption}" width="{width}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
     return (f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
@@ -117,23 +114,19 @@ def _table(entry, label):
 
 def turned(text):
     """HTML whose tables a narrow screen can show turned: every cell knows the heading of its column."""
-    if "<table" not in text:
-        return text
     soup = BeautifulSoup(text, "html.parser")
-    for style in soup("style"):
-        style.decompose()
+    for part in soup(["style", "caption"]):
+        part.decompose()
     for table in soup("table"):
         heads = table.thead("th") if table.thead else []
         for head in heads:
             head.string = in_words(head.get_text(), column=True)
         table.attrs = {"class": next(name for least, name in WIDTHS if len(heads) >= least)}
-        for part in table(["caption", "th", "td", "tr"]):
+        for part in table(["th", "td", "tr"]):
             part.attrs = {}
-        for caption in table("caption"):
-            caption.decompose()
         for row in table.tbody("tr") if table.tbody else ():
             for head, cell in zip(heads, row(["th", "td"]), strict=False):
                 cell["data-label"] = head.string
                 if re.fullmatch(r"[-+]?[\d.]+(e[-+]\d+)?|–|nan", cell.get_text().strip()):
-                    cell["class"] = "number"
+                    head["class"] = cell["class"] = "number"
     return str(soup)

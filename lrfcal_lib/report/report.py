@@ -19,7 +19,6 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import date
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -293,14 +292,14 @@ def write_pages(out, session, runs, found, seconds):
     """The pages of the notebooks and the first one, of what is in the report's folder."""
     loader = FileSystemLoader(Path(__file__).parent)
     jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
-    quoted = partial(re.sub, r"(?<=')\w+(?=')", lambda m: WORDS.get(m[0], m[0]))  # methods named in sentences
-    jinja.filters["words"] = lambda text: quoted(WORDS.get(text, str(text)))
+    quoted = r"(?<=')\w+(?=')"  # methods named in sentences
+    jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: WORDS.get(m[0], m[0]), WORDS.get(text, text))
     numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
     drawn = {}
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
         body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
-        known = {"session": session, "run": run, "body": body, "before": before, "after": after}
-        made = jinja.get_template("notebook.html.jinja").render(known)
+        template = jinja.get_template("notebook.html.jinja")
+        made = template.render(session=session, run=run, body=body, before=before, after=after)
         (out / f"{run.name}.html").write_text(made, encoding="utf-8")
     figures = {name: figure for shown, _ in drawn.values() for name, figure in shown.items()}
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
