@@ -70,7 +70,7 @@ picture: setup
 	$(RUN) -m lrfcal_lib report data/sim_lms221
 	$$(command -v chromium || command -v chromium-browser || command -v google-chrome) --headless --no-sandbox \
 		--hide-scrollbars --window-size=1280,730 --screenshot=reports/.readme.png "file://$$PWD/reports/sim_lms221/index.html"
-	$(RUN) -c "import cv2; cv2.imwrite('reports/readme.jpg', cv2.imread('reports/.readme.png'))" && rm reports/.readme.png
+	$(RUN) -c "import cv2; cv2.imwrite('reports/readme.jpg', cv2.imread('reports/.readme.png'), [cv2.IMWRITE_JPEG_QUALITY, 85])" && rm reports/.readme.png
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*

@@ -47,7 +47,6 @@ PART = ".report-"  # begins the names of folders in which a report is being writ
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
 _CLIENTS = set()  # of the notebooks that are being executed
-PICTURES = ("scene", "cloud", "clouds_of_boards", "frames")  # for the first screen, the best one first
 MEASURED = ("combined", "fused", "likelihood", "half_step", "last_beam")  # edge lengths, the best way first
 SOURCE_OF_SESSIONS = (
     "there is no session to report on. Either name one, `make report SESSION=path`, or get the public recording that "
@@ -309,7 +308,7 @@ def write_pages(out, session, runs, found, seconds):
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         numbers=numbers, drawn=drawn, verdicts=verdicts, told=told, main=main, headline=_headline(out, main),
         rest=[words for words in main["sentences"][1:] if not words.startswith("Expected error")] if main else [],
-        picture=next((figures[name] for name in PICTURES if figures.get(name)), ""),
+        picture=next((figures[n] for n in ("scene", "cloud", "clouds_of_boards", "frames") if figures.get(n)), ""),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )  # fmt: skip
