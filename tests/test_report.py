@@ -23,7 +23,8 @@ from shared import ROOT
 from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_session import wall, write
 
-from lrfcal_lib.report import notebook, page, report
+from lrfcal_lib.report import notebook, report
+from lrfcal_lib.report.page import formula
 from lrfcal_lib.session.stated import SessionError
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
@@ -188,10 +189,10 @@ def test_labels_of_stored_figures_are_eight_points_or_more_at_1280():
 
 
 def test_a_displayed_formula_can_be_broken():
-    made = page.formula(r"a = b + \left( c + d \right), \qquad e = \frac{1}{2}", display=True)
+    made = formula(r"a = b + \left( c + d \right), \qquad e = \frac{1}{2}", display=True)
     parts = re.findall("<math.*?</math>", made)
     assert [re.sub("<[^>]+>", "", part) for part in parts] == ["a", "=b", "+(c", "+d),", "e", "=12"]
-    assert page.formula("a = b").count("<math") == 1
+    assert formula("a = b").count("<math") == 1
 
 
 def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
