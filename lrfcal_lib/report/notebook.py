@@ -96,6 +96,7 @@ def save(fig, name, caption, *, main=True):
     _record("figures", name, {"name": name, "caption": caption, "main": main})
     # drawing gives a figure without layout engine the default one, which would move what was placed by hand
     with plt.rc_context({"figure.constrained_layout.use": False}):
+        fig.draw_without_rendering()  # equal scales and ticks move what is laid out: a second pass settles them
         if path := report_file(f"figures/{name}.png"):
             fig.savefig(path, metadata={"Software": None})
         if get_ipython() is not None:
