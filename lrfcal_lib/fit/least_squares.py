@@ -14,7 +14,8 @@ hands over as `corrected`. Robust weights are frozen while a step is judged and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -60,16 +61,24 @@ class Block:
         """Number d of residuals that are judged together by a robust loss."""
         return self.whitener.shape[-1] if self.whitener.ndim > self.residuals.ndim else 1
 
+    @cached_property
+    def white(self):
+        """Whitened residuals."""
+        w, r = self.whitener, self.residuals
+        return w * r if w.ndim == r.ndim else (w @ r.reshape(r.shape[:-1] + (-1, w.shape[-1], 1))).reshape(r.shape)
+
+    @cached_property
+    def white_jacobian(self):
+        """Whitened Jacobian, the corrected one where there is one."""
+        w, J = self.whitener, self.jacobian if self.corrected is None else self.corrected
+        if w.ndim == self.residuals.ndim:
+            return w[..., None] * J
+        return (w @ J.reshape(J.shape[:-2] + (-1, w.shape[-1], J.shape[-1]))).reshape(J.shape)
+
 
 def whiten(block, jacobian=True):
     """Whitened residuals and (corrected) Jacobian of a block."""
-    w, r = block.whitener, block.residuals
-    J = block.jacobian if block.corrected is None else block.corrected
-    if w.ndim == r.ndim:
-        return w * r, (w[..., None] * J if jacobian else None)
-    groups = r.shape[:-1] + (-1, w.shape[-1])
-    r = (w @ r.reshape(groups + (1,))).reshape(r.shape)
-    return r, ((w @ J.reshape(groups + J.shape[-1:])).reshape(J.shape) if jacobian else None)
+    return block.white, (block.white_jacobian if jacobian else None)
 
 
 def robust(z, loss):
@@ -86,11 +95,17 @@ def usual_size(count):
     return float(np.sqrt(chi2_distribution.ppf(0.5, count) / count))
 
 
+@lru_cache(maxsize=4096)
+def largest_chi2(freedom):
+    """What chi-square stays below with a probability of 99.9 %."""
+    return float(chi2_distribution.ppf(0.999, freedom))
+
+
 def _weigh(block, loss, scale, axes):
-    """Robust weights (..., n) of a block at its own state and the loss value summed over the trial."""
-    r, d = whiten(block, jacobian=False)[0], block.size
+    """Robust weights (..., n) of a block at its own state, None without, and the loss value summed over the trial."""
+    r, d = block.white, block.size
     if block.cost is not None or loss is None:
-        return np.ones_like(r), np.sum(r**2 if block.cost is None else 2 * block.cost, axis=axes)
+        return None, (r * r if block.cost is None else 2 * block.cost).sum(axis=axes)
     squares = np.sum(r.reshape(r.shape[:-1] + (-1, d)) ** 2, axis=-1)
     count = np.broadcast_to(np.asarray(d if block.count is None else block.count, float), squares.shape)
     z = np.sqrt(squares / count)  # sizes of groups of residuals that are judged together
@@ -109,14 +124,15 @@ def _blocks(evaluate, state):
 
 
 def linearise(blocks, loss, scale, axes):
-    """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the robust weights."""
+    """Normal equations and cost of whitened, robustly weighted blocks, and the roots of the weights (None without)."""
     hessian, gradient, cost, roots = 0.0, 0.0, 0.0, []
     for block in blocks:
         weights, value = _weigh(block, loss, scale, axes)
-        roots.append(np.sqrt(weights))
         r, J = whiten(block)
-        r, J = roots[-1] * r, roots[-1][..., None] * J
-        transposed = np.swapaxes(J, -1, -2)
+        roots.append(None if weights is None else np.sqrt(weights))
+        if weights is not None:
+            r, J = roots[-1] * r, roots[-1][..., None] * J
+        transposed = J.swapaxes(-1, -2)
         hessian, gradient = hessian + transposed @ J, gradient + (transposed @ r[..., None])[..., 0]
         cost = cost + 0.5 * value
     return hessian, gradient, cost, roots
@@ -124,9 +140,11 @@ def linearise(blocks, loss, scale, axes):
 
 def _frozen_cost(blocks, roots, axes):
     """Half the sum of squares with the robust weights of an earlier state."""
-    pairs = zip(blocks, roots, strict=True)
-    each = (0.5 * (root * whiten(b, False)[0]) ** 2 if b.cost is None else b.cost for b, root in pairs)
-    return sum(np.sum(cost, axis=axes) for cost in each)
+    total = 0.0
+    for block, root in zip(blocks, roots, strict=True):
+        r = block.white if root is None else root * block.white
+        total = total + (0.5 * (r * r).sum(axis=axes) if block.cost is None else block.cost.sum(axis=axes))
+    return total
 
 
 def eliminate(hessian, gradient, shared, rcond=1e-13):
@@ -201,7 +219,8 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
         tried = _blocks(evaluate, trial)
-        before, after = _frozen_cost(blocks, roots, axes), _frozen_cost(tried, roots, axes)
+        before = cost if loss is None else _frozen_cost(blocks, roots, axes)
+        after = _frozen_cost(tried, roots, axes)
         accepted = after <= before * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * before)
         converged = converged | (small & np.isfinite(after) & (damping < 10.0))
@@ -249,12 +268,20 @@ def solve(
     Raises DegenerateGeometry naming unobservable motions when `required` (single problems only), and ValueError when
     residuals at the start are not finite.
     """
-    axes = -1 if shared is None else (-2, -1)
-    if not all(np.isfinite(block.residuals).all() for block in _blocks(evaluate, start)):
+    axes, last = -1 if shared is None else (-2, -1), [None, None]
+
+    def once(state):
+        """Blocks at a state; those of the last state are kept."""
+        if last[0] is not state:
+            last[:] = state, _blocks(evaluate, state)
+        return last[1]
+
+    if not all(np.isfinite(block.residuals).all() for block in once(start)):
         raise ValueError(f"{method}: residuals at the start value are not finite: check the observations and T0")
     options |= {"shared": shared, "loss": loss, "scale": scale}
-    state, converged, iterations, history = minimise(evaluate, start, retract, **options)
-    parts = [(*whiten(block), _weigh(block, loss, scale, axes)[0]) for block in _blocks(evaluate, state)]
+    state, converged, iterations, history = minimise(once, start, retract, **options)
+    parts = [(*whiten(block), _weigh(block, loss, scale, axes)[0]) for block in once(state)]
+    parts = [(r, J, np.ones_like(r) if weights is None else weights) for r, J, weights in parts]
     r, J, weights = (np.concatenate([p[i] for p in parts], axis=-1 if i != 1 else -2) for i in range(3))
     hessians, scores = _by_placement(r, J, weights, groups, shared)
     hessian = np.sum(hessians, axis=-3)
@@ -267,7 +294,7 @@ def solve(
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
         freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > chi2_distribution.ppf(0.999, max(freedom, 1)))
+    too_large = (freedom > 0) & (chi2 > largest_chi2(max(freedom, 1)))
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = read(state)
     return Solution(
@@ -289,7 +316,10 @@ def _by_placement(r, J, weights, groups, shared):
         return reduced_hessian(weighted @ J, shared), (weighted @ r[..., None])[:, :shared, 0]
     groups = np.zeros(1, int) if groups is None else np.asarray(groups)
     groups = np.repeat(groups, r.shape[-1] // len(groups))
-    rows = [groups == group for group in np.unique(groups)]
+    ends, names = np.r_[0, np.flatnonzero(np.diff(groups)) + 1, len(groups)].tolist(), np.unique(groups)
+    rows = [slice(*pair) for pair in pairwise(ends)]  # a group in one piece, mostly
+    if len(rows) > len(names):
+        rows = [groups == group for group in names]
     hessians = [weighted[..., here] @ J[..., here, :] for here in rows]
     scores = [(weighted[..., here] @ r[..., here, None])[..., 0] for here in rows]
     return np.stack(hessians, axis=-3), np.stack(scores, axis=-2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
@@ -21,19 +22,26 @@ def line_block(pose, obs):
     The sign of the distance is kept, and behind the camera the formula goes on (mirrored), so that a poor start value
     can still find its way. The whitener holds the crossing's covariance, projected, and the line's.
     """
-    lines, model = obs.crossing_lines, obs.model
-    rotated = rotate_points(pose, obs.crossing_points)
-    q = rotated + pose[..., None, :, 3]
-    a, b = lines[..., 0] * model.fx, lines[..., 1] * model.fy
-    x, y, z = q[..., 0], q[..., 1], q[..., 2]
-    slope = (a * x + b * y) / z
-    residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
-    gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
-    shift = geometry.moved_noise(pose, gradient, obs.crossing_covariance)
-    variance = np.sum(shift * gradient, axis=-1) + obs.crossing_line_sigma**2
-    jacobian = gradient_by_pose(rotated, gradient)
-    corrected = jacobian - geometry.noise_correction(rotated, q, gradient, shift, residuals / variance)
-    return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
+    from lrfcal_lib.fit.loops import line_rows  # numba, which few need
+
+    n, m = obs.crossing_points.shape[-2], obs.model
+    trials = max(pose.shape[:-2], obs.crossing_points.shape[:-2], key=len)
+    count, given = math.prod(trials), []
+    for value, tail in (
+        (pose if pose.ndim == len(trials) + 2 else np.broadcast_to(pose, trials + (3, 4)), (3, 4)),
+        (obs.crossing_points, (n, 3)),
+        (obs.crossing_covariance, (n, 3, 3)),
+        (obs.crossing_lines, (n, 3)),
+        (obs.crossing_line_sigma, (n,)),
+    ):  # one for all trials, or one for each
+        given.append(np.ascontiguousarray(value, float).reshape((count if value.ndim > len(tail) else 1, *tail)))
+    residuals, whitener = np.empty((2, count, n))
+    jacobian, corrected = np.empty((2, count, n, 6))
+    line_rows(*given, np.array([m.fx, m.fy, m.cx, m.cy]), residuals, whitener, jacobian, corrected)
+    shape, rows = trials + (n,), trials + (n, 6)
+    return Block(
+        residuals.reshape(shape), jacobian.reshape(rows), whitener.reshape(shape), corrected=corrected.reshape(rows)
+    )
 
 
 def read_pose(pose):
