@@ -89,6 +89,13 @@ def robust(z, loss):
     return CAUCHY**2 * np.log1p(square), 1.0 / (1.0 + square)
 
 
+def medians(values, used):
+    """Medians of the used values (..., n) of every row, 0 where there are none; many times as fast as np.nanmedian."""
+    count, ordered = used.sum(axis=-1, keepdims=True), np.sort(np.where(used, values, np.inf), axis=-1)
+    low, high = (np.take_along_axis(ordered, np.maximum(n // 2, 0), axis=-1) for n in (count - 1, count))
+    return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
+
+
 @lru_cache(maxsize=4096)
 def usual_size(count):
     """Median root mean square of `count` normal numbers."""
@@ -113,7 +120,9 @@ def _weigh(block, loss, scale, axes):
         inside = block.whitener != 0 if d == 1 else np.any(block.whitener != 0, axis=(-1, -2))
         sizes, index = np.unique(count, return_inverse=True)
         usual = np.array([usual_size(float(size)) for size in sizes])[index].reshape(count.shape)
-        scale = np.maximum(np.nanmedian(np.where(inside, z / usual, np.nan), axis=axes, keepdims=True), 1e-9)
+        wide = z.shape[: z.ndim + min(np.atleast_1d(axes))]
+        level = medians((z / usual).reshape(*wide, -1), (inside & (z == z)).reshape(*wide, -1))
+        scale = np.maximum(np.expand_dims(level, axes), 1e-9)
     value, weights = robust(z / scale, loss)
     return np.repeat(weights, d, axis=-1), np.sum(count * scale**2 * value, axis=axes)
 
