@@ -353,10 +353,12 @@ def rays(state, data, group):
 def ray_columns(by_o, by_d, ray):
     """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and direction."""
     o, d, d_head, pitch, by_parts = ray
-    back_o, back_d = tilt(by_o, -pitch), tilt(by_d, -pitch)
-    head = np.concatenate([cross(d_head, back_d), back_o], axis=-1)[..., AXIS_COLUMNS]
-    turn = (cross(o, by_o) + cross(d, by_d))[..., :1]
-    return head, turn * by_parts
+    (x, y, z), (_, y_o, z_o), (x_d, y_d, z_d) = (np.moveaxis(v, -1, 0) for v in (d_head, by_o, by_d))
+    c, s = np.cos(pitch), np.sin(pitch)
+    back = c * y_d + s * z_d, c * z_d - s * y_d  # of by_d, in the head's frame
+    head = [z * x_d - x * back[1], x * back[0] - y * x_d, c * y_o + s * z_o, c * z_o - s * y_o]  # `AXIS_COLUMNS`
+    turn = o[..., 1] * z_o - o[..., 2] * y_o + d[..., 1] * z_d - d[..., 2] * y_d
+    return np.stack(head, axis=-1), turn[..., None] * by_parts
 
 
 def assemble(unknowns, **derivatives):
@@ -459,15 +461,19 @@ def view_block(state, data, unknowns):
     t = (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
     w = geometry.log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
-    left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
+    left = inverse_left_jacobian(w)
 
-    def rows(turn, shift):
-        return np.concatenate([left @ turn, shift], axis=-2)
+    def by(columns, turn, shift):
+        """Derivatives by turns and shifts of a pose from what they do to the board's turn and shift in the camera."""
+        out = np.zeros(A.shape[:2] + (6, columns))
+        out[..., :3, : turn.shape[-1]], out[..., 3:, columns - shift.shape[-1] :] = left @ turn, shift
+        return out
 
-    axis = np.concatenate([rows(-A, A @ hat(y - head[..., 3])), rows(zero, -A)], axis=-1)[..., AXIS_COLUMNS] * moved
-    turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
-    by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
-    own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
+    axis = by(4, -A[..., 1:], np.concatenate([(A @ hat(y - head[..., 3]))[..., 1:], -A[..., 1:]], axis=-1)) * moved
+    turn = by(1, -A[..., :1], A @ hat(y)[..., :1]) * moved
+    by_board = by(6, B, B)
+    eye = np.broadcast_to(np.eye(3), A.shape)
+    own = by(6, eye, np.concatenate([-hat(t - camera[..., 3]), eye], axis=-1))
     mine = view["camera"][..., None] == np.arange(unknowns.cameras)
     cameras = (own[..., None, :] * mine[:, :, None, :, None]).reshape(A.shape[:2] + (6, -1))
     J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
