@@ -97,15 +97,9 @@ def medians(values, used):
 
 
 @lru_cache(maxsize=4096)
-def usual_size(count):
-    """Median root mean square of `count` normal numbers."""
-    return float(np.sqrt(chi2_distribution.ppf(0.5, count) / count))
-
-
-@lru_cache(maxsize=4096)
-def largest_chi2(freedom):
-    """What chi-square stays below with a probability of 99.9 %."""
-    return float(chi2_distribution.ppf(0.999, freedom))
+def largest_chi2(freedom, probability=0.999):
+    """What chi-square stays below with a probability."""
+    return float(chi2_distribution.ppf(probability, freedom))
 
 
 def _weigh(block, loss, scale, axes):
@@ -119,7 +113,7 @@ def _weigh(block, loss, scale, axes):
     if scale == "auto":
         inside = block.whitener != 0 if d == 1 else np.any(block.whitener != 0, axis=(-1, -2))
         sizes, index = np.unique(count, return_inverse=True)
-        usual = np.array([usual_size(float(size)) for size in sizes])[index].reshape(count.shape)
+        usual = np.sqrt([largest_chi2(float(size), 0.5) / size for size in sizes])[index].reshape(count.shape)
         wide = z.shape[: z.ndim + min(np.atleast_1d(axes))]
         level = medians((z / usual).reshape(*wide, -1), (inside & (z == z)).reshape(*wide, -1))
         scale = np.maximum(np.expand_dims(level, axes), 1e-9)

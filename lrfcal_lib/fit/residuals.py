@@ -24,24 +24,20 @@ def line_block(pose, obs):
     """
     from lrfcal_lib.fit.loops import line_rows  # numba, which few need
 
-    n, m = obs.crossing_points.shape[-2], obs.model
-    trials = max(pose.shape[:-2], obs.crossing_points.shape[:-2], key=len)
-    count, given = math.prod(trials), []
-    for value, tail in (
-        (pose if pose.ndim == len(trials) + 2 else np.broadcast_to(pose, trials + (3, 4)), (3, 4)),
-        (obs.crossing_points, (n, 3)),
-        (obs.crossing_covariance, (n, 3, 3)),
-        (obs.crossing_lines, (n, 3)),
-        (obs.crossing_line_sigma, (n,)),
-    ):  # one for all trials, or one for each
-        given.append(np.ascontiguousarray(value, float).reshape((count if value.ndim > len(tail) else 1, *tail)))
-    residuals, whitener = np.empty((2, count, n))
-    jacobian, corrected = np.empty((2, count, n, 6))
-    line_rows(*given, np.array([m.fx, m.fy, m.cx, m.cy]), residuals, whitener, jacobian, corrected)
-    shape, rows = trials + (n,), trials + (n, 6)
-    return Block(
-        residuals.reshape(shape), jacobian.reshape(rows), whitener.reshape(shape), corrected=corrected.reshape(rows)
+    trials, m = max(pose.shape[:-2], obs.crossing_points.shape[:-2], key=len), obs.model
+    count, poses = math.prod(trials), pose if pose.ndim > len(trials) + 1 else np.broadcast_to(pose, trials + (3, 4))
+    given = (
+        (poses, 2), (obs.crossing_points, 2), (obs.crossing_covariance, 3), (obs.crossing_lines, 2),
+        (obs.crossing_line_sigma, 1),
+    )  # fmt: skip
+    residuals, whitener = np.empty((2, *trials, obs.crossing_points.shape[-2]))
+    jacobian, corrected = np.empty((2, *residuals.shape, 6))
+    line_rows(
+        *(np.ascontiguousarray(v, float).reshape((count if v.ndim > k else 1, *v.shape[-k:])) for v, k in given),
+        np.array([m.fx, m.fy, m.cx, m.cy]),
+        *(v.reshape((count, *v.shape[len(trials) :])) for v in (residuals, whitener, jacobian, corrected)),
     )
+    return Block(residuals, jacobian, whitener, corrected=corrected)
 
 
 def read_pose(pose):
