@@ -16,11 +16,12 @@ _FILLED = [float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, :
 def line_rows(poses, points, covariances, lines, line_sigma, camera, residuals, whitener, jacobian, corrected):
     """Fill residuals and whitener (t, n), Jacobian and its correction (t, n, 6) of points and lines under poses.
 
-    Of all but the poses (t, 3, 4) there is one set for every pose, or one for all; `camera` is fx, fy, cx, cy.
+    Of poses (t, 3, 4), points, covariances, lines and their sigma there is one set for each trial or one for all;
+    `camera` is fx, fy, cx, cy.
     """
     fx, fy, cx, cy = camera
-    for t in range(len(poses)):
-        (r00, r01, r02, tx), (r10, r11, r12, ty), (r20, r21, r22, tz) = poses[t]
+    for t in range(len(residuals)):
+        (r00, r01, r02, tx), (r10, r11, r12, ty), (r20, r21, r22, tz) = poses[t % len(poses)]
         own, spread = t % len(points), t % len(covariances)
         line, sigma = t % len(lines), t % len(line_sigma)
         for i in range(points.shape[1]):

@@ -24,18 +24,20 @@ def line_block(pose, obs):
     """
     from lrfcal_lib.fit.loops import line_rows  # numba, which few need
 
-    trials, m = max(pose.shape[:-2], obs.crossing_points.shape[:-2], key=len), obs.model
-    count, poses = math.prod(trials), pose if pose.ndim > len(trials) + 1 else np.broadcast_to(pose, trials + (3, 4))
-    given = (
-        (poses, 2), (obs.crossing_points, 2), (obs.crossing_covariance, 3), (obs.crossing_lines, 2),
-        (obs.crossing_line_sigma, 1),
-    )  # fmt: skip
+    trials, m = np.broadcast_shapes(pose.shape[:-2], obs.crossing_points.shape[:-2]), obs.model
     residuals, whitener = np.empty((2, *trials, obs.crossing_points.shape[-2]))
     jacobian, corrected = np.empty((2, *residuals.shape, 6))
+    given = pose, obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma
+    out = residuals, whitener, jacobian, corrected
+
+    def flat(v, own):
+        """With one leading axis, of all trials or of one that stands for all."""
+        return v.reshape((math.prod(v.shape[: v.ndim - own]), *v.shape[v.ndim - own :]))
+
     line_rows(
-        *(np.ascontiguousarray(v, float).reshape((count if v.ndim > k else 1, *v.shape[-k:])) for v, k in given),
+        *(flat(np.ascontiguousarray(v, float), own) for v, own in zip(given, (2, 2, 3, 2, 1), strict=True)),
         np.array([m.fx, m.fy, m.cx, m.cy]),
-        *(v.reshape((count, *v.shape[len(trials) :])) for v in (residuals, whitener, jacobian, corrected)),
+        *(flat(v, own) for v, own in zip(out, (1, 1, 2, 2), strict=True)),
     )
     return Block(residuals, jacobian, whitener, corrected=corrected)
 
