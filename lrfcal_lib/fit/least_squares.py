@@ -175,7 +175,7 @@ def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it promises."""
     diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
     extra = np.asarray(damping)[..., None] * diagonal
-    extra = extra + 1e-14 * np.max(diagonal, axis=-1, keepdims=True) + 1e-300  # what nobody sees stays where it is
+    extra = extra + 1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300  # what nobody sees stays where it is
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared is None:
         step = whole = -np.linalg.solve(damped, gradient[..., None])[..., 0]
@@ -184,8 +184,8 @@ def _step(hessian, gradient, damping, shared):
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
         step = common, -(back[..., shared] + back[..., :shared] @ common)
         whole = np.concatenate([np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1)
-    length = np.sum(whole * (hessian @ whole[..., None])[..., 0], axis=-1)
-    promised = -np.sum(whole * gradient, axis=-1) - 0.5 * length
+    length = (whole * (hessian @ whole[..., None])[..., 0]).sum(axis=-1)
+    promised = -(whole * gradient).sum(axis=-1) - 0.5 * length
     return (step, length, promised) if shared is None else (step, np.sum(length), np.sum(promised))
 
 
@@ -217,7 +217,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
     hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
     history, converged = [cost], np.zeros(np.shape(cost), bool)
     damping, iteration = np.full(np.shape(cost), 1e-7), 0
-    while iteration < max_iterations and not np.all(converged):
+    while iteration < max_iterations and not converged.all():
         iteration += 1
         step, length, promised = _step(hessian, gradient, damping, shared)
         trial = retract(state, step)
@@ -227,16 +227,16 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         accepted = after <= before * (1 + 1e-12) + 1e-26
         small = (length < tolerance**2) | (length < 1e-14 * before)
         converged = converged | (small & np.isfinite(after) & (damping < 10.0))
-        if np.all(accepted):
+        if accepted.all():
             state, blocks = trial, tried
-        elif np.any(accepted):
+        elif accepted.any():
             state = np.where(accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim)), trial, state)
             blocks = _blocks(evaluate, state)
         # less damping where the linear model keeps its promise, more where it overshoots (large residuals)
         gain = np.where(promised > 3e-15 * before, (before - after) / np.maximum(promised, 1e-300), 1.0)
         kept = np.where(gain > 0.8, 0.1, 1.0) * damping
         worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
-        damping = np.clip(np.where(accepted & (gain > 0.5), kept, worse), 1e-12, 1e14)
+        damping = np.minimum(np.maximum(np.where(accepted & (gain > 0.5), kept, worse), 1e-12), 1e14)
         hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
         history.append(cost)
     return state, (bool(converged) if converged.ndim == 0 else converged), iteration, np.array(history)

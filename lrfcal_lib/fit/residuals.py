@@ -7,6 +7,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
@@ -44,7 +45,9 @@ def line_block(pose, obs):
 
 def read_pose(pose):
     """Transform and parameters of a pose state."""
-    return pose_transform(pose), geometry.pose_parameters(pose)
+    rotation = Rotation.from_matrix(pose[..., :3])
+    parameters = np.concatenate([rotation.as_rotvec(), pose[..., 3]], axis=-1)
+    return RigidTransform.from_components(pose[..., 3], rotation), parameters
 
 
 def edge_residuals_px(obs, transform, model=None):
