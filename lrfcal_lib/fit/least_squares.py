@@ -14,11 +14,11 @@ hands over as `corrected`. Robust weights are frozen while a step is judged and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -96,12 +96,6 @@ def medians(values, used):
     return np.where(count > 0, 0.5 * low + 0.5 * high, 0.0)[..., 0]
 
 
-@lru_cache(maxsize=4096)
-def largest_chi2(freedom, probability=0.999):
-    """What chi-square stays below with a probability."""
-    return float(chi2_distribution.ppf(probability, freedom))
-
-
 def _weigh(block, loss, scale, axes):
     """Robust weights (..., n) of a block at its own state, None without, and the loss value summed over the trial."""
     r, d = block.white, block.size
@@ -113,7 +107,7 @@ def _weigh(block, loss, scale, axes):
     if scale == "auto":
         inside = block.whitener != 0 if d == 1 else np.any(block.whitener != 0, axis=(-1, -2))
         sizes, index = np.unique(count, return_inverse=True)
-        usual = np.sqrt([largest_chi2(float(size), 0.5) / size for size in sizes])[index].reshape(count.shape)
+        usual = np.sqrt(chdtri(sizes, 0.5) / sizes)[index].reshape(count.shape)
         wide = z.shape[: z.ndim + min(np.atleast_1d(axes))]
         level = medians((z / usual).reshape(*wide, -1), (inside & (z == z)).reshape(*wide, -1))
         scale = np.maximum(np.expand_dims(level, axes), 1e-9)
@@ -297,7 +291,7 @@ def solve(
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
         freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > largest_chi2(max(freedom, 1)))
+    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), 0.001))
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = read(state)
     return Solution(
