@@ -8,7 +8,7 @@ import pytest
 from joint_draws import draw, square_per_number
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
 from lrfcal_lib.evaluate import tables
@@ -121,6 +121,37 @@ def test_boards_of_unknown_size_in_the_coloured_cloud(joint):
         for edge, length in fused_outline_of(joint, placement)[0].lengths.items()
     ]
     assert len(misses) >= 6 and np.mean(np.abs(misses)) < 3.0
+
+
+def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_board(joint):
+    table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint)
+    own = table[(table.source != "paper") & table.measured_mm.notna()].set_index("variant")
+    error = own.error_mm.abs().groupby("variant").mean()
+    assert error["combined"] < 1.0 and error["combined"] < error.drop(["combined", "fused"]).min() / 10
+    assert (own.loc["combined"].error_mm / own.loc["combined"].sigma_mm).abs().max() < 3.5
+    assert own.sigma_mm.notna().all() and set(own.loc["combined"].ends) <= {"image", "scan"}
+    larger = replace(joint.prepared.board, corners=joint.prepared.board.corners * 1.1)
+    other = combined.combined_outlines(replace(joint, prepared=replace(joint.prepared, board=larger)))
+    same = combined.combined_outlines(joint)
+    for placement, (board, _) in same.items():
+        for name, length in board.lengths.items():
+            assert other[placement][0].lengths[name] == pytest.approx(length, abs=1e-5)
+
+
+def test_what_is_known_of_a_board_is_differentiated_exactly(joint):
+    views = {camera: list(found.values()) for camera, found in joint.prepared.views.items()}
+    case = combined.case_of(joint, observe_joint(joint.prepared, views), next(iter(joint.without)))
+    state, covariance = combined.fitted(case, case.start, 1.0)
+    own = len(covariance) - case.unknowns.shared
+
+    def sights(step):
+        change, step = (step[: case.unknowns.shared], step[case.unknowns.shared :][None])
+        return combined.sight_block(combined.moved(case, state, (change, step)), case, 1.0).residuals[0]
+
+    J = combined.sight_block(state, case, 1.0).jacobian[0]
+    steps = 1e-6 * np.eye(len(covariance))
+    numeric = np.stack([(sights(step) - sights(-step)) / 2e-6 for step in steps], axis=1)
+    assert own > 6 and J.any() and np.abs(numeric - J).max() < 2e-2 * np.abs(J).max()
 
 
 def test_an_image_edge_on_a_plane_projects_onto_itself(found):
