@@ -5,27 +5,35 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.calibrate.pipeline import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.tables import read_truth
-from lrfcal_lib.evaluate.uncertainty import point_sigma
+from lrfcal_lib.evaluate.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
 from lrfcal_lib.model.geometry import fit_plane, tilt
 from lrfcal_lib.session.stated import read_json
 
+AT_ONCE = 1 << 16  # points
+BESIDE = 0.05  # metres along the beam by which a reading is of another surface than the beam's centre meets
 PATCH = 40  # points that average the noise out of a patch of a wall
 
 
 def with_sigma(cloud, solution):
-    """A Cloud with the standard deviations (metres) that a JointSolution predicts: its own and the range noise."""
-    axes = [np.linspace(np.min(v), np.max(v) + 1e-6, n) for v, n in ((cloud.pitch, 9), (cloud.bearing, 9))]
-    distances = np.geomspace(max(cloud.range.min(), 0.05), cloud.range.max() + 1e-6, 12)
-    found = point_sigma(solution, axes[1], axes[0], distances)
-    whole = np.hypot(found.sigma, found.parts["range noise"])
-    at = np.stack([np.maximum(cloud.range, distances[0]), cloud.pitch, cloud.bearing], axis=1)
-    return replace(cloud, sigma=RegularGridInterpolator((distances, *axes), whole)(at))
+    """A Cloud with the standard deviations (metres) of its points that a JointSolution predicts.
+
+    Of the distance of a point from its surface: calibration, errors of the sweep's pitch and range noise along the
+    normal (along the beam where there is none). A turn of the whole cloud about the tilt axis does not count.
+    """
+    chain, noise, sigma = chain_of(solution), range_noise(solution), np.zeros(len(cloud.points))
+    for part in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
+        _, J, by_pitch = carried(chain, cloud.bearing[part], cloud.pitch[part], cloud.range[part])
+        normals, beams = cloud.normals[part] @ chain.head[:, :3], -J[..., COLUMNS.index("range_offset")]
+        normals = np.where(np.isfinite(normals), normals, beams)
+        sweep = np.hypot(chain.sweep_sigma[0], chain.sweep_sigma[1] * cloud.pitch[part])
+        sweep, own = (v * np.sum(normals * by, axis=1) for v, by in ((sweep, by_pitch), (noise, beams)))
+        sigma[part] = np.sqrt(spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None]) ** 2 + sweep**2 + own**2)
+    return replace(cloud, sigma=sigma)
 
 
 def largest_plane(cloud, tolerance=0.04):
@@ -94,7 +102,9 @@ def scene_errors(cloud, calibration, method):
     gauge = truth.T_head_lrf * T_head_lrf.inv()
     turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
-    sweep = session.sweep(placement)
+    sweep, axis = session.sweep(placement), calibration.platform.axis_with(method)
+    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
+    turn += np.mean(truth.pitch[placement] - correct(placement, np.zeros(3), sweep.pitch)[1])
     order = np.argsort(sweep.pitch)
     pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])
     points = tilt(cloud.points, turn) + shift
@@ -108,7 +118,8 @@ def scene_errors(cloud, calibration, method):
     ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
     light = np.clip(light * np.median(ratio), 0, 255)
     color = np.where(cloud.seen, np.abs(cloud.colors - light).mean(axis=1), np.nan)
-    blocked, true = np.zeros(len(points), bool), origins + hits.distance[:, None] * directions
+    own = np.abs(depth) < BESIDE  # else the rim of the spot read a surface beside the beam: the point is where it is
+    blocked, true = np.zeros(len(points), bool), origins + np.where(own, hits.distance, length)[:, None] * directions
     for view in views_of(calibration, method, placement):
         mine = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
