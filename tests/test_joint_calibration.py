@@ -11,8 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
-from lrfcal_lib.evaluate import tables
+from lrfcal_lib.evaluate import scenes, tables
 from lrfcal_lib.evaluate.export import calibration_record
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
@@ -136,6 +137,55 @@ def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_bo
     for placement, (board, _) in same.items():
         for name, length in board.lengths.items():
             assert other[placement][0].lengths[name] == pytest.approx(length, abs=1e-5)
+
+
+def other_session(found, **changes):
+    """The calibration of a session whose images are not as they were."""
+    session = found.prepared.session
+    records = tuple(replace(record, **changes) for record in session.image_records)
+    return replace(found, prepared=replace(found.prepared, session=replace(session, image_records=records)))
+
+
+BAD = {
+    "images without a known pitch": (lambda c: other_session(c, pitch=np.nan), "joint", "of none is the pitch known"),
+    "a method that was not run": (lambda c: c, "line_printed", "'line_printed' poses no camera"),
+    "another rig's cameras": (
+        lambda c: replace(c, solutions={("top", m): s for (_, m), s in c.solutions.items()}), "joint",
+        "they are of left, right, the calibration by 'joint' poses top",
+    ),
+    "another rig's lenses": (
+        lambda c: replace(c, prepared=replace(c.prepared, models={
+            name: replace(model, width=320, height=240) for name, model in c.prepared.models.items()})),
+        "joint", "has 320 x 240 pixels, its image",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_colour_a_cloud_is_refused(found, case):
+    change, method, words = BAD[case]
+    with pytest.raises(ValueError, match=words):
+        pipeline.color_cloud(change(found), method)
+
+
+def test_lengths_between_features_know_how_good_they_are(found):
+    """Two halves of one face are no distance apart across it, and half a board along it."""
+    cloud, solution, offs = pipeline.color_cloud(found, "joint"), found.joint.solution, []
+    for placement in np.unique(cloud.placement):
+        rows = np.flatnonzero(cloud.placement == placement)
+        x = cloud.points[rows, 0]
+        left, right = rows[x < np.median(x)], rows[x >= np.median(x)]
+        planes = [scenes.fit_feature(cloud, half, solution) for half in (left, right)]
+        length, sigma = scenes.length_between(scenes.fit_feature(cloud, rows, solution), planes[0])
+        offs.append(length / sigma)
+        points = [scenes.fit_feature(cloud, half, solution, plane=False) for half in (left, right)]
+        length, sigma = scenes.length_between(*points)
+        assert length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre)) and 0 < sigma < 0.01
+        length, sigma = scenes.length_between(points[0], planes[1])
+        assert length < 5 * sigma
+    assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
+    with pytest.raises(DegenerateGeometry, match="no point"):
+        scenes.fit_feature(cloud, [], solution)
 
 
 def test_what_is_known_of_a_board_is_differentiated_exactly(joint):

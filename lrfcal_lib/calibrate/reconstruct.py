@@ -253,6 +253,10 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     """
     if not np.isfinite(sweep.ranges).any():
         raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range)")
+    ends, view = (np.degrees([min(v), max(v)]).round(2) for v in (sweep.bearings, lrf.field_of_view))
+    if ends[0] < view[0] - np.degrees(lrf.bearing_step) or ends[1] > view[1] + np.degrees(lrf.bearing_step):
+        words = f"bearings {ends[0]} to {ends[1]} deg, '{lrf.model}' sees {view[0]} to {view[1]} deg"
+        raise ValueError(f"placement {sweep.placement}: {words}: take the calibration of the rig that recorded it")
     turns = np.abs(np.diff(sweep.pitch))
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
     painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall

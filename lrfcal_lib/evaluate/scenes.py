@@ -11,7 +11,7 @@ from lrfcal_lib.calibrate.pipeline import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.tables import read_truth
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
-from lrfcal_lib.model.geometry import fit_plane, tilt
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt
 from lrfcal_lib.session.stated import read_json
 
 AT_ONCE = 1 << 16  # points
@@ -62,6 +62,65 @@ def flatness(points):
     mean = (np.bincount(which, miss) / count)[count >= PATCH / 2]
     noise = np.var(miss - (np.bincount(which, miss) / count)[which]) / PATCH
     return miss, float(np.sqrt(max(np.mean(mean**2) - noise, 0.0)))
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A plane or a point fitted to some points of a Cloud, metres.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+    normal : ndarray, shape (3,), or None
+        Of a plane.
+    noise, tilt : ndarray, shape (3, 3)
+        Covariances of centre and normal from the range noise (or the points' scatter about the plane).
+    jacobian : ndarray, shape (3, 13)
+        Of the centre by what the calibration may have wrong; `chain` knows how much.
+    """
+
+    centre: np.ndarray
+    normal: np.ndarray | None
+    noise: np.ndarray
+    tilt: np.ndarray
+    jacobian: np.ndarray
+    chain: object
+
+
+def fit_feature(cloud, chosen, solution, plane=True):
+    """Fit a plane, or else take the middle, of chosen points (index or mask) of a Cloud: a Feature.
+
+    `solution` is the JointSolution that the cloud was made with. DegenerateGeometry if the points span no plane.
+    """
+    part, chain, noise = cloud.rows(chosen), chain_of(solution), range_noise(solution)
+    if not len(part.points):
+        raise DegenerateGeometry("no point of the cloud was chosen")
+    J, R, centre = carried(chain, part.bearing, part.pitch, part.range)[1], chain.head[:, :3], part.points.mean(axis=0)
+    beams = -J[..., COLUMNS.index("range_offset")] @ R.T
+    scatter, count, normal, tilted = noise**2 * beams.T @ beams, len(beams), None, np.zeros((3, 3))
+    if plane:
+        normal, _, rough = fit_plane(part.points)
+        variance = max(noise**2 * np.mean((beams @ normal) ** 2), rough**2)
+        size, axes = np.linalg.eigh(np.cov(part.points.T, bias=True))
+        scatter = variance * count * np.outer(normal, normal)
+        tilted = variance / count * (axes[:, 1:] / size[1:]) @ axes[:, 1:].T
+    return Feature(centre, normal, scatter / count**2, tilted, R @ J.mean(axis=0), chain)
+
+
+def length_between(first, second):
+    """Length between two Features and its standard deviation, metres.
+
+    Between two points along the line that joins them, otherwise along the normal of the plane, or the mean of both.
+    What the calibration has wrong counts as far as it moves the two apart.
+    """
+    way, planes = second.centre - first.centre, [f for f in (first, second) if f.normal is not None]
+    normals = [f.normal * np.copysign(1.0, f.normal @ planes[0].normal) for f in planes] or [way]
+    along = np.mean(normals, axis=0)
+    along = along / np.linalg.norm(along)
+    variance = along @ (first.noise + second.noise) @ along
+    variance += sum(way @ plane.tilt @ way for plane in planes) / len(normals) ** 2
+    common = spread(first.chain, (along @ (second.jacobian - first.jacobian))[None])
+    return float(abs(along @ way)), float(np.sqrt(variance + common**2))
 
 
 @dataclass(frozen=True)
