@@ -76,6 +76,11 @@ ALTERNATIVES = {
         }), 0.004, 100.0, ("small", "large"),
         "bearings are {size} +- {sigma} % too {sign}", "check the angular step that session.json states",
     ),
+    "spot": Alternative(
+        lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)), 0.2, 100.0, LARGER,
+        "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
+        "check spot_exit_m and spot_divergence_rad, or leave them out",
+    ),
 }  # fmt: skip
 
 

@@ -33,6 +33,7 @@ DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the 
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
 LARGE = {"squares": 0.02, "ranges": 0.02}  # errors of sizes that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
+RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
 LOST = 0.1  # share of the placements that may be left out without a warning
 SIZES = (
     "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
@@ -277,6 +278,10 @@ def contradicts_stated(joint):
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = max(doubt, abs(offset))
+    if abs(bias := joint.solution.edge_bias) > RIM:
+        words = f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius outside the edges)"
+        words = f"{words}: state spot_exit_m and spot_divergence_rad as they are, or measure the board's edges"
+        reasons.append(Reason(CARE, "spot", words))
     scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (
