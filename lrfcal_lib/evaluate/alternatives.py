@@ -18,6 +18,7 @@ ASKED = 4.0  # standard deviations beyond which the data contradict a statement
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
+ALIKE = 0.15  # log odds; sides are expected to deviate no more than this while statements are weighed
 LEVER = 0.2  # metres, weighs turns against shifts
 LARGER = ("larger", "smaller")
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
@@ -109,7 +110,9 @@ def weigh(solution, admitted_offset):
         Of the range finder's maker, metres.
     """
     state, unknowns, obs = solution.state, solution.unknowns, solution.observations
-    before, c = named_blocks(state, gather(obs, **solution.data.levels), unknowns), unknowns.shared
+    # sides that may deviate, and beams that may say nothing, take up what a wrong statement does to edges
+    levels = solution.data.levels | {"side_sigma": min(solution.data.side_sigma, ALIKE), "lapse": 0.0}
+    before, c = named_blocks(state, gather(obs, **levels), unknowns), unknowns.shared
     before = {name: whiten(block) for name, block in before.items()}
     prior, pull = np.zeros((2, c + 1))
     if "range_offset" in unknowns.sensor:
@@ -118,7 +121,7 @@ def weigh(solution, admitted_offset):
         pull[where] = prior[where] * solution.sensor["range_offset"]
     found = []
     for kind, alternative in ALTERNATIVES.items():
-        after = named_blocks(state, gather(alternative.change(obs, STEP), **solution.data.levels), unknowns)
+        after = named_blocks(state, gather(alternative.change(obs, STEP), **levels), unknowns)
         hessian = gradient = 0.0
         for name, (r, J) in before.items():
             J = np.insert(J, c, (whiten(after[name], False)[0] - r) / STEP, axis=-1)
@@ -144,7 +147,8 @@ def doubtful(solution, admitted_offset, without=()):
     """
     found = [doubt for doubt in weigh(solution, admitted_offset) if doubt.kind not in without]
     asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
-    return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
+    # sizes first: with all backgrounds equally far a wide spot does what a large outline does
+    return sorted((d for d in asked if d.ratio > AS_GOOD * asked[0].ratio), key=lambda d: d.kind == "spot")
 
 
 def far_from_stated(joint):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
+from scipy.stats import t as student
 
 from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras
@@ -21,7 +22,7 @@ YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
          NO: "This calibration cannot be trusted"}  # fmt: skip
 DISTANCES = (1.0, 2.0, 5.0)  # metres
-FEWEST, FEW = 3, 6  # placements
+FEWEST, FEW, MANY = 3, 6, 12  # placements: too few, few, enough to know their scatter
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
 SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
@@ -216,6 +217,10 @@ def judge(calibration, method=None, **options):
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
+    if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
+        known, within = 100 / np.sqrt(2 * (n - 1)), student.ppf(0.95, n - 1)
+        words = f"The scatter over {n} placements is itself known to {known:.0f} % only"
+        notes += (f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",)
     return replace(_answered(found, sizes + reasons), notes=notes)
 
 
