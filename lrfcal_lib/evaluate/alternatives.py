@@ -147,8 +147,7 @@ def doubtful(solution, admitted_offset, without=()):
     """
     found = [doubt for doubt in weigh(solution, admitted_offset) if doubt.kind not in without]
     asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
-    # sizes first: with all backgrounds equally far a wide spot does what a large outline does
-    return sorted((d for d in asked if d.ratio > AS_GOOD * asked[0].ratio), key=lambda d: d.kind == "spot")
+    return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
 
 
 def far_from_stated(joint):

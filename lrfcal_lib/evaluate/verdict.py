@@ -268,7 +268,10 @@ def contradicts_stated(joint):
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    asked = doubtful(joint.solution, admitted, () if joint.prepared.board.pattern else ("squares",))
+    # a spot that nobody states, or before backgrounds that are all alike, is no statement
+    told = lrf.spot_exit is not None and bool(np.any(joint.solution.observations.beam_background))
+    known = {"squares": joint.prepared.board.pattern is not None, "spot": told}
+    asked = doubtful(joint.solution, admitted, [kind for kind, there in known.items() if not there])
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
