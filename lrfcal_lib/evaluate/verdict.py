@@ -268,8 +268,9 @@ def contradicts_stated(joint):
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    # a spot that nobody states, or before backgrounds that are all alike, is no statement
-    told = lrf.spot_exit is not None and bool(np.any(joint.solution.observations.beam_background))
+    # the spot is to be stated, and before many backgrounds of different distance
+    many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
+    told = lrf.spot_exit is not None and bool(many)
     known = {"squares": joint.prepared.board.pattern is not None, "spot": told}
     asked = doubtful(joint.solution, admitted, [kind for kind, there in known.items() if not there])
     if asked:
