@@ -216,16 +216,13 @@ def _single(points):
 
 def _share(some, count):
     """Call ``some(rows, worker)`` for slices of so many rows, in threads: the compiled loops free the interpreter."""
-    slices = [slice(start, min(start + SHARE, count)) for start in range(0, count, SHARE)]
 
     def work(worker):
-        for rows in slices[worker::WORKERS]:
-            some(rows, worker)
+        for start in range(worker * SHARE, count, WORKERS * SHARE):
+            some(slice(start, start + SHARE), worker)
 
-    if len(slices) < 2:
-        return work(0)
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(work, range(WORKERS)))
+        list(pool.map(work, range(WORKERS)))
 
 
 def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mask=None):
