@@ -51,9 +51,10 @@ def every_text(axis):
 
 def tick_labels(axis):
     """The labels of ticks within view."""
-    low, high = sorted(axis.get_view_interval())
-    margin, ticks = 1e-6 * (high - low), [*axis.get_major_ticks(), *axis.get_minor_ticks()]
-    ticks = [t for t in ticks if t.get_visible() and low - margin <= t.get_loc() <= high + margin]
+    scaled, ticks = axis.get_transform().transform, [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+    low, high = sorted(scaled(np.array(axis.get_view_interval(), float)))
+    at, margin = scaled(np.array([tick.get_loc() for tick in ticks], float)), 1e-6 * (high - low)
+    ticks = [t for t, x in zip(ticks, at, strict=True) if t.get_visible() and low - margin <= x <= high + margin]
     return [label for t in ticks for label in (t.label1, t.label2) if label.get_visible() and label.get_text().strip()]
 
 
