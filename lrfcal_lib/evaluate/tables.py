@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from lrfcal_lib.calibrate.combined import combined_outlines
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
@@ -481,7 +481,7 @@ def edge_summary(table):
     the errors inside their 90 % intervals; NaN where nothing is said about them).
     """
     table = table[table.measured_mm.notna()]
-    within = (table.error_mm.abs() < norm.ppf(0.95) * table.sigma_mm).where(table.sigma_mm.notna())
+    within = (table.error_mm.abs() < ndtri(0.95) * table.sigma_mm).where(table.sigma_mm.notna())
     groups = table.assign(size=table.error_mm.abs(), within=100 * within.astype(float))
     return groups.groupby(["source", "ends", "variant"], sort=False).agg(
         n=("size", "size"), mean_abs_error_mm=("size", "mean"), median_abs_error_mm=("size", "median"),
