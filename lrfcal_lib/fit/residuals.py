@@ -190,7 +190,8 @@ SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
-USUAL = {"edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}  # and how widely they may differ
+# and how widely they may differ: at the rim of the spot the odds say nothing any more
+USUAL = {"edge_log_odds": (0.0, 6.0), "edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}
 SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
 AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
 
@@ -550,7 +551,8 @@ def named_blocks(state, data, unknowns):
         blocks["sweep"] = sweep_block(state, data, unknowns)
     if unknowns.sides:
         blocks["side"] = side_block(state, data, unknowns)
-    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in unknowns.sensor}
+    shown = set(unknowns.sensor) - (set() if "beam" in blocks else {"edge_log_odds"})
+    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in shown}
     if data.prior is not None and unknowns.axis:
         blocks["prior"] = prior_block(state, data, unknowns)
     return blocks

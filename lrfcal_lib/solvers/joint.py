@@ -19,7 +19,7 @@ from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
-START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 60
+START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 300
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
