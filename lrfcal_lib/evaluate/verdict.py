@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras
@@ -218,7 +218,7 @@ def judge(calibration, method=None, **options):
     places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
-        known, within = 100 / np.sqrt(2 * (n - 1)), student.ppf(0.95, n - 1)
+        known, within = 100 / np.sqrt(2 * (n - 1)), stdtrit(n - 1, 0.95)
         words = f"The scatter over {n} placements is itself known to {known:.0f} % only"
         notes += (f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",)
     return replace(_answered(found, sizes + reasons), notes=notes)
