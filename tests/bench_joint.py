@@ -40,7 +40,7 @@ def whole(count=100):
 def against_scipy(count=5):
     """The core against scipy's dense trust region with a numeric Jacobian, increments about the start value."""
     obs = none(problem(count), "beam")
-    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))
+    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
     c = unknowns.shared
 
     def state_of(x):

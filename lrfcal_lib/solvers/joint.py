@@ -16,6 +16,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_param
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
+from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
@@ -218,9 +219,10 @@ def solve_joint(
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
+    rivals = ()
     if start is None:
         obs, lost = without_lost_placements(obs)
-        obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
+        obs, start, bad, rivals = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
     data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     state = converged(start, data, coarse(unknowns))
@@ -234,7 +236,8 @@ def solve_joint(
             state, data = settle(state, data, unknowns)
     if noise == "estimate" or lapse:
         state = converged(state, data, unknowns, LAST_STEP)
-    return finished(obs, state, data, unknowns, excluded, required)
+    found = finished(obs, state, data, unknowns, excluded, required)
+    return replace(found, warnings=rivals + found.warnings)
 
 
 def solve_again(obs, like):
@@ -320,23 +323,24 @@ def image_name(obs, row):
 
 
 def best_start(obs, unknowns, sweep_sigma, T0=None):
-    """The most promising start value, what is left of the observations with it, and in words what is not.
+    """The most promising start value: the observations left with it, itself, what is not left, and its rivals (words).
 
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
-    data, least = gather(obs, sweep_sigma=tuple(sweep_sigma)), np.inf
-    for number, state in enumerate(start_states(obs, T0)):
-        if not unknowns.axis:
-            known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
-            state = replace(state, head=pose_array(known))
-        misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
-        found = agreeing_start(obs, state, data, unknowns)
-        badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2]))
-        if number == 0 or badness < least:
-            (kept, start, bad, _), rough, least = found, np.median(misses), badness
-        if least < GOOD_START and (T0 is None or number):
+    data, tried = gather(obs, sweep_sigma=tuple(sweep_sigma)), []
+    for number, states in enumerate(start_states(obs, T0)):
+        for state in states:
+            if not unknowns.axis:
+                known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
+                state = replace(state, head=pose_array(known))
+            misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
+            found = agreeing_start(obs, state, data, unknowns)
+            tried.append((found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])), *found[:3], np.median(misses)))
+        if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
             break
+    tried.sort(key=lambda one: one[0])
+    kept, start, bad, rough = tried[0][1:]
     miss = np.median(joint_noise.view_misses(start, gather(kept)))
     if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
@@ -349,7 +353,25 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, start, bad
+    return kept, start, bad, rival_words(obs, tried)
+
+
+def rival_words(obs, tried):
+    """In words, which start values with cameras far from the best one's explain the data nearly as well."""
+    poses = [_seen_from_lrf(obs, state) for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
+    words = [
+        f"a second minimum explains the data nearly as well: camera '{name}' {np.degrees(turn):.0f} deg and "
+        f"{1000 * shift:.0f} mm from where it is handed over; record more placements that lean other ways"
+        for others in poses[1:] for name, *both in zip(obs.cameras, others, poses[0], strict=True)
+        for turn, shift in [geometry.transform_difference(*both)] if turn > SAME_TURN
+    ]  # fmt: skip
+    return tuple(dict.fromkeys(words))
+
+
+def _seen_from_lrf(obs, state):
+    """``T_camera_lrf`` of all cameras at pitch zero."""
+    poses, head = map(pose_transform, state.cameras), pose_transform(state.head)
+    return [T if mount == "head" else T * head for T, mount in zip(poses, obs.mounts, strict=True)]
 
 
 def left_out_shares(obs, bad):
