@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.pipeline import largest_range
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras
+from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
 from lrfcal_lib.evaluate.diagnosis import problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
@@ -316,6 +316,9 @@ def contradicts_stated(joint):
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     asked = doubtful(joint.solution, admitted, () if joint.prepared.board.pattern else ("squares",))
+    instead = not_an_offset(joint.solution)
+    if instead and (not asked or asked[0].kind == instead.kind):
+        asked, doubt = [instead], abs(offset)
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
@@ -323,7 +326,7 @@ def contradicts_stated(joint):
         reasons.append(Reason(NO if large else CARE, best.kind, words))
         off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
         doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
-    if abs(offset) > admitted + margin:
+    if abs(offset) > admitted + margin and instead not in asked:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
             f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
