@@ -23,7 +23,7 @@ SWEEP_SIGMA = (np.radians(0.5), 0.05)
 START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 60
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
-LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
+LEFT_OUT = 1000.0  # times the squared share: what a start value that leaves out placements counts against others
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
@@ -336,7 +336,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
                 state = replace(state, head=pose_array(known))
             misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
             found = agreeing_start(obs, state, data, unknowns)
-            tried.append((found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])), *found[:3], np.median(misses)))
+            tried.append((found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2, *found[:3], np.median(misses)))
         if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
             break
     tried.sort(key=lambda one: one[0])

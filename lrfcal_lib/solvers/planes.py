@@ -171,11 +171,13 @@ def start_from_planes(obs):
         found += [closed_form(lines[rows], sets.boards[rows], False) @ frame.T for rows in own]
     candidates = _before_boards(np.concatenate(found), sets, _centred(triangles)[1])
 
-    def trimmed(candidates):
-        """Mean square (m^2) of candidates over more placements than a closed form uses."""
+    least = max(p // 2 + 2, 7 if flat else 5)  # more placements than a closed form uses
+
+    def trimmed(candidates, count=least):
+        """Mean square (m^2) of candidates over so many placements, those they suit best."""
         residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
         squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
-        return squares[:, : max(p // 2 + 2, 7 if flat else 5)].mean(axis=1)
+        return squares[:, :count].mean(axis=1)
 
     def evaluate(pose):
         return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
@@ -184,9 +186,9 @@ def start_from_planes(obs):
     best = candidates[[*order[:8], *_apart(candidates, order[:MINIMAL])]]
     refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
     every = np.concatenate([refined, best])
-    misses = trimmed(every)
-    apart = np.array(_apart(every, np.argsort(misses)))
-    return pose_transform(every[apart[misses[apart] <= NEARLY**2 * misses.min()]])
+    apart = every[_apart(every, np.argsort(trimmed(every)))]
+    most = trimmed(apart, max(least, round(SEEN * p)))
+    return pose_transform(apart[most <= NEARLY**2 * most[0]])
 
 
 def _apart(poses, order):
@@ -281,10 +283,12 @@ def three_planes(triangles, boards):
     columns = _common_points(lengths[0] - lengths[1], angle[0] + angle[1]) @ null
     columns = np.concatenate([columns, -columns], axis=-2)
     one, two = columns[..., :3], columns[..., 3:]
-    rotation = np.stack([one, two, np.cross(one, two)], axis=-1) / np.linalg.norm(one, axis=-1)[..., None, None]
+    rotation = np.stack([one, two, np.cross(one, two)], axis=-1)
+    rotation /= np.maximum(np.linalg.norm(one, axis=-1), 1e-12)[..., None, None]
     return _on_planes(rotation, normal[..., None, :, :], boards[..., None, :, :, 3], centre[..., None, :, :])
 
 
+@np.errstate(all="ignore")
 def _common_points(one, two):
     """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share; real parts of complex ones."""
     (a, b, c), (d, e, f) = (
@@ -303,10 +307,10 @@ def _common_points(one, two):
     companion = np.zeros(resultant.shape[:-1] + (4, 4))
     companion[..., 0, :] = -resultant[..., 1:] / resultant[..., :1]
     companion[..., [1, 2, 3], [0, 1, 2]] = 1.0
-    y = np.linalg.eigvals(companion)
+    y = np.linalg.eigvals(np.nan_to_num(companion, posinf=0.0, neginf=0.0))  # parallel boards leave nothing
     power = y[..., None] ** [2, 1, 0]
     x = -np.sum(up[..., None, :] * power, axis=-1) / np.sum(down[..., None, :] * power[..., 1:], axis=-1)
-    return np.stack([x.real, y.real, np.ones(y.shape)], axis=-1)
+    return np.nan_to_num(np.stack([x.real, y.real, np.ones(y.shape)], axis=-1), posinf=0.0, neginf=0.0)
 
 
 def shifted(rotation, normal, right):
