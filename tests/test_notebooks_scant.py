@@ -24,7 +24,7 @@ SAYS = {
     ("lines", "07"): "whether it bends",
     ("wall", "04"): "the images do not agree on the top edge",
     ("wall", "05"): "no placement has sides",
-    ("edges", "07"): "4 placements only",
+    ("edges", "07"): "placements only, 6 or more are needed",
     ("blind", "01"): "this session has no images",
     ("blind", "04"): "no camera could be calibrated",
     ("blind", "07"): "cannot be trusted: nothing can be handed over: the session has no camera",

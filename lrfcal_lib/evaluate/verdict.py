@@ -11,14 +11,15 @@ from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
-from lrfcal_lib.evaluate.diagnosis import problem_words
+from lrfcal_lib.evaluate.diagnosis import lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array, transform_difference
+from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.planes import rival_words
 
 YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
@@ -70,8 +71,8 @@ class Reason:
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', of
         :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
-        'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error', 'noise',
-        'warning', 'error'.
+        'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
+        'model error', 'noise', 'warning', 'error'.
     words : str
     """
 
@@ -128,9 +129,8 @@ class Verdict:
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
         for camera, own in self.regions.items():
             known = sorted((value, name) for name, value in own.items() if np.isfinite(value))
-            if known:
-                (low, at), (high, there) = known[0], known[-1]
-                out.append(f"In the image of '{camera}' at 2 m: {brief(low)} px {at} to {brief(high)} px {there}.")
+            ends = [f"{brief(value)} px {name}" for value, name in (known[:1] + known[-1:])]
+            out += [f"In the image of '{camera}' at 2 m: {' to '.join(ends)}."] if ends else []
         out += self.notes
         if self.errors:
             out.append(
@@ -241,22 +241,18 @@ def judge(calibration, method=None, **options):
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
+    reasons += [Reason(CARE, "lens", words) for words in lens_words(prepared).values()]
     return replace(_answered(found, sizes + reasons), notes=notes)
 
 
 def _refusal(calibration):
     """Why nothing can be handed over: what keeps the joint estimate, or else every camera, from an answer."""
     prepared, problems = calibration.prepared, calibration.problems
-    why = [problems[key] for key in [("rig", "joint")] if key in problems]
+    why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
     if not prepared.views:
-        why = [words for key, words in prepared.problems.items() if str(key).startswith(("images", "camera"))]
-        why = why or ["the session has no camera"]
-        if calibration.platform.solutions:
-            why.append("the tilt axis is known from the edges in the sweeps")
-    elif not prepared.scans:
-        why = [f"no sweep shows the board: {', '.join(dict.fromkeys(map(str, prepared.problems.values())))}"]
-    why = why or [*dict.fromkeys(problems.values())]
-    return f"nothing can be handed over: {'; '.join(why[:3])}"
+        why = prepared.problems.get("images", "the session has no camera")
+        why += "; the tilt axis is known from the edges in the sweeps" * bool(calibration.platform.solutions)
+    return f"nothing can be handed over: {why}"
 
 
 def sight_of(prepared):
@@ -279,7 +275,10 @@ def _without_joint(calibration, method, doubt):
         reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
     lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
     reasons += [Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})") for c, why in lost.items()]
-    reasons += [Reason(NO, "second minimum", _rival_words(*both)) for both in solved.items() if both[1].rival]
+    reasons += [
+        Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
+        for camera, found in solved.items() if found.rival is not None
+    ]  # fmt: skip
     unknown = calibration.platform.problems.get("combined")
     if unknown and any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()):
         reasons.append(Reason(NO, "far from stated", unknown))
@@ -296,14 +295,6 @@ def _without_joint(calibration, method, doubt):
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
     noise = np.median([board.sigma_range for board in prepared.scans.values()])
     return replace(_expected(chains, prepared.models, pitch, noise, reasons, doubt), sweep_mm=0.0)
-
-
-def _rival_words(camera, solution):
-    turn, shift = transform_difference(solution.transform, solution.rival)
-    return (
-        f"a second minimum explains the data nearly as well: camera '{camera}' {np.degrees(turn):.0f} deg and "
-        f"{1000 * shift:.0f} mm from where it is handed over; record more placements that lean other ways"
-    )
 
 
 def contradicts_stated(joint):

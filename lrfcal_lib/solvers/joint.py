@@ -16,7 +16,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_param
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
-from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN
+from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
@@ -336,7 +336,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
                 state = replace(state, head=pose_array(known))
             misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
             found = agreeing_start(obs, state, data, unknowns)
-            tried.append((found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2, *found[:3], np.median(misses)))
+            badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2
+            tried.append((badness, *found[:3], np.median(misses)))
         if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
             break
     tried.sort(key=lambda one: one[0])
@@ -353,19 +354,15 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, start, bad, rival_words(obs, tried)
+    return kept, start, bad, second_minima(obs, tried)
 
 
-def rival_words(obs, tried):
+def second_minima(obs, tried):
     """In words, which start values with cameras far from the best one's explain the data nearly as well."""
-    poses = [_seen_from_lrf(obs, state) for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
-    words = [
-        f"a second minimum explains the data nearly as well: camera '{name}' {np.degrees(turn):.0f} deg and "
-        f"{1000 * shift:.0f} mm from where it is handed over; record more placements that lean other ways"
-        for others in poses[1:] for name, *both in zip(obs.cameras, others, poses[0], strict=True)
-        for turn, shift in [geometry.transform_difference(*both)] if turn > SAME_TURN
-    ]  # fmt: skip
-    return tuple(dict.fromkeys(words))
+    best, *others = [_seen_from_lrf(obs, state) for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
+    pairs = [(name, *both) for poses in others for name, *both in zip(obs.cameras, best, poses, strict=True)]
+    far = [pair for pair in pairs if geometry.transform_difference(*pair[1:])[0] > SAME_TURN]
+    return tuple(dict.fromkeys(rival_words(*pair) for pair in far))
 
 
 def _seen_from_lrf(obs, state):

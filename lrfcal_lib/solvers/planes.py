@@ -201,6 +201,15 @@ def _apart(poses, order):
     return found
 
 
+def rival_words(camera, best, other):
+    """That another pose of a camera explains the data nearly as well."""
+    turn, shift = geometry.transform_difference(best, other)
+    return (
+        f"a second minimum explains the data nearly as well: camera '{camera}' {np.degrees(turn):.0f} deg and "
+        f"{1000 * shift:.0f} mm from where it is handed over; record more placements that lean other ways"
+    )
+
+
 def _before_boards(poses, sets, centres):
     """Poses that put (most of) the boards before the camera, and the range finder on the side that the camera sees."""
     normal, point = sets.boards[..., 2], sets.boards[..., 3]
