@@ -19,7 +19,9 @@ from lrfcal_lib.solvers.pitch import PitchErrors
 SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
 SHEET_SHARE = 0.5  # a sheet bent less than this share of what the scan shows does not explain the scan
 LENS_PARTS, LENS_CORNERS, LENS_MISS = np.array([6, 4]), 20, 0.15  # of an image; corners in a part; pixels
-REMEDY = "use a lens below 110 deg, crop the images to their middle, or undistort them with a wider model first"
+OFF_MIDDLE = 0.2  # of the image's size
+OTHER_SIZE = "as with intrinsics of another image size"
+REMEDY = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
 SAME_TURN = 0.5  # two cameras whose turns differ by less than this share of the larger one moved together
 
 
@@ -111,6 +113,8 @@ def lens_words(prepared):
         fold = np.append(bent[1:][np.diff(bent) < 0], np.inf)[0] / corner
         words = [f"corners of the chessboard miss by {alike:.2f} px alike"] * int(alike > LENS_MISS)
         words += [f"the model folds back at {100 * fold:.0f} % of the way to the image's corners"] * int(fold < 1)
+        if np.abs(np.array([model.cx / model.width, model.cy / model.height]) - 0.5).max() > OFF_MIDDLE:
+            words.append(f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, {OTHER_SIZE}")
         if words:
             out[camera] = f"the lens of camera '{camera}' is not that of its model ({'; '.join(words)}): {REMEDY}"
     return out

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
-from lrfcal_lib.evaluate.diagnosis import lens_words, problem_words
+from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
@@ -224,13 +224,14 @@ def judge(calibration, method=None, **options):
     the LRF sees and the board's features are known).
     """
     prepared, joint = calibration.prepared, calibration.joint
+    lens = [Reason(NO if OTHER_SIZE in words else CARE, "lens", words) for words in lens_words(prepared).values()]
     # also where the joint estimate is not handed over: a wrong size may be why
     sizes, doubt = ([], 0.0) if joint is None else contradicts_stated(joint)
     method = method or handed_over(calibration)
     if method is None:
         refused, lost = Reason(NO, "handed over", _refusal(calibration)), problem_words(prepared.problems)
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",) if lost else ()
-        return replace(_answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*sizes, refused]), notes=notes)
+        return replace(_answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]), notes=notes)
     if method == "joint":
         found = verdict(joint.solution, prepared.models, doubt=doubt, **sight_of(prepared) | options)
     else:
@@ -241,8 +242,7 @@ def judge(calibration, method=None, **options):
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
-    reasons += [Reason(CARE, "lens", words) for words in lens_words(prepared).values()]
-    return replace(_answered(found, sizes + reasons), notes=notes)
+    return replace(_answered(found, lens + sizes + reasons), notes=notes)
 
 
 def _refusal(calibration):

@@ -359,16 +359,11 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
 
 def second_minima(obs, tried):
     """In words, which start values with cameras far from the best one's explain the data nearly as well."""
-    best, *others = [_seen_from_lrf(obs, state) for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
-    pairs = [(name, *both) for poses in others for name, *both in zip(obs.cameras, best, poses, strict=True)]
+    best, *others = [state.cameras for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
+    named = [zip(obs.cameras, best, poses, strict=True) for poses in others]
+    pairs = [(name, *map(pose_transform, both)) for poses in named for name, *both in poses]
     far = [pair for pair in pairs if geometry.transform_difference(*pair[1:])[0] > SAME_TURN]
     return tuple(dict.fromkeys(rival_words(*pair) for pair in far))
-
-
-def _seen_from_lrf(obs, state):
-    """``T_camera_lrf`` of all cameras at pitch zero."""
-    poses, head = map(pose_transform, state.cameras), pose_transform(state.head)
-    return [T if mount == "head" else T * head for T, mount in zip(poses, obs.mounts, strict=True)]
 
 
 def left_out_shares(obs, bad):

@@ -140,7 +140,7 @@ def check_normals(sets, camera, least=0.02):
         )
 
 
-SUBSETS, MINIMAL = 400, 100
+SUBSETS, MINIMAL = 400, 40
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
@@ -183,7 +183,7 @@ def start_from_planes(obs):
         return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
 
     order = np.argsort(trimmed(candidates))
-    best = candidates[[*order[:8], *_apart(candidates, order[:MINIMAL])]]
+    best = candidates[[*order[:4], *_apart(candidates, order[:100])]]
     refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
     every = np.concatenate([refined, best])
     apart = every[_apart(every, np.argsort(trimmed(every)))]
@@ -192,11 +192,11 @@ def start_from_planes(obs):
 
 
 def _apart(poses, order):
-    """Indices of poses, the first ones in some order that are turned against all before, at most 8."""
+    """Indices of poses, the first ones in some order that are turned against all before, at most 6."""
     found = []
     for i in order:
         turns = np.trace(np.swapaxes(poses[found, :, :3], -1, -2) @ poses[i, :, :3], axis1=1, axis2=2)
-        if len(found) < 8 and (turns < 1 + 2 * np.cos(SAME_TURN)).all():
+        if len(found) < 6 and (turns < 1 + 2 * np.cos(SAME_TURN)).all():
             found.append(i)
     return found
 
@@ -300,26 +300,25 @@ def three_planes(triangles, boards):
 @np.errstate(all="ignore")
 def _common_points(one, two):
     """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share; real parts of complex ones."""
-    (a, b, c), (d, e, f) = (
-        (Q[..., :1, 0], 2 * Q[..., 0, 1:], np.stack([Q[..., 1, 1], 2 * Q[..., 1, 2], Q[..., 2, 2]], axis=-1))
-        for Q in (one, two)
-    )  # polynomials in y, the highest power first: a x^2 + b x + c
 
-    def times(p, q):
-        out = np.zeros(p.shape[:-1] + (p.shape[-1] + q.shape[-1] - 1,))
-        for i in range(p.shape[-1]):
-            out[..., i : i + q.shape[-1]] += p[..., i, None] * q
-        return out
+    def at(y):
+        """Numerator and denominator of x at y, and the resultant, which is zero where the conics meet."""
+        (a, b, c), (d, e, f) = (
+            (Q[0, 0], 2 * (Q[0, 1] * y + Q[0, 2]), Q[1, 1] * y**2 + 2 * Q[1, 2] * y + Q[2, 2])
+            for Q in (np.moveaxis(Q, (-2, -1), (0, 1))[..., None] for Q in (one, two))
+        )  # a x^2 + b x + c
+        up, down = d * c - a * f, a * e - d * b
+        return up, down, up**2 - down * (b * f - e * c)
 
-    up, down = a * f - d * c, a * e - d * b
-    resultant = times(up, up) - times(down, times(b, f) - times(e, c))
+    nodes = np.arange(-2.0, 3.0)
+    resultant = at(nodes)[2] @ np.linalg.inv(np.vander(nodes)).T
     companion = np.zeros(resultant.shape[:-1] + (4, 4))
     companion[..., 0, :] = -resultant[..., 1:] / resultant[..., :1]
     companion[..., [1, 2, 3], [0, 1, 2]] = 1.0
     y = np.linalg.eigvals(np.nan_to_num(companion, posinf=0.0, neginf=0.0))  # parallel boards leave nothing
-    power = y[..., None] ** [2, 1, 0]
-    x = -np.sum(up[..., None, :] * power, axis=-1) / np.sum(down[..., None, :] * power[..., 1:], axis=-1)
-    return np.nan_to_num(np.stack([x.real, y.real, np.ones(y.shape)], axis=-1), posinf=0.0, neginf=0.0)
+    up, down, _ = at(y)
+    found = np.stack([(up / down).real, y.real, np.ones(y.shape)], axis=-1)
+    return np.nan_to_num(found, posinf=0.0, neginf=0.0)
 
 
 def shifted(rotation, normal, right):
