@@ -33,13 +33,13 @@ report: setup
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
-	$(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
 
 golden: setup
-	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadfile tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py
+	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadgroup tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py
 
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \

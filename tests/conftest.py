@@ -71,11 +71,15 @@ def lms400(lms400_session):
 
 
 LONGEST = (
-    "test_notebooks", "test_notebooks_recording", "test_record_emulated", "test_image", "test_notebooks_scant",
-    "test_report", "test_golden", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
+    "test_notebooks", "test_notebooks_recording", "test_golden", "test_record_emulated", "test_notebooks_scant",
+    "test_image", "test_report", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
 )  # fmt: skip
+ALONE = ("test_stored_outputs_and_golden_tables", "test_tables_of")  # a notebook each
 
 
 def pytest_collection_modifyitems(items):
-    """The files that take longest come first, so that test runners side by side finish together."""
+    """What takes longest comes first, so that runners side by side finish together; a file stays in one of them."""
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+    items.sort(key=lambda item: not item.name.startswith(ALONE))
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(item.name if item.name.startswith(ALONE) else item.path.stem))

@@ -3,8 +3,11 @@
 import os
 import pickle
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,7 +49,7 @@ def test_the_same_is_worked_out_once(folder, session):
     stage = Stage()
     first, again = stage.run(session, 1, joint=True), stage.run(open_session(session.path), 1, joint=True)
     assert stage.calls == again["count"] == 1 and np.array_equal(first["values"], again["values"])
-    assert [file.suffix for file in folder.iterdir()] == [".pickle"]
+    assert sorted(file.suffix for file in folder.iterdir()) == [".lock", ".pickle"]
 
 
 def test_nothing_is_kept_unless_a_folder_is_named(session, tmp_path, monkeypatch):
@@ -119,10 +122,25 @@ def test_a_stage_that_fails_leaves_nothing(folder, session):
     for _ in range(2):
         with pytest.raises(ValueError, match="no board"):
             Stage().run(session, fail=True)
-    assert not folder.exists()
+    assert list(folder.glob("*.pickle")) == []
+
+
+def test_of_two_at_the_same_time_the_second_waits(folder, session):
+    stage = Stage()
+    slow = cache.cached(lambda of: time.sleep(0.2) or stage.run.__wrapped__(of))
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(slow, [session, session]))
+    assert stage.calls == 1 and [one["count"] for one in found] == [1, 1]
+
+
+def test_what_was_made_of_a_session_can_be_the_first_argument(folder, session):
+    stage = Stage()
+    for shift in (0.0, 0.0, 0.001):
+        stage.run(SimpleNamespace(prepared=SimpleNamespace(session=session), shift=shift))
+    assert stage.calls == 2
 
 
 def test_a_kept_stage_is_the_stage_itself(folder, session):
-    fresh, kept = prepare_scans(session), prepare_scans(session)
+    fresh, (_, kept) = prepare_scans.__wrapped__(session), (prepare_scans(session), prepare_scans(session))
     assert kept is not fresh and pickle.dumps(kept) == pickle.dumps(pickle.loads(pickle.dumps(fresh)))
     assert prepare_scans.__doc__.startswith("The board in every sweep") and list(kept.scans) == list(fresh.scans)

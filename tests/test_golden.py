@@ -1,10 +1,18 @@
 """The tables of a small session, to the sixth digit; those of two others are compared where their notebooks run."""
 
-from notebook_runs import WITH_SESSION, check_tables, run_plainly
-from shared import QUICK
+import pytest
+from notebook_runs import GOLDEN, NOTEBOOKS, WITH_SESSION, check_tables, run_plainly, tables_of
+from shared import QUICK, stages
 
 
-def test_tables_are_the_golden_ones(tmp_path):
-    for path in WITH_SESSION:
-        run_plainly(path, QUICK, tmp_path / "stages", tmp_path / "report")
-    check_tables(tmp_path / "report", "sim_quick")
+@pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
+def test_tables_of_the_small_session(path, tmp_path):
+    run_plainly(path, QUICK, stages(), tmp_path)
+    check_tables(tmp_path, "sim_quick", path)
+
+
+@pytest.mark.parametrize("session", ["sim_lms221", "sim_quick", "lms400_zed"])
+def test_no_table_is_left_over(session):
+    written = [name for path in NOTEBOOKS for name in tables_of(path)]
+    assert len(written) == len(set(written))
+    assert {file.stem for file in (GOLDEN / session).glob("*.csv")} <= set(written)

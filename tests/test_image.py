@@ -40,15 +40,16 @@ def record(camera, file, placement, pitch=0.0, purpose="board"):
 def rays():
     """Normalised directions of all rays of the image, shape (h * SAMPLES, w * SAMPLES, 2)."""
     uv = np.stack(np.meshgrid(*(((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5) for n in SIZE)), axis=-1)
-    return (undistort(uv, MODEL) - [MODEL.cx, MODEL.cy]) / [MODEL.fx, MODEL.fy]
+    return ((undistort(uv, MODEL) - [MODEL.cx, MODEL.cy]) / [MODEL.fx, MODEL.fy]).astype(np.float32)
 
 
 def render(pose, board=SHEET, background=170.0, noise=1.5, seed=0):
     """Image of a board, every pixel averaged over rays, blurred a little, with noise."""
-    inverse = np.linalg.inv(pose.as_matrix()[:3, [0, 1, 3]])
+    inverse = np.linalg.inv(pose.as_matrix()[:3, [0, 1, 3]]).astype(np.float32)
     plane = rays() @ inverse[:, :2].T + inverse[:, 2]
     x, y = plane[..., 0] / plane[..., 2], plane[..., 1] / plane[..., 2]
-    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines()], axis=0) & (plane[..., 2] > 0)
+    lines = board.lines().astype(np.float32)
+    inside = np.all([a * x + b * y + c < 0 for a, b, c in lines], axis=0) & (plane[..., 2] > 0)
     shade = np.where(inside, face(x, y, board), background)
     small = cv2.GaussianBlur(shade.reshape(MODEL.height, SAMPLES, MODEL.width, SAMPLES).mean(axis=(1, 3)), (0, 0), 0.7)
     noisy = np.clip(small + np.random.default_rng(seed).normal(0, noise, small.shape), 0, 255)
@@ -58,10 +59,10 @@ def render(pose, board=SHEET, background=170.0, noise=1.5, seed=0):
 def face(x, y, board):
     """Grey values of a board: dark, or a white sheet with a chessboard on a brown board."""
     if board.pattern is None:
-        return np.full(x.shape, 35.0)
+        return np.full_like(x, 35.0)
     p = board.pattern
     u, v = (x - p.origin[0]) / p.square, (y - p.origin[1]) / p.square
-    i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+    i, j = np.floor(u).astype(np.int16), np.floor(v).astype(np.int16)
     squares = (i >= -1) & (i < p.columns) & (j >= -1) & (j < p.rows)
     white = (u > -1.3) & (u < p.columns + 0.3) & (v > -1.3) & (v < p.rows + 0.3)
     return np.where(squares, np.where((i + j) % 2 == 0, 20.0, 235.0), np.where(white, 235.0, 105.0))
@@ -73,7 +74,7 @@ def clutter(seed=3):
     for _ in range(90):
         box = cv2.boxPoints((rng.uniform([0, 0], [640, 480]), rng.uniform(20, 120, 2), rng.uniform(0, 90)))
         cv2.fillPoly(out, [np.rint(box).astype(np.int32)], int(rng.uniform(10, 250)))
-    return np.kron(out, np.ones((SAMPLES, SAMPLES), np.uint8)).astype(float)
+    return np.kron(out, np.ones((SAMPLES, SAMPLES), np.uint8)).astype(np.float32)
 
 
 def pose_of(roll=0.0, tilt=(0.2, -0.3), at=(0.0, 0.0, 0.9), centre=(0.12, 0.095), facing=False):

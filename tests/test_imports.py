@@ -74,7 +74,7 @@ for name in ("model", "fit", "session", "preprocess", "solvers"):
         importlib.import_module(found.name)
 """
 LIGHT = {  # code, what it must not load
-    "solvers and preprocessing": (WALK, {"open3d", "pandas", "matplotlib", "serial", "IPython"}),
+    "solvers and preprocessing": (WALK, {"open3d", "pandas", "matplotlib", "serial", "IPython", "scipy.stats"}),
     "the package": ("import lrfcal_lib", {"numpy"}),
     "help": ("from lrfcal_lib.__main__ import parser; parser()", {"numpy"}),
 }

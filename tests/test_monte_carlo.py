@@ -142,7 +142,7 @@ def draw_plainly(rng, mount):
 def test_errors_reach_the_bound_and_are_as_stated(mount):
     """Limits that a correct estimator passes in all but one of a thousand runs, widened by the 7 % that twelve
     placements make the softness of the edges look smaller than it is."""
-    trials = monte_carlo(lambda rng: draw_plainly(rng, mount), solve_joint, range(30))
+    trials = monte_carlo(lambda rng: draw_plainly(rng, mount), solve_joint, range(16))
     table = consistency(trials).set_index("group")
     judged, pooled = table.drop(index=["edge softness", "all"]), table.loc["all"]
     assert trials.failed == {} and judged.rmse_over_crb.between(0.7, 1.1 * 1.25).all()
@@ -152,6 +152,6 @@ def test_errors_reach_the_bound_and_are_as_stated(mount):
 
 def test_a_wrong_noise_level_is_caught():
     """Noise 1.5 times as large as stated: the same limits fail."""
-    found = monte_carlo(lambda rng: draw(rng, 8, see_noise=1.5)[:2], solve_joint, range(20))
+    found = monte_carlo(lambda rng: draw(rng, 8, see_noise=1.5)[:2], solve_joint, range(12))
     row = consistency(found).iloc[-1]
     assert row.nees > 1.6 and row.nees > 1.2 * row.nees_high

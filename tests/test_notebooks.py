@@ -66,21 +66,12 @@ def test_outputs_show_no_errors_and_no_machine(path):
             assert "/home/" not in text and "/tmp/" not in text and " at 0x" not in text
 
 
-@pytest.fixture(scope="module")
-def tables(tmp_path_factory):
-    """Folder that takes the tables of all notebooks."""
-    return tmp_path_factory.mktemp("report")
-
-
 @each_notebook
-def test_stored_outputs_are_those_of_the_shipped_session(path, tables):
-    done = run_nbval(path, tables)
+def test_stored_outputs_and_golden_tables_are_those_of_the_shipped_session(path, tmp_path):
+    done = run_nbval(path, tmp_path)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert " passed" in done.stdout and any(cell.outputs for cell in code_cells(read(path)))
-
-
-def test_tables_are_the_golden_ones(tables):
-    check_tables(tables, "sim_lms221")
+    check_tables(tmp_path, "sim_lms221", path)
 
 
 def test_falsified_output_is_caught(tmp_path):

@@ -1,20 +1,11 @@
-"""Every notebook that takes a session runs on somebody else's recording."""
+"""Every notebook that takes a session runs on somebody else's recording, and gives the same tables."""
 
 import pytest
 from notebook_runs import WITH_SESSION, check_tables, run_plainly
 from shared import stages
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory):
-    """Folder that takes the tables of all notebooks."""
-    return tmp_path_factory.mktemp("report")
-
-
 @pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
-def test_runs_on_the_recording(path, lms400_session, report):
-    run_plainly(path, lms400_session, stages(), report)
-
-
-def test_tables_are_the_golden_ones(report):
-    check_tables(report, "lms400_zed")
+def test_tables_of_the_recording(path, lms400_session, tmp_path):
+    run_plainly(path, lms400_session, stages(), tmp_path)
+    check_tables(tmp_path, "lms400_zed", path)

@@ -142,14 +142,14 @@ def test_error_agrees_with_the_predicted_covariance(faces, monkeypatch):
     monkeypatch.setattr(platform, "SIGMA_GAP", 1e-4)
     rng = np.random.default_rng(11)
     boards, scores, errors = sweep_boards(rng, 20), [], []
-    for _ in range(60):
+    for _ in range(30):
         obs = swept(rng, boards, noise=1.0)
         found = solve_platform(obs if faces else without_faces(obs), ROUGH)
         e, covariance = chart_error(found.T_head_lrf), found.solution.covariance
         scores.append(e @ np.linalg.solve(covariance, e) / 4)
         errors.append(e / np.sqrt(np.diag(covariance)))
     assert 0.7 < np.mean(scores) < 1.35
-    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(60)
+    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(30)
 
 
 def test_one_edge_with_a_face_serves_too():
@@ -237,12 +237,12 @@ def test_direction_offset_is_recovered_and_asked_for(edges):
 
 def test_an_honest_platform_asks_for_nothing():
     wanted, scores = [], []
-    for seed in range(100, 120):
+    for seed in range(100, 110):
         _, sweeps = pitched(seed, 0.0, 0.0, noise=0.003)
         found = estimate_pitch_errors(*sweeps)
         wanted.append(found.wanted)
         scores.append(found.direction_offset / found.direction_sigma)
-    assert wanted.count("none") >= 18
+    assert wanted.count("none") >= 9
     assert 0.4 < np.std(scores) < 1.6
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.__main__ import main
+from lrfcal_lib.emulators.world import scaled
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
@@ -40,8 +41,9 @@ def truth():
 
 @pytest.fixture(scope="module")
 def tiny():
-    """Two placements, nothing else."""
-    rig = replace(FULL.rig, cameras=FULL.rig.cameras[:1], beam=replace(FULL.rig.beam, rings=1))
+    """Two placements and a camera of few pixels, nothing else."""
+    small = scaled(FULL.rig, 160)
+    rig = replace(small, cameras=small.cameras[:1], beam=replace(small.beam, rings=1))
     return replace(FULL, rig=rig, pairs=1, step=np.radians(1.0), intrinsics_views=0, room_sweep=(), room_images=())
 
 

@@ -158,7 +158,7 @@ def test_setup_says_what_to_do(run_setup, tmp_path, case):
 
 
 def test_setup_that_failed_is_done_again(run_setup, tmp_path):
-    assert run_setup(python3=FAKE_PYTHON + 'case "$*" in *pip*) exit 3 ;; esac').returncode != 0
+    assert run_setup(python3=FAKE_PYTHON + 'case "$*" in *"-m pip"*) exit 3 ;; esac').returncode != 0
     assert not (tmp_path / ".venv" / "stamp").exists()
 
 

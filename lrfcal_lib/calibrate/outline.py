@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.residuals import beam_terms, edge_shift, flip_sigma, pad
@@ -219,7 +219,7 @@ def face_surface(face, model):
     A, freedom = _quadratic(p[:, 0], p[:, 1]), max(len(p) - 6, 1)
     flat, bent = (np.linalg.lstsq(A[:, :k], p[:, 2], rcond=None)[0] for k in (3, 6))
     before, after = np.sum((p[:, 2] - A[:, :3] @ flat) ** 2), np.sum((p[:, 2] - A @ bent) ** 2)
-    asked = (before - after) / 3 / (after / freedom) > f_distribution.ppf(0.999, 3, freedom)
+    asked = (before - after) / 3 / (after / freedom) > fdtri(3, freedom, 0.999)
     return pose, bent if asked else np.zeros(6)
 
 

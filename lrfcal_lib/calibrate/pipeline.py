@@ -315,6 +315,7 @@ def joint_settings(prepared, observations):
     return settings
 
 
+@cached
 def calibrate_jointly(prepared):
     """Estimate everything about a session's rig at once.
 
@@ -346,6 +347,7 @@ def with_joint(calibration):
     return replace(calibration, platform=replace(platform, axes=axes), joint=joint, **found)
 
 
+@cached
 def leave_out(joint, groups=8):
     """The estimate without each placement: `groups` of them are left out in turn.
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,8 @@ from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once
+SHARE = 1 << 15  # of them that a thread takes at a time
+WORKERS = min(os.cpu_count() or 1, 8)
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)
 SIGMAS = 2.5  # by which a reading must miss the surfaces on both sides
@@ -104,15 +109,15 @@ class View:
             asked = f"camera '{self.camera}' has {m.width} x {m.height} pixels"
             raise ValueError(f"{asked}, its image {size[0]} x {size[1]}: intrinsics hold for one image size only")
 
-    @property
+    @cached_property
     def pose(self):
         """Top three rows of the transform."""
-        return np.ascontiguousarray(geometry.pose_array(self.T_camera_platform))
+        return _single(geometry.pose_array(self.T_camera_platform))
 
-    @property
+    @cached_property
     def lens(self):
         """Intrinsics, and the squared distance from the axis at which the lens folds, for the compiled loops."""
-        return np.r_[self.model.parameters, fold(self.model)]
+        return _single(np.r_[self.model.parameters, fold(self.model)])
 
 
 def fold(model):
@@ -143,27 +148,36 @@ class Painter:
 
         self.loops, self.views, self.noise, self.exposures = colouring, views, noise, np.zeros((len(views), 2))
         self.cells = [max(2.0, 2 * step * view.model.fx) for view in self.views]
-        self.nearest = []
-        for view, cell in zip(self.views, self.cells, strict=True):
-            size = int(view.model.height / cell) + 1, int(view.model.width / cell) + 1
-            self.nearest.append(np.full(size, np.inf, np.float32))
+        sizes = [[int(n / cell) + 1 for n in v.image.shape[:2]] for v, cell in zip(self.views, self.cells, strict=True)]
+        self.nearest = [np.full((WORKERS, rows * columns), np.inf, np.float32) for rows, columns in sizes]
 
     def hide(self, points):
         """Let points (n, 3) hide what is behind them."""
-        for view, cell, nearest in zip(self.views, self.cells, self.nearest, strict=True):
-            self.loops.hide(_single(points), view.pose, view.lens, view.model.width, view.model.height, cell, nearest)
+
+        def some(rows, worker):
+            part = _single(points[rows])
+            for v, cell, nearest in zip(self.views, self.cells, self.nearest, strict=True):
+                self.loops.hide(part, v.pose, v.lens, v.image.shape[1::-1], cell, nearest[worker])
+
+        _share(some, len(points))
+        for nearest in self.nearest:
+            np.min(nearest, axis=0, out=nearest[0])
 
     def paint(self, points, normals, only=slice(None)):
         """Colours (n, 3), whether any image sees the points (n,), and the number of the one that counts most."""
-        points, normals, n = _single(points), _single(np.nan_to_num(normals)), len(points)
-        sums, best, source = np.zeros((n, 4), np.float32), np.zeros(n, np.float32), np.full(n, -1, np.int32)
-        for k in range(len(self.views))[only]:
-            v, loops = self.views[k], (sums, best, source, self.views[k].number)
-            near = self.cells[k], self.nearest[k], self.noise, self.exposures[k]
-            self.loops.paint(points, normals, v.pose, v.lens, np.ascontiguousarray(v.image), *near, *loops)
-        seen = sums[:, 3] > 0
-        mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-30)
-        return np.where(seen[:, None], mean, np.nan), seen, source
+        n, views = len(points), range(len(self.views))[only]
+        colors, seen, source = np.empty((n, 3), np.float32), np.empty(n, bool), np.full(n, -1, np.int32)
+
+        def some(rows, _):
+            part = _single(points[rows]), _single(normals[rows])
+            sums, best = np.zeros((len(part[0]), 4), np.float32), np.zeros(len(part[0]), np.float32)
+            for k in views:
+                v, near = self.views[k], (self.cells[k], self.nearest[k][0], self.noise, self.exposures[k])
+                self.loops.paint(*part, v.pose, v.lens, v.image, *near, sums, best, source[rows], v.number)
+            self.loops.finish(sums, colors[rows], seen[rows])
+
+        _share(some, n)
+        return colors, seen, source
 
     def compare_exposures(self, points, normals):
         """Estimate gain and fall-off towards the corners of every image from points that several images see.
@@ -198,6 +212,20 @@ class Painter:
 
 def _single(points):
     return np.ascontiguousarray(points, np.float32)
+
+
+def _share(some, count):
+    """Call ``some(rows, worker)`` for slices of so many rows, in threads: the compiled loops free the interpreter."""
+    slices = [slice(start, min(start + SHARE, count)) for start in range(0, count, SHARE)]
+
+    def work(worker):
+        for rows in slices[worker::WORKERS]:
+            some(rows, worker)
+
+    if len(slices) < 2:
+        return work(0)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(work, range(WORKERS)))
 
 
 def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mask=None):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
@@ -206,7 +206,7 @@ def _beams(boards, solution, rate):
     outside = (shift[..., None] - Z_NODES * sigma[..., None]) * (across / np.abs(ray[..., 2]))[..., None]
     points = local[:, None] + outside[..., None] * normal[:, None]
     bearing, pitch, _ = beams_to(geometry.apply_pose(boards, points.reshape(n, -1, 3)), solution.T_head_lrf)
-    chance = np.stack([norm.cdf(Z_NODES), norm.cdf(-Z_NODES)])[:, None]
+    chance = np.stack([ndtr(Z_NODES), ndtr(-Z_NODES)])[:, None]
     number = number[:, None, :, None] * chance  # (n, 2, points, nodes): first the hits
     bearing, pitch = (v.reshape(n, 1, -1, len(Z_NODES)) for v in (bearing, pitch))
     group = {"bearing": bearing, "pitch": pitch, "edge": edge[:, None], "background": rate.background, "used": number}

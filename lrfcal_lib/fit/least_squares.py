@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -83,7 +83,7 @@ def robust(z, loss):
 @lru_cache(maxsize=4096)
 def usual_size(count):
     """Median root mean square of `count` normal numbers."""
-    return float(np.sqrt(chi2_distribution.ppf(0.5, count) / count))
+    return float(np.sqrt(chdtri(count, 0.5) / count))
 
 
 def _weigh(block, loss, scale, axes):
@@ -267,7 +267,7 @@ def solve(
     if freedom is None:
         own = J.shape[-1] if shared is None else shared + len(r) * (J.shape[-1] - shared)
         freedom = r.size // chi2.size - own
-    too_large = (freedom > 0) & (chi2 > chi2_distribution.ppf(0.999, max(freedom, 1)))
+    too_large = (freedom > 0) & (chi2 > chdtri(max(freedom, 1), 0.001))
     inflation = np.where(too_large, chi2 / max(freedom, 1), 1.0)
     transform, parameters = read(state)
     return Solution(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from lrfcal_lib.model.geometry import lrf_to_platform
 from lrfcal_lib.preprocess.board_in_scan import face_points, plane_axes
@@ -220,7 +220,7 @@ def bend_of(face, placement=0, level=0.0):
     p_value = 0.0
     for covariance, count in ((by_parts, len(pieces)), (by_points, len(miss))):
         F = q @ np.linalg.solve(covariance[3:, 3:], q) / len(q)
-        p_value = max(p_value, float(f_distribution.sf(F, len(q), count - unknowns)))
+        p_value = max(p_value, float(fdtrc(len(q), count - unknowns, F)))
     size, sigma = _height_range(face, q, by_parts[3:, 3:])
     return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
 

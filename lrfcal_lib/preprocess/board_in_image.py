@@ -27,6 +27,7 @@ PREDICTION_SIGMA = 0.005  # of an edge on the board, metres
 POSE_ROUNDS = 15  # of Gauss-Newton
 CORNER_INSET = 0.03  # share of an edge left out at both ends: corners curl and are torn
 COARSE_PROFILES, COARSE_ACROSS = 24, 25  # samples along and across each edge when orders of corners are compared
+THIN_PROFILES = 150  # of an edge where orders are compared by the narrow search
 CLEAR_SHARE = 0.7  # an order with less than this share of the best score is ruled out
 
 
@@ -118,8 +119,8 @@ def view_board(image, board, model, view=None, picks=None, *, lines=None, relief
     return replace(view, T_camera_board=pose, covariance=covariance)
 
 
-def _view_pattern(view, image, board, model, picks, lines, relief):
-    """The view with the pose from the pattern's corners, and the edges around it, in a narrow search."""
+def _view_pattern(view, image, board, model, picks, lines, relief, most=np.inf):
+    """The view with the pose from the pattern's corners and the edges near it, each by `most` profiles or fewer."""
     pose, covariance, used = board_pose(view.pixels, board.pattern, model, relief)
     pixels = np.where(used[:, None], view.pixels, np.nan)
     view = replace(view, pixels=pixels, T_camera_board=pose, covariance=covariance)
@@ -135,7 +136,7 @@ def _view_pattern(view, image, board, model, picks, lines, relief):
         scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW
         reach = np.clip(scale * WINDOW, 3.0, 40.0), max(scale * PREDICTION_SIGMA, 1.0)
         try:
-            edges.append(refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, *reach))
+            edges.append(refine_edge(image, model, name, uv[0], uv[1], uv[2] - inner, *reach, most))
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
@@ -151,7 +152,7 @@ def order_scores(image, board, model, orders, poses):
 
     `orders` are the corners (n, k, 2) in each order, `poses` a stack of n rough ``T_camera_board``. The scores are
     those of a few coarse profiles across the outline; orders that they cannot tell apart are compared by the edges that
-    the full search finds.
+    the narrow search finds with a few more.
     """
     lines = board.lines()
     start = corners_of_lines(lines)
@@ -170,7 +171,7 @@ def order_scores(image, board, model, orders, poses):
         return coarse
     for i in likely:
         # profiles that found an edge count less the farther it lies from where the outline puts it
-        view = _view_pattern(BoardView(pixels=orders[i]), image, board, model, {}, lines, None)
+        view = _view_pattern(BoardView(pixels=orders[i]), image, board, model, {}, lines, None, THIN_PROFILES)
         for edge in view.edges:
             k, seen = board.edges.index(edge.name), board_line(view, edge, model)
             off = np.mean((np.stack([start[k], end[k]]) @ seen[:2] + seen[2]) ** 2)

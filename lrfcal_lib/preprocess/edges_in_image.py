@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from lrfcal_lib.model.camera import distort, line_through, pinhole
+from lrfcal_lib.model.camera import line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -68,29 +68,22 @@ class OutlineNotSeen(ValueError):
     """The images do not show where a board ends (a sheet on a wall, a background as bright as the board)."""
 
 
+def loops():
+    """The compiled loops; numba takes half a second to load."""
+    from lrfcal_lib.preprocess import profiles
+
+    return profiles
+
+
 def sample(image, model, uv):
     """Colours (..., channels) at undistorted pixels (..., 2), bilinear; NaN outside the image.
 
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
-    image = image.reshape(*image.shape[:2], -1)
-    normalised = (uv - [model.cx, model.cy]) / [model.fx, model.fy]
-    seen = distort(normalised, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
-    height, width, channels = image.shape
-    (x, y), (u, v) = np.moveaxis(normalised, -1, 0), np.moveaxis(seen, -1, 0)
-    # far outside, where the radial distortion no longer grows, it folds points back into the image
-    k1, k2, _, _, k5 = model.distortion
-    r2 = x * x + y * y
-    inside = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
-    inside &= (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
-    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
-    column, row = u.astype(np.intp), v.astype(np.intp)
-    u, v = ((s - whole).astype(np.float32)[..., None] for s, whole in ((u, column), (v, row)))
-    flat, at = image.reshape(-1, channels), row * width + column
-    top, bottom = (flat.take(i, axis=0) * (1 - u) + flat.take(i + 1, axis=0) * u for i in (at, at + width))
-    out = top * (1 - v) + bottom * v
-    out[~inside] = np.nan
-    return out
+    image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
+    out = np.empty((uv.size // 2, image.shape[2]), np.float32)
+    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, out)
+    return out.reshape(uv.shape[:-1] + (-1,))
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
@@ -98,35 +91,23 @@ def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
 
     Derivative of a Gaussian of `sigma` samples across the edge, of `along` averaged profiles, norm over the colours.
     """
-    gone = np.isnan(strip).any(axis=-1)
-    filled = uniform_filter1d(np.where(gone[..., None], 0, strip), along, axis=1)
-    slope = gaussian_filter1d(filled, sigma, axis=0, order=1)
-    height = np.linalg.norm(slope, axis=-1) * sigma * np.sqrt(2 * np.pi)
+    gone, places = np.isnan(strip[..., 0]), np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)
+    bell = np.exp(-0.5 * (places / sigma) ** 2)
+    slope = places / sigma * bell / bell.sum() * np.sqrt(2 * np.pi)
+    filled = np.where(gone[..., None], np.float32(0), strip)
+    found = cv2.sepFilter2D(filled, cv2.CV_32F, np.full(along, 1 / along), slope, borderType=cv2.BORDER_REFLECT)
+    height = np.linalg.norm(found.reshape(strip.shape), axis=-1)
     reach = int(np.ceil(2 * sigma))
     near_gone = cv2.dilate(gone.astype(np.uint8), np.ones((2 * reach + 1, along), np.uint8)) > 0
     return np.where(near_gone, 0, height)
 
 
 def peaks(height, least=LEAST_CONTRAST):
-    """Local maxima of the step height in every profile: column, place across (to a fraction of a sample), contrast."""
+    """Local maxima of the step height by profile: column, place across (to a fraction of a sample), contrast."""
     low, mid, high = height[:-2], height[1:-1], height[2:]
-    row, column = np.nonzero((mid >= low) & (mid > high) & (mid > least))
+    column, row = np.nonzero(((mid >= low) & (mid > high) & (mid > least)).T)
     a, b, c = low[row, column], mid[row, column], high[row, column]
     return column, row + 1 + 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-12), b
-
-
-def vote(column, place, weight, shape, slopes):
-    """Weight of the profiles with a peak near each line ``place = offset + slope (column - middle)``, (m, across).
-
-    `shape` is (across, along) of the strip; a sample to either side still agrees.
-    """
-    across, along = shape
-    offset = np.rint(place - slopes[:, None] * (column - (along - 1) / 2)).astype(int)
-    line, peak = np.nonzero((offset >= 0) & (offset < across))
-    hit = np.zeros((len(slopes), across + 2, along))
-    for agree in range(3):
-        np.maximum.at(hit, (line, offset[line, peak] + agree, column[peak]), weight[peak])
-    return hit[:, 1:-1].sum(axis=2)
 
 
 def fit_line(column, place, offset, slope, tolerance, rounds=12):
@@ -172,12 +153,12 @@ def correlation_factor(column, residual, window=3.0):
     return float(max(total[beyond[0] if len(beyond) else -1], 1.0))
 
 
-def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np.inf):
+def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np.inf, most=np.inf):
     """Find a straight edge near a predicted stretch: an ImageEdge, or EdgeNotSeen with the reason.
 
     `start` and `end` are the predicted ends (undistorted pixels), `outward` any vector that points out of the board;
     the edge is searched `half_width` pixels to both sides. `prior_px` is the standard deviation of the prediction: of
-    two lines with similar support the nearer one is taken.
+    two lines with similar support the nearer one is taken. A profile stands at every pixel, or at `most` that many.
     """
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = np.linalg.norm(end - start)
@@ -188,7 +169,8 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     along = (end - start) / length
     normal = np.array([along[1], -along[0]])
     normal = normal * np.sign(normal @ outward)
-    columns = np.arange(int(length) + 1)
+    apart = max(int(length / most), 1)
+    columns = np.arange(0, int(length) + 1, apart)
     pad = 3 * SMOOTH_PX + 1
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
     strip = sample(image, model, start + columns[None, :, None] * along + across[:, None, None] * normal)
@@ -196,6 +178,7 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
         raise EdgeNotSeen(f"cut by the image border: {100 * visible / len(columns):.0f}% of it inside the image")
     (offset, slope), covariance, seen, rms = _line_in_strip(strip, visible, across, half_width, prior_px)
+    seen, slope, covariance = apart * seen, slope / apart, covariance / np.outer([1, apart], [1, apart])
     middle = seen.mean()
     to_middle = np.array([[1.0, middle], [0.0, 1.0]])
     covariance = to_middle @ covariance @ to_middle.T * ACROSS_STEP_PX**2
@@ -214,7 +197,7 @@ def _line_in_strip(strip, visible, across, half_width, prior_px):
     height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
     column, place, contrast = peaks(height)
     slopes = np.linspace(-1, 1, 41) * min(half_width / ACROSS_STEP_PX, 24) / height.shape[1] * 2
-    votes = vote(column, place, contrast / (contrast + FULL_CONTRAST), height.shape, slopes)
+    votes = loops().vote(column, place, contrast / (contrast + FULL_CONTRAST), height.shape, slopes)
     # the prediction is as uncertain at either end as it is in the middle
     tilted = slopes[:, None] * ACROSS_STEP_PX * height.shape[1] / 2
     allowed = (np.abs(across) <= half_width) * np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
@@ -273,7 +256,7 @@ def edge_votes(image, board, model, pose):
         strip = sample(image, model, on_board(xy, pose, model))
         height = step_contrast(strip, 1.5, along=3)
         column, place, _ = peaks(height, 8.0)
-        votes = vote(column, place, np.ones(len(column)), height.shape, slopes).max(axis=0)
+        votes = loops().vote(column, place, np.ones(len(column)), height.shape, slopes).max(axis=0)
         seen = np.isfinite(strip[..., 0]).sum(axis=1)
         out.append(np.where(seen > 0.3 * height.shape[1], votes / np.maximum(seen, 1), np.nan))
     return np.stack(out)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from lrfcal_lib.model.camera import distort, undistort
 from lrfcal_lib.preprocess.pattern_in_image import grey
@@ -329,4 +329,4 @@ def _best_split(moved, sigma, total):
         if np.linalg.norm(step) >= LEAST_STEP and lasts and F > most:
             best, most = k, F
     free = 1.1 * (total - 1)  # 3 (n - 1) differences, used with the efficiency 0.37 of a median deviation
-    return best, min(1.0, (total - 1) * float(f_distribution.sf(most, 3, free)))
+    return best, min(1.0, (total - 1) * float(fdtrc(3, free, most)))

@@ -8,6 +8,7 @@ short. A pickle can run code when it is read, so a folder is refused that others
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import pickle
@@ -23,12 +24,13 @@ VARIABLE = "LRFCAL_CACHE"
 
 
 def cached(stage):
-    """Keep the results of a function whose first argument is a session.
+    """Keep the results of a function whose first argument is a session, or what was made of one.
 
     Parameters
     ----------
     stage : callable
-        ``stage(session, ...)``; the same arguments always give the same result, and nobody changes it in place.
+        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments always give the same
+        result, and nobody changes it in place.
 
     Returns
     -------
@@ -39,28 +41,30 @@ def cached(stage):
     """
 
     @wraps(stage)
-    def look_first(session, *args, **options):
+    def look_first(of, *args, **options):
         """The kept result of the same call, or else what the stage makes now."""
         if not os.environ.get(VARIABLE):
-            return stage(session, *args, **options)
-        folder = Path(os.environ[VARIABLE])
+            return stage(of, *args, **options)
+        folder, session = Path(os.environ[VARIABLE]), getattr(getattr(of, "prepared", of), "session", of)
         found = folder.stat() if folder.exists() else None
         if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
             may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
             raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
-        key = hashlib.sha256(pickle.dumps((stage.__qualname__, session, args, sorted(options.items()))))
+        key = hashlib.sha256(pickle.dumps((stage.__qualname__, of, args, sorted(options.items()))))
         for file in (Path(record.file) for record in session.image_records):
             key.update(file.read_bytes() if file.is_file() else b"missing")
         key.update(library())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
-        if file.is_file():
-            return pickle.loads(file.read_bytes())  # only we write there, see above
-        result = stage(session, *args, **options)
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with NamedTemporaryFile(dir=folder, delete=False) as part:
-            part.write(pickle.dumps(result))
-        os.replace(part.name, file)  # whole or not at all: other notebooks read at the same time
-        return result
+        if not file.is_file():
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with open(file.with_suffix(".lock"), "w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
+                if not file.is_file():
+                    result = pickle.dumps(stage(of, *args, **options))
+                    with NamedTemporaryFile(dir=folder, delete=False) as part:
+                        part.write(result)
+                    os.replace(part.name, file)  # whole or not at all
+        return pickle.loads(file.read_bytes())  # only we write there, see above
 
     return look_first
 

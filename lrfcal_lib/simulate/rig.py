@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import tilt
+from lrfcal_lib.model.geometry import apply_pose, pose_array, tilt
 from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate.beam import LMS221, Beam
 from lrfcal_lib.simulate.draw import AHEAD
@@ -94,8 +94,8 @@ class Rig:
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch, radians."""
-        back = RigidTransform.from_rotation(Rotation.from_rotvec([-pitch, 0.0, 0.0]))
+        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch (or at many), radians."""
+        back = RigidTransform.from_rotation(Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0])))
         return camera.mounting * self.T_head_lrf.inv() * back
 
     def camera_infos(self):
@@ -135,12 +135,15 @@ class Rig:
         return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
-        """Whether a camera sees points of the board, its corners by default, inside the image by a margin in pixels."""
-        p = self.outline(T_camera_board) if points is None else T_camera_board.apply(points)
-        if p[:, 2].min() < 0.1 or np.abs(p[:, :2] / p[:, 2:]).max() > 1.0:
-            return False
+        """Whether a camera sees points of the board (corners by default) inside the image by a margin in pixels.
+
+        For a pose, or each of a stack of poses.
+        """
+        flat = np.column_stack([self.board.known_corners(), np.zeros(len(self.board.edges))])
+        p = apply_pose(pose_array(T_camera_board), flat if points is None else points)
         uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
-        return bool(np.all((uv > margin) & (uv < size - 1 - margin)))
+        ahead = (p[..., 2] >= 0.1) & (np.abs(p[..., :2]) <= p[..., 2:]).all(axis=-1)
+        return np.all(ahead & ((uv > margin) & (uv < size - 1 - margin)).all(axis=-1), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -291,8 +294,8 @@ def _pair(rig, distance, turn, rng):
 
 def _spans(rig, pose, margin):
     """First and last pitch of a sweep, and at which all cameras see the whole board; None where that is too little."""
-    shown = [all(rig.shows(c, rig.camera_pose(c, at) * pose) for c in rig.cameras) for at in PITCH_GRID]
-    seen, (pitch, bearing) = PITCH_GRID[np.array(shown)], rig.sweep_pitch(rig.outline(pose))
+    shown = np.all([rig.shows(c, rig.camera_pose(c, PITCH_GRID) * pose) for c in rig.cameras], axis=0)
+    seen, (pitch, bearing) = PITCH_GRID[shown], rig.sweep_pitch(rig.outline(pose))
     beside = np.abs(bearing - np.pi / 2).max() >= np.radians(rig.beam.field_of_view / 2) - 2 * margin
     if beside or not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None

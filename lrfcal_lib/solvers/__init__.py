@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
@@ -194,8 +194,8 @@ def find_outlying_placements(obs):
         known = np.isfinite(residuals)
         placements, index, count = np.unique(obs.plane_placement[known], return_inverse=True, return_counts=True)
         mean = np.bincount(index, residuals[known] ** 2) / count
-        level = np.median(mean if keep is None else mean[keep]) / chi2.median(NUMBERS)
-        before, keep = keep, mean <= level * chi2.ppf(ACCEPTED, NUMBERS)
+        level = np.median(mean if keep is None else mean[keep]) / chdtri(NUMBERS, 0.5)
+        before, keep = keep, mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
         if np.array_equal(before, keep):
             break
         some = obs.select(placements[keep])

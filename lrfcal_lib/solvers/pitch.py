@@ -7,7 +7,7 @@ from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import pad, sight_normals
@@ -197,7 +197,7 @@ class PitchModel:
             return self
         more, free = self.n_parameters - small.n_parameters, numbers - self.n_parameters
         F = (small.misfit - self.misfit) / more / (self.misfit / free)
-        return replace(self, F=float(F), p_value=float(f_distribution.sf(F, more, free)))
+        return replace(self, F=float(F), p_value=float(fdtrc(more, free, max(F, 0.0))))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,54 @@
+"""The inner loops of edges in images, compiled by numba once and kept: colours between pixels, votes for lines."""
+
+import numpy as np
+from numba import njit
+
+COMPILED = {"cache": True, "error_model": "numpy", "nogil": True}
+
+
+@njit(**COMPILED)
+def bilinear(image, uv, lens, out):
+    """Colours (n, channels) of a recorded image at undistorted pixels (n, 2); NaN outside of it.
+
+    `lens` is :attr:`lrfcal_lib.model.camera.CameraModel.parameters`. Far outside, where the radial distortion no longer
+    grows, it would fold points back into the image.
+    """
+    height, width, channels = image.shape
+    fx, fy, cx, cy, k1, k2, k3, k4, k5 = lens
+    for i in range(len(uv)):
+        x, y = (uv[i, 0] - cx) / fx, (uv[i, 1] - cy) / fy
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
+        u = (x * radial + (2 * k3 * x * y + k4 * (r2 + 2 * x * x))) * fx + cx
+        v = (y * radial + (k3 * (r2 + 2 * y * y) + 2 * k4 * x * y)) * fy + cy
+        grows = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
+        if not (grows and 0 <= u < width - 1 and 0 <= v < height - 1):
+            out[i] = np.nan
+            continue
+        column, row = int(u), int(v)
+        right, down = np.float32(u - column), np.float32(v - row)
+        left, up = np.float32(1) - right, np.float32(1) - down
+        for c in range(channels):
+            top = np.float32(image[row, column, c]) * left + np.float32(image[row, column + 1, c]) * right
+            bottom = np.float32(image[row + 1, column, c]) * left + np.float32(image[row + 1, column + 1, c]) * right
+            out[i, c] = top * up + bottom * down
+
+
+@njit(**COMPILED)
+def vote(column, place, weight, shape, slopes):
+    """Weight of the profiles with a peak near each line ``place = offset + slope (column - middle)``, (m, across).
+
+    `shape` is (across, along) of the strip, `column` ascends; a sample to either side still agrees, and of the peaks of
+    one profile that agree with a line the highest counts.
+    """
+    votes = np.zeros((len(slopes), shape[0]))
+    for line in range(len(slopes)):
+        counted, highest = np.full(shape[0], -1), np.zeros(shape[0])
+        for i in range(len(column)):
+            near = int(np.rint(place[i] - slopes[line] * (column[i] - (shape[1] - 1) / 2)))
+            for offset in range(max(near - 1, 0), min(near + 2, shape[0])):
+                before = highest[offset] if counted[offset] == column[i] else 0.0
+                if weight[i] > before:
+                    votes[line, offset] += weight[i] - before
+                    counted[offset], highest[offset] = column[i], weight[i]
+    return votes
