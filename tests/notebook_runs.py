@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from shared import ROOT, stages
 
-from lrfcal_lib.report import notebook
+from lrfcal_lib.report.notebook import asked
 from lrfcal_lib.session import cache
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -58,18 +58,18 @@ def run_plainly(path, session, folder, report):
 
     After them the solutions of its exercises. Where nothing else can be asked it ends there.
     """
-    ended, real = [], notebook.asked
+    ended = []
 
-    def asked(possible, why, *, rest=False):
-        ended.extend([why] * (rest and not possible))
-        return real(possible, why)
+    def heard(possible, why, *, rest=False):
+        ended.extend([why] * bool(rest and not possible))
+        return asked(possible, why)
 
     told, names = io.StringIO(), {"display": lambda shown: None}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
-        patch.setattr(notebook, "asked", asked)
+        patch.setattr("lrfcal_lib.report.notebook.asked", heard)
         for number, cell in enumerate(code_cells(read(path))):
             if ended:
                 return told.getvalue()
