@@ -144,7 +144,7 @@ def doubtful(solution, admitted_offset, without=()):
 
 
 def not_an_offset(solution):
-    """The Doubt about bearings where they explain the data better than the range offset found does, or None.
+    """The Doubt about bearings where they explain the data far better than the range offset found does, or None.
 
     Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with the offset held.
     """
@@ -152,7 +152,7 @@ def not_an_offset(solution):
     if "range_offset" in names:
         square = (offset / solution.solution.trusted_sigma[names.index("range_offset")]) ** 2
         best = weigh(solution, HELD)[0] if square > ASKED**2 else None
-        if best and best.kind == "bearings" and best.ratio > max(square, INSTEAD**2):
+        if best and best.kind == "bearings" and best.ratio > max(square / AS_GOOD, INSTEAD**2):
             return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
     return None
 
