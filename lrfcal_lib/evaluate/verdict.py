@@ -320,7 +320,8 @@ def contradicts_stated(joint):
     if abs(offset) > admitted + margin and instead not in asked:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
-            f"the range finder (session.json may state systematic_error_m): {SIZES}; the unit of the ranges and the angular step"
+            f"the range finder (session.json may state systematic_error_m): {SIZES}; the unit of the ranges; the "
+            "angular step"
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = max(doubt, abs(offset))
