@@ -8,8 +8,11 @@ import pytest
 from notebook_runs import WITH_SESSION, run_plainly
 from tiny_sessions import record, rectangle
 
+from lrfcal_lib.calibrate.pipeline import calibrate
 from lrfcal_lib.evaluate.export import calibrate_session
+from lrfcal_lib.evaluate.verdict import judge
 from lrfcal_lib.session import cache
+from lrfcal_lib.session.read import open_session
 
 SCANT = {  # besides, none has images at several pitches
     "lines": {"pitch_deg": [0.0], "platform": None},  # single scan lines, no platform: no sweep, no axis, no cloud
@@ -68,3 +71,14 @@ def test_calibrate_writes_what_is_handed_over_with_its_axis(scant, tmp_path, mon
     written = json.loads((tmp_path / "calibration.json").read_text())
     assert (status == 3) == (written["verdict"]["answer"] == "no")
     assert (np.diag(written["platform"]["axis_covariance"]) > 0).all(), "an axis that no data show is as stated"
+
+
+def test_half_of_the_scans_without_ranges_is_a_verdict(tmp_path):
+    path = record(tmp_path / "session", rectangle(0.02), pitch_deg=np.arange(-14.0, 15.0, 2.0))
+    scans = dict(np.load(path / "lrf/scans.npz"))
+    scans["ranges"] = np.where((scans["placement"] > 2)[:, None], np.nan, scans["ranges"])
+    np.savez(path / "lrf/scans.npz", **scans)
+    judged = judge(calibrate(open_session(path), ["zhang_pless"]))
+    told = " ".join(judged.sentences())
+    assert judged.answer == "no" and "placements with a board pose and points on the board, at least 3 needed" in told
+    assert "placement 3 has" in told and "Record next: 6 or more placements" in told
