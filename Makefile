@@ -11,7 +11,7 @@ SIMULATED := sim_lms221 sim_quick
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup report test notebooks golden lab data bench fuzz clean
+.PHONY: help setup report test notebooks golden lab data picture bench fuzz clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
@@ -22,6 +22,7 @@ help:
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
+	@echo "make picture                 the picture of the README: the first screen of the shipped session's report"
 	@echo "make clean                   remove the environment, reports and caches"
 
 setup:
@@ -63,6 +64,13 @@ data: setup
 	mv $(addprefix data/.new/,$(SIMULATED)) data
 	rmdir data/.new
 	cd data && find $(SIMULATED) -type f | LC_ALL=C sort | xargs sha256sum > SHA256SUMS
+
+picture: export TESTS := 1
+picture: setup
+	$(RUN) -m lrfcal_lib report data/sim_lms221
+	$$(command -v chromium || command -v chromium-browser || command -v google-chrome) --headless --no-sandbox \
+		--hide-scrollbars --window-size=1280,730 --screenshot=reports/.readme.png "file://$$PWD/reports/sim_lms221/index.html"
+	$(RUN) -c "import cv2; cv2.imwrite('reports/readme.jpg', cv2.imread('reports/.readme.png'), [cv2.IMWRITE_JPEG_QUALITY, 85])" && rm reports/.readme.png
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache reports/*/ reports/.sessions reports/.report-*

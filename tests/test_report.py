@@ -1,5 +1,7 @@
 """The report: notebooks run, what they found arrives, what fails is said and spoils nothing else."""
 
+import base64
+import html
 import json
 import os
 import re
@@ -11,14 +13,18 @@ import sys
 import threading
 from types import SimpleNamespace
 
+import cv2
 import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pandas as pd
 import pytest
+from shared import ROOT
+from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_session import wall, write
 
 from lrfcal_lib.report import notebook, report
+from lrfcal_lib.report.page import formula
 from lrfcal_lib.session.stated import SessionError
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
@@ -33,7 +39,21 @@ fig, ax = plt.subplots()
 ax.plot(session.sweep(1).ranges[0])
 notebook.save(fig, "ranges", "One scan line <of many>.")
 notebook.finding("mean_range", 2.0, "Mean range", "m", digits=1)
-notebook.table(pd.DataFrame({"edge": ["ab", "ca"], "error_mm": [-2.0, float("nan")]}), "errors", digits=1)
+notebook.table(pd.DataFrame({"method": ["joint", "line_ml"], "error_mm": [-2.0, float("nan")]}), "errors", digits=1)
+"""
+JUDGED = """
+record = {"answer": "yes", "expected_error_at_m": {"1": {"cloud_mm": 2.0, "left_px": 1.0},
+                                                   "2": {"cloud_mm": 3.0, "left_px": 1.5}}}
+said = ["this can be trusted", "expected error at 2 m: 3 mm", "handed over: 'joint'", "rest", "record next: nothing"]
+notebook.verdict("Can it be trusted?", said, record)
+notebook.table(pd.DataFrame({"placement": range(3), "used": True}), "placements")
+lengths = {"source": ["wall"] * 4 + ["paper"], "placement": [1, 1, 2, 2, None],
+           "error_mm": [1.0, -3.0, 3.0, -5.0, 8.84], "variant": ["fused"] * 4 + ["last_beam"]}
+notebook.table(pd.DataFrame(lengths), "edge_lengths")
+wide = pd.DataFrame({f"a_rather_long_heading_{n}_mm": [1234.5678] for n in range(14)})
+display(wide)
+_ = notebook.table(wide, "wide")
+print("x" * 300)
 """
 
 
@@ -56,6 +76,10 @@ def finished(session, tmp_path_factory):
     folder = tmp_path_factory.mktemp("notebooks")
     good = write_notebook(folder / "00_good.ipynb", GOOD, RESULTS)
     early = 'notebook.finding("early", "found before the failure", "Verdict")'
+    cells = nbformat.read(good, 4)
+    cells.cells += [nbformat.v4.new_markdown_cell("Of $t_y$ and\n\n$$\\mathbf y = \\left(a + b\\right) \\tag{3}$$"),
+                    nbformat.v4.new_code_cell(JUDGED)]  # fmt: skip
+    nbformat.write(cells, good)
     bad = write_notebook(folder / "01_bad.ipynb", GOOD, early, "raise ValueError('board 7 is <missing>')")
     out = tmp_path_factory.mktemp("reports") / "wall"
     (out / "figures").mkdir(parents=True)
@@ -73,23 +97,107 @@ def test_a_failing_notebook_is_told_and_the_rest_delivered(finished):
     assert "01_bad failed" in page and "board 7 is &lt;missing&gt;" in page
     page = (out / "00_good.html").read_text()
     assert "Walls are" in page and "data:image/png;base64," in page and 'href="index.html"' in page
-    assert "plt.subplots" not in page, "pages hide the code"
+    assert page.count('<details class="code"><summary>') == 3, "code is folded, and there"
+    assert re.sub("<[^>]+>", "", page).count("fig, ax = plt.subplots()") == 1
+    assert 'rel="next" href="01_bad.html"' in page and 'rel="prev"' not in page
+    assert '<mi mathvariant="bold">y</mi>' in page and "<span>(3)</span>" in page and "$" not in page
 
 
 def test_index_states_what_was_found_and_needs_no_other_file(finished, session):
     page = (finished[0] / "index.html").read_text()
     digest = report.hashlib.sha256((session / "session.json").read_bytes()).hexdigest()
-    told = ["A wall", "Walls are flat.", "2.0 m", "Mean range", "One scan line &lt;of many&gt;."]
-    told += [digest, np.__version__, '<td class="number">-2.0</td>', '<td class="number">–</td>']
+    told = ["A wall", "Walls are flat.", "2.0 m", "Mean range", "<b>Figure 0.1.</b> One scan line &lt;of many&gt;."]
+    told += [digest, np.__version__, "<b>Table 0.1.</b> Errors", '<td data-label="method">lines, likelihood</td>']
+    told += [f'<td class="number" data-label="error [mm]">{cell}</td>' for cell in ("-2.0", "–")]
     assert [words for words in told if words not in page] == []
     assert "found before the failure" in page, "a notebook that fails has told what it found until then"
-    assert re.findall(r'<img src="(.{22})', page) == ["data:image/png;base64,"]
+    assert set(re.findall(r'<img [^>]*src="(.{22})', page)) == {"data:image/png;base64,"}
     assert "<script" not in page and "<link" not in page
+
+
+def test_the_first_screen_has_the_verdict_and_its_numbers(finished):
+    page = (finished[0] / "index.html").read_text()
+    first = re.sub("<[^>]+>", "", page.split("</header>")[1].split("Contents")[0])
+    first = re.sub(r"\s+", " ", html.unescape(first))
+    told = ["This can be trusted.", "Handed over: 'joint estimate'.", "Record next: nothing.", "3.0 ± 1.5 mm",
+            "2.0 mm at 1 m", "1.5 ± 0.8 px", "3.0 ± 1.0 mm", "of 4 edge lengths", "8.84 mm"]  # fmt: skip
+    assert [words for words in told if words not in first] == []
+    assert "Rest." not in first and "Expected error at 2 m" not in first
+    assert "Rest." in page and "Expected error at 2 m" in page, "below"
+
+
+OVER = """() => {
+    for (const part of document.querySelectorAll("details")) part.open = true;
+    const width = document.documentElement.clientWidth, over = [];
+    for (const part of document.querySelectorAll("body, body *")) {
+        const inline = getComputedStyle(part).display.startsWith("inline");
+        if (part.getBoundingClientRect().right > width + 1 || !inline && part.scrollWidth > part.clientWidth + 1)
+            over.push([part.tagName, part.textContent.slice(0, 80)]);
+    }
+    return over;
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    require_browser()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        yield (browser := playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=120_000))
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Pages of the notebooks as they are stored."""
+    folder, names = tmp_path_factory.mktemp("stored"), sorted((ROOT / "notebooks").glob("*.ipynb"))
+    runs = [report.Run(path.stem, path.stem, "", 0.0, "", nbformat.read(path, 4)) for path in names]
+    found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
+    report.write_pages(folder, report.open_session(report.SHIPPED), runs, found, 0.0)
+    return folder
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_nothing_is_cut_off_and_nothing_fetched(finished, stored, browser, width):
+    view, said = browser.new_page(viewport={"width": width, "height": 800}), []
+    view.set_default_timeout(120_000)  # a busy machine takes its time
+    view.on("console", lambda message: said.append(message.text))
+    view.on("pageerror", lambda error: said.append(str(error)))
+    view.on("request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url))
+    pages = [*finished[0].glob("*.html"), *stored.glob("*.html")]
+    assert len(pages) == 14
+    for file in pages:
+        view.goto(file.as_uri())
+        assert view.evaluate(OVER) == [], file.name
+        assert not re.search(r"\$|\\\\(frac|mathbf|tag)", view.inner_text("body").replace("$HOME", "")), file.name
+    assert said == []
+    view.goto((finished[0] / "index.html").as_uri())
+    numbers = view.locator(".numbers b").last.bounding_box()
+    assert width == 400 or numbers["y"] + numbers["height"] < 800, "the numbers are on the first screen"
+    view.close()
+
+
+def test_labels_of_stored_figures_are_eight_points_or_more_at_1280():
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        for cell in nbformat.read(path, 4).cells:
+            for data in (o.get("data", {}).get("image/png") for o in cell.get("outputs", ())):
+                if data:
+                    inches = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), 0).shape[1] / 100
+                    shown = min(1, (1280 - 48) / 96 / inches)
+                    assert shown * notebook.STYLE["legend.fontsize"] >= 8, (path.name, inches)
+
+
+def test_a_displayed_formula_can_be_broken():
+    made = formula(r"a = b + \left( c + d \right), \qquad e = \frac{1}{2}", display=True)
+    parts = re.findall("<math.*?</math>", made)
+    assert [re.sub("<[^>]+>", "", part) for part in parts] == ["a", "=b", "+(c", "+d),", "e", "=12"]
+    assert formula("a = b").count("<math") == 1
 
 
 def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
     out, _ = finished
-    assert (out / "tables" / "errors.csv").read_text() == "edge,error_mm\nab,-2\nca,\n"
+    assert (out / "tables" / "errors.csv").read_text() == "method,error_mm\njoint,-2\nline_ml,\n"
     found = [(f["notebook"], f["key"], f["value"]) for f in json.loads((out / "findings.json").read_text())]
     assert found == [("00_good", "mean_range", 2.0), ("01_bad", "early", "found before the failure")]
     assert not (out / "parts").exists() and not (out / "figures" / "stale.png").exists()
@@ -238,9 +346,9 @@ def test_outside_a_report_run_nothing_is_written(monkeypatch, tmp_path):
     monkeypatch.delenv("LRFCAL_REPORT", raising=False)
     monkeypatch.chdir(tmp_path)
     notebook.save(plt.figure(), "empty", "Nothing.")
-    html = notebook.table(pd.DataFrame({"a": [0.12345]}), "numbers", digits=2).data
+    made = notebook.table(pd.DataFrame({"a": [0.12345]}), "numbers", digits=2).data
     assert notebook.report_file("cloud.ply") is None and list(tmp_path.iterdir()) == []
-    assert ">0.12<" in html and "numbers" in html
+    assert ">0.12<" in made and "numbers" in made
 
 
 def test_saving_leaves_what_was_placed_by_hand(monkeypatch, tmp_path, recwarn):

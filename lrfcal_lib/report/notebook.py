@@ -20,6 +20,7 @@ from IPython.display import HTML, display
 
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import escape
+from lrfcal_lib.solvers import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
@@ -29,8 +30,13 @@ STYLE = {
     "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 10, "axes.titleweight": "bold",
     "axes.titlelocation": "left", "axes.labelsize": 9, "axes.spines.top": False, "axes.spines.right": False,
     "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "lines.linewidth": 1.4,
-    "lines.markersize": 4, "legend.frameon": False, "legend.fontsize": 8, "image.interpolation": "nearest",
+    "lines.markersize": 4, "legend.frameon": False, "legend.fontsize": 8.5, "image.interpolation": "nearest",
     "image.cmap": "viridis",
+}  # fmt: skip
+UNITS = {"deg": "deg", "mm": "mm", "px": "px", "m": "m", "m3": "m³", "percent": "%", "radii": "spot radii"}
+WORDS = {name: method.label for name, method in METHODS.items()} | {
+    "joint": "joint estimate", "line_3d": "lines in space", "projected_last_beam": "projected lines, last beam",
+    "projected_printed": "projected lines as the paper prints them",
 }  # fmt: skip
 _found = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
@@ -97,12 +103,12 @@ def save(fig, name, caption, *, main=True):
         if get_ipython() is not None:
             display(fig)
     if get_ipython() is not None:
-        display(HTML(f'<p style="color:#555;max-width:48em">{escape(caption)}</p>'))
+        display(HTML(f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'))
     plt.close(fig)
 
 
 def table(df, name, digits=3, caption=""):
-    """A table to show, kept as ``tables/<name>.csv`` in a report run.
+    """A table to show, its columns and methods in words, kept as ``tables/<name>.csv`` in a report run.
 
     Parameters
     ----------
@@ -123,14 +129,25 @@ def table(df, name, digits=3, caption=""):
     # none shows a minus before a zero
     shapes = {c: f"{{:z.{places.get(c, 3)}f}}" for c in df.columns if df[c].dtype.kind == "f"}
     shapes |= {c: "{:.2g}" for c in shapes if c == "p_value"}  # a small chance is not none
-    _record("tables", name, {"name": name, "caption": caption, "formats": shapes})
     if path := report_file(f"tables/{name}.csv"):
         df.to_csv(path, index=False, float_format="%.9g")
     shown = df.reset_index(drop=True)
     for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
-        shown[column] = shown[column].map(lambda v: v if v is None or isinstance(v, Number) else escape(v))
-    styler = shown.style.format(shapes, na_rep="–").format_index(escape, axis=1).hide(axis="index").set_uuid(name)
-    return HTML((styler.set_caption(escape(caption)) if caption else styler).to_html())
+        words = str if column == "source" else in_words  # a session is called as it is
+        shown[column] = [v if v is None or isinstance(v, Number) else escape(words(v)) for v in shown[column]]
+    styler = shown.style.format(shapes, na_rep="–").format_index(lambda c: escape(in_words(c, True)), axis=1)
+    styler, caption = styler.hide(axis="index").set_uuid(name), caption or in_words(name).capitalize()
+    made = styler.set_caption(escape(caption)).to_html()
+    _record("tables", name, {"name": name, "caption": caption, "html": made})
+    return HTML(made)
+
+
+def in_words(text, column=False):
+    """An identifier in words: a method by its name, a column with its unit; everything else as it is."""
+    if text in WORDS or not isinstance(text, str) or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)+", text):
+        return WORDS.get(text, text)
+    *words, last = text.split("_")
+    return " ".join((*words, f"[{UNITS[last]}]" if column and last in UNITS else last))
 
 
 def finding(key, value, text, unit="", digits=3, *, main=True):
@@ -158,10 +175,13 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     print(f"{text}: {shown}")
 
 
-def verdict(title, sentences):
-    """Print sentences, the most important one first, and put them on the first page of the report before all else."""
+def verdict(title, sentences, record=None):
+    """Print sentences, the most important one first, and put them on the first page of the report before all else.
+
+    With the record of a :class:`lrfcal_lib.evaluate.verdict.Verdict` its answer and expected errors stand in front.
+    """
     sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
-    _record("verdicts", "verdict", {"title": title, "sentences": sentences})
+    _record("verdicts", "verdict", {"title": title, "sentences": sentences, "record": record})
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 

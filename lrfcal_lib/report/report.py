@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import base64
 import ctypes
 import fcntl
 import hashlib
@@ -24,16 +23,15 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
-import cv2
 import nbformat
 import pandas as pd
-from jinja2 import Environment
+from jinja2 import Environment, FileSystemLoader
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
-from nbconvert import HTMLExporter
 from tqdm import tqdm
 
-from lrfcal_lib.report.notebook import ROOT, SCRATCH, SHIPPED
+from lrfcal_lib.report import page
+from lrfcal_lib.report.notebook import ROOT, SCRATCH, SHIPPED, WORDS
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session
@@ -49,7 +47,7 @@ PART = ".report-"  # begins the names of folders in which a report is being writ
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
 _CLIENTS = set()  # of the notebooks that are being executed
-THUMBNAIL_WIDTH = 900  # pixels
+MEASURED = ("combined", "fused", "likelihood", "half_step", "last_beam")  # edge lengths, the best way first
 SOURCE_OF_SESSIONS = (
     "there is no session to report on. Either name one, `make report SESSION=path`, or get the public recording that "
     "the README describes: GitHub repository suijingfeng/LaserSeteroCalibration @ f9a70a9, folder "
@@ -66,6 +64,7 @@ class Run:
     thesis: str
     seconds: float
     error: str
+    notebook: nbformat.NotebookNode
 
 
 def make_report(session_path, out=None, jobs=2, notebooks=None):
@@ -97,13 +96,13 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
-        runs = _execute_all(paths, environment, new, jobs)
+        runs = _execute_all(paths, environment, jobs)
         found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
         found |= {part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")}
         shutil.rmtree(new / "parts")
         findings = [{"notebook": run.name, **entry} for run in runs for entry in found[run.name]["findings"]]
         (new / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
-        _write_index(new, session, runs, found, time.monotonic() - begin)
+        write_pages(new, session, runs, found, time.monotonic() - begin)
     return runs
 
 
@@ -255,11 +254,11 @@ def _take_place(new, out):
         shutil.rmtree(old)
 
 
-def _execute_all(paths, environment, out, jobs):
-    """Execute and convert notebooks side by side; the bar shows on a terminal only."""
+def _execute_all(paths, environment, jobs):
+    """Execute notebooks side by side; the bar shows on a terminal only."""
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
-        futures = {pool.submit(_run, path, environment, out): path for path in reversed(paths)}
+        futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:
             with tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
                 for future in as_completed(futures):
@@ -276,8 +275,8 @@ def _execute_all(paths, environment, out, jobs):
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _run(path, environment, out):
-    """Execute one notebook and write its page: prose, figures and numbers, without the code."""
+def _run(path, environment):
+    """Execute one notebook."""
     begin = time.monotonic()
     notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
     # first heading and first paragraph
@@ -285,47 +284,55 @@ def _run(path, environment, out):
     blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
     title = next((block.lstrip("# ").splitlines()[0] for block in blocks if block.startswith("#")), path.stem)
     thesis = next((re.sub(r"[*`>]", "", block) for block in blocks if not block.startswith("#")), "")
-    plain = {"exclude_input": True, "exclude_input_prompt": True, "exclude_output_prompt": True, "embed_images": True}
-    exporter = HTMLExporter(theme="light", **plain)
-    page, _ = exporter.from_notebook_node(notebook, resources={"metadata": {"name": title}})
-    page = re.sub(r"(<body[^>]*>)", r'\1<p style="margin:1em 2em"><a href="index.html">report</a></p>', page, count=1)
-    (out / f"{path.stem}.html").write_text(page, encoding="utf-8")
-    return Run(path.stem, title, " ".join(thesis.split()), time.monotonic() - begin, error)
+    return Run(path.stem, title, " ".join(thesis.split()), time.monotonic() - begin, error, notebook)
 
 
-def _write_index(out, session, runs, found, seconds):
-    source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source).render(
+def write_pages(out, session, runs, found, seconds):
+    """The pages of the notebooks and the first one, of what is in the report's folder."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
+    quoted = r"(?<=')\w+(?=')"  # methods named in sentences
+    jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: WORDS.get(m[0], m[0]), WORDS.get(text, text))
+    numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
+    drawn = {}
+    for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
+        body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
+        template = jinja.get_template("notebook.html.jinja")
+        made = template.render(session=session, run=run, body=body, before=before, after=after)
+        (out / f"{run.name}.html").write_text(made, encoding="utf-8")
+    figures = {name: figure for shown, _ in drawn.values() for name, figure in shown.items()}
+    verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
+    main = max(verdicts, key=lambda entry: entry["record"] is not None, default=None)  # the first one without a record
+    told = {entry["key"]: entry for run in runs for entry in found[run.name]["findings"]}
+    made = jinja.get_template("report.html.jinja").render(
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
-        findings=[entry for run in runs for entry in found[run.name]["findings"] if entry["main"]],
-        verdicts=[entry for run in runs for entry in found[run.name]["verdicts"]],
-        thumbnail=lambda name: _thumbnail(out / "figures" / f"{name}.png"),
-        rows=lambda entry: _rows(out / "tables" / f"{entry['name']}.csv", entry["formats"]),
+        numbers=numbers, drawn=drawn, verdicts=verdicts, told=told, main=main, headline=_headline(out, main),
+        rest=[words for words in main["sentences"][1:] if not words.startswith("Expected error")] if main else [],
+        picture=next((figures[n] for n in ("scene", "cloud", "clouds_of_boards", "frames") if figures.get(n)), ""),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
     )  # fmt: skip
-    (out / "index.html").write_text(page, encoding="utf-8")
+    (out / "index.html").write_text(made, encoding="utf-8")
 
 
-def _thumbnail(file):
-    """A picture as data URI, so that the page needs no other file; '' where there is none."""
-    picture = cv2.imread(str(file))
-    if picture is None:
-        return ""
-    scale = min(THUMBNAIL_WIDTH / picture.shape[1], 1.0)
-    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
-
-
-def _rows(file, shapes):
-    """Header, alignment and formatted cells of a table; None where its notebook failed before writing it."""
-    if not file.is_file():
-        return None
-    table = pd.read_csv(file)
-    shown = {c: ["–" if pd.isna(v) else shapes.get(c, "{}").format(v) for v in table[c]] for c in table}
-    cells = [list(row) for row in zip(*shown.values(), strict=True)]
-    return {"columns": list(shown), "numeric": [table[c].dtype.kind in "if" for c in table], "cells": cells}
+def _headline(out, verdict):
+    """Numbers of the first screen as far as there are any: expected errors by distance, measured edge lengths."""
+    numbers, tables = {}, out / "tables"
+    if verdict and verdict["record"] and verdict["record"]["expected_error_at_m"]:
+        errors = pd.DataFrame(verdict["record"]["expected_error_at_m"])
+        numbers = {"cloud": dict(errors.loc["cloud_mm"]), "image": dict(errors.drop("cloud_mm").max())}
+        # a standard deviation from n placements is itself known to one part in sqrt(2 (n - 1))
+        used = pd.read_csv(tables / "placements.csv").used.sum() if (tables / "placements.csv").is_file() else 0
+        numbers["known"] = (2 * (used - 1)) ** -0.5 if used > 1 else 0.0
+    if (tables / "edge_lengths.csv").is_file():
+        lengths = pd.read_csv(tables / "edge_lengths.csv").dropna(subset="error_mm")
+        lengths, own = lengths.assign(error=lengths.error_mm.abs()), lengths.source != "paper"
+        if len(best := next((way for way in MEASURED if (own & (lengths.variant == way)).any()), "")):
+            part = lengths[own & (lengths.variant == best)]
+            spread = part.groupby("placement").error.mean().sem()
+            numbers["edges"] = {"n": len(part), "mean": part.error.mean(), "sigma": spread,
+                                "paper": lengths[~own].error.mean()}  # fmt: skip
+    return numbers
 
 
 def _provenance(session):

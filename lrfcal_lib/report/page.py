@@ -1,0 +1,132 @@
+"""Pages out of executed notebooks: formulas that any browser draws, code folded, figures and tables numbered."""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from itertools import chain
+from xml.etree import ElementTree
+
+from bs4 import BeautifulSoup
+from latex2mathml.converter import convert
+from nbconvert.filters.highlight import Highlight2HTML
+from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+
+from lrfcal_lib.report.notebook import in_words
+
+SHORT = 15  # rows of a table that is shown unfolded
+PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
+WIDTHS = ((9, "wide"), (4, "medium"), (0, "narrow"))  # columns from which a table is turned on screens as narrow
+
+
+class Renderer(IPythonRenderer):
+    """Markdown of a notebook as HTML, its formulas as MathML."""
+
+    def inline_math(self, body):
+        return formula(body)
+
+    def block_math(self, body):
+        number = re.search(r"\\tag\{(.*?)\}", body)
+        drawn = formula(re.sub(r"\\tag\{.*?\}", "", body), display=True)
+        return f'<div class="formula"><div>{drawn}</div>' + (f"<span>({number[1]})</span>" if number else "") + "</div>"
+
+    def multiline_math(self, text):
+        return self.block_math(text.strip("$"))
+
+
+def formula(latex, display=False):
+    """A formula as MathML; a displayed one in parts, so that lines can break where it says = or +, or leaves a gap."""
+    row = ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", convert(latex)))[0]
+    parts = [[]]
+    # what stands between \left and \right may be broken too
+    for node in chain.from_iterable(node if display and node.tag == "mrow" else [node] for node in row):
+        if display and parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
+            node.set("form", "infix")
+            parts.append([])
+        parts[-1].append(ElementTree.tostring(node, "unicode"))
+        if display and node.tag == "mspace" and float(node.get("width").removesuffix("em")) >= 1:
+            parts.append([])
+    drawn = '<math displaystyle="true">' if display else "<math>"
+    return " ".join(f"{drawn}<mrow>{''.join(part)}</mrow></math>" for part in parts)
+
+
+def render(notebook, found, number, folder):
+    """The body of a notebook's page, and its figures and tables by name, as HTML.
+
+    `found` are the entries of :mod:`lrfcal_lib.report.notebook`; figures are taken from the report's `folder`.
+    """
+    figures = {entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
+               for n, entry in enumerate(found["figures"], start=1)}  # fmt: skip
+    tables = {e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)}
+    body, color = [], Highlight2HTML(pygments_lexer="ipython3")
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            renderer = Renderer(escape=False, attachments=cell.get("attachments", {}), exclude_anchor_links=True)
+            text = turned(MarkdownWithMath(renderer=renderer).render(cell.source))
+            body.append(re.sub(r'(href="\d\d_\w+)\.ipynb"', r'\1.html"', text))
+        elif cell.cell_type == "code":
+            body.append(f'<details class="code"><summary>Code</summary>{color(cell.source)}</details>')
+            for output in cell.outputs:
+                shown = _output(output)
+                if (caption := re.match(r'<p id="figure-(\w+)"', shown)) and figures.get(caption[1]):
+                    body[-1] = figures[caption[1]]  # the picture stands before its caption
+                elif (styled := re.search(r'<table id="T_(\w+)"', shown)) and styled[1] in tables:
+                    body.append(tables[styled[1]])
+                else:
+                    body.append(turned(shown))
+    return "\n".join(body), figures, tables
+
+
+def _output(output):
+    """One output of a cell: HTML, picture or text."""
+    if output.output_type == "error":
+        plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(output.traceback))
+        return f'<pre class="error">{html.escape(plain)}</pre>'
+    data = output.get("data", {})
+    if "text/html" in data:
+        return data["text/html"]
+    if "image/png" in data:
+        return f'<img alt="" src="data:image/png;base64,{data["image/png"].strip()}">'
+    return f"<pre>{html.escape(output.get('text') or data.get('text/plain', ''))}</pre>"
+
+
+def _figure(folder, entry, label):
+    """A figure that holds its picture, as large as it was drawn; '' where its notebook failed before drawing it."""
+    if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
+        return ""
+    data, caption = file.read_bytes(), html.escape(entry["caption"])
+    width = round(int.from_bytes(data[16:20]) * PIXELS_PER_INCH)
+    picture = f'<img alt="{caption}" width="{width}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
+    return (f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
+            f"<figcaption><b>{label}.</b> {caption}</figcaption></figure>")  # fmt: skip
+
+
+def _table(entry, label):
+    """A table, folded where it is long."""
+    made = turned(entry["html"])
+    rows = made.count("<tr>") - 1
+    file, caption = f"tables/{entry['name']}.csv", html.escape(entry["caption"])
+    return (f'<details class="table" id="T-{entry["name"]}"{" open" if rows <= SHORT else ""}><summary>'
+            f'<b>{label}.</b> {caption} <span class="soft">({rows} rows, <a href="{file}">CSV</a>)</span></summary>'
+            f"{made}</details>")  # fmt: skip
+
+
+def turned(text):
+    """HTML whose tables a narrow screen can show turned: every cell knows the heading of its column."""
+    soup = BeautifulSoup(text, "html.parser")
+    for part in soup(["style", "caption"]):
+        part.decompose()
+    for table in soup("table"):
+        heads = table.thead("th") if table.thead else []
+        for head in heads:
+            head.string = in_words(head.get_text(), column=True)
+        table.attrs = {"class": next(name for least, name in WIDTHS if len(heads) >= least)}
+        for part in table(["th", "td", "tr"]):
+            part.attrs = {}
+        for row in table.tbody("tr") if table.tbody else ():
+            for head, cell in zip(heads, row(["th", "td"]), strict=False):
+                cell["data-label"] = head.string
+                if re.fullmatch(r"[-+]?[\d.]+(e[-+]\d+)?|–|nan", cell.get_text().strip()):
+                    head["class"] = cell["class"] = "number"
+    return str(soup)
