@@ -18,7 +18,7 @@ help:
 	@echo "make test                    lint and run all tests, the notebooks included"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
-	@echo "make bench                   compare speed with scipy and OpenCV"
+	@echo "make bench                   speed and memory beside scipy, OpenCV and GTSAM, if installed: reports/bench/"
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"

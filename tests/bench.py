@@ -1,76 +1,235 @@
-"""Speed, as ratios within one run: ours against scipy, OpenCV, or itself one by one. Run with ``make bench``."""
+"""Speed and memory, every figure beside a named alternative in the same run: ``make bench``.
 
+Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: its ratio is null
+unless somebody installs it (`pip install gtsam`).
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
 import time
+import tracemalloc
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from joint_draws import draw, none
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 
 from lrfcal_lib.calibrate.reconstruct import Painter, View
-from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project
-from lrfcal_lib.session.lms2xx_codec import decode_scans, encode_scan, split_stream
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import Unknowns, gather, joint_blocks, move_state
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
+from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, encode_scan, split_stream
 from lrfcal_lib.solvers import solve_camera
+from lrfcal_lib.solvers.joint import converged, of_placements, solve_joint
+from lrfcal_lib.solvers.joint_start import start_states, thin
 
-REPEATS = 7
+ROOT = Path(__file__).resolve().parent.parent
+FULL = {
+    "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "core": 5, "points": 10_000_000,
+    "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
+}  # fmt: skip
+TINY = {  # for the test, which only asks whether everything is written
+    "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "core": 0, "points": 10_000, "growth": (1_000,),
+    "telegrams": 100, "session": None,
+}  # fmt: skip
+CHUNK = 1_000_000  # points that growth hands over at a time
+ROWS = {"face": 40, "beam": 30}
+MODEL = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
 
 
-def seconds(function):
-    """Median time of a call, after one to warm up."""
+def seconds(repeats, *functions):
+    """Median times of calls that take turns (so that both meet the same load), after one each to warm up."""
+    times = np.zeros((repeats + 1, len(functions)))
+    for row in times:
+        for i, function in enumerate(functions):
+            begin = time.perf_counter()
+            function()
+            row[i] = time.perf_counter() - begin
+    return np.median(times[1:], axis=0).tolist()
+
+
+def memory(function):
+    """Largest size of what Python and NumPy hold during a call, MB."""
+    tracemalloc.start()
     function()
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 1e6
 
 
-def solving():
-    """One line calibration: ours, scipy with a numeric Jacobian, and a thousand trials at once."""
+def cameras(size):
+    """One line calibration of twenty placements, and many at once, against scipy with a numeric Jacobian."""
     rng = np.random.default_rng(0)
     rig = random_rig(rng)
     obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig), noise=1.0)
     start = solve_camera(obs).transform
-
-    def residuals(x):
-        T = RigidTransform.from_components(x[3:], Rotation.from_rotvec(x[:3]))
-        return line_distance(pinhole(T.apply(obs.crossing_points), obs.model), obs.crossing_lines)
-
     x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
     T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
-    ours = seconds(lambda: solve_camera(obs, "line", T0))
-    theirs = seconds(lambda: least_squares(residuals, x0, method="lm"))
-    points = np.broadcast_to(obs.crossing_points, (1000,) + obs.crossing_points.shape)
-    trials = replace(obs, crossing_points=points, crossing_placement=0 * obs.crossing_placement)
-    batch = seconds(lambda: solve_camera(trials, "line", T0)) / 1000
-    what = f"line calibration, {len(obs.crossing_points)} crossings"
-    yield what, 1000 * ours, "ms", "scipy lm, numeric", theirs / ours
-    yield "the same in a batch of 1000", 1000 * batch, "ms", "one by one", ours / batch
+    points = obs.crossing_points + rng.normal(0, 0.002, (size["trials"], *obs.crossing_points.shape))
+    trials = replace(obs, crossing_points=points)
+
+    def scipy(points):
+        def residuals(x):
+            T = RigidTransform.from_components(x[3:], Rotation.from_rotvec(x[:3]))
+            return line_distance(pinhole(T.apply(points), obs.model), obs.crossing_lines)
+
+        return least_squares(residuals, x0, method="lm").x
+
+    def one():
+        return solve_camera(obs, "line", T0, search=False)
+
+    def many():
+        return solve_camera(trials, "line", T0)
+
+    ours, theirs = seconds(3 * size["repeats"], one, lambda: scipy(obs.crossing_points))
+    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours, one
+    some = points[: max(1, len(points) // 20)]
+    batch, loop = seconds(size["repeats"], many, lambda: [scipy(p) for p in some])
+    faster = loop * len(points) / len(some) / batch
+    yield "monte_carlo_1000_s", batch, "monte_carlo_vs_scipy", "scipy in a loop", faster, many
 
 
-def colouring():
-    """A million points through the lens; ten million coloured with occlusion, against OpenCV and a depth buffer."""
-    rng = np.random.default_rng(1)
-    model = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
-    points = rng.uniform([-1, -0.7, 1.5], [1, 0.7, 4], (10_000_000, 3)).astype(np.float32)
-    image = rng.integers(0, 255, (768, 1024, 3), dtype=np.uint8)
-    zero, ahead = np.zeros(3), np.tile(np.float32([0, 0, -1]), (len(points), 1))
-    some = points[::10].astype(float)
-    ours = seconds(lambda: project(some, model))
-    theirs = seconds(lambda: cv2.projectPoints(some, zero, zero, model.matrix, model.distortion))
-    yield "projection", 1 / ours, "Mpoint/s", "cv2.projectPoints", theirs / ours
+def problem(count):
+    """A drawn session with so many rows of each group a placement, evenly picked."""
+    obs, masks = draw(np.random.default_rng(0), count)[0], {}
+    for name, most in ROWS.items():
+        places = getattr(obs, f"{name}_placement")
+        rows = np.concatenate([thin(np.flatnonzero(places == p), most) for p in range(count)])
+        masks[name] = np.isin(np.arange(len(places)), rows)
+    return obs.keep(**masks)
+
+
+def core(count):
+    """Ranges and views of a problem: a start value, and whitened residuals and Jacobian of increments about one."""
+    obs = none(problem(count), "beam")
+    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
+
+    def rows(shared, own, start=start, data=data):
+        parts = [whiten(block) for block in joint_blocks(move_state(start, (shared, own), unknowns), data, unknowns)]
+        return np.concatenate([r for r, _ in parts], axis=1), np.concatenate([J for _, J in parts], axis=1)
+
+    return start, data, unknowns, rows
+
+
+def with_gtsam(count, at_once):
+    """What runs GTSAM's iterations from the start value, with a Python factor a placement.
+
+    Every factor works out its own placement, or (`at_once`, the most that can be done for GTSAM from Python) the first
+    one that meets a new state works out all of them.
+    """
+    import gtsam
+
+    start, data, unknowns, rows = core(count)
+    c, last, pieces = unknowns.shared, [np.full(unknowns.shared, np.nan), np.zeros((count, unknowns.own)), None], []
+    for p in range(count):
+        groups = {name: {k: v[[p]] for k, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
+        piece = replace(data, **groups, middle=data.middle[[p]], direction=data.direction[[p]])
+        pieces.append((of_placements(start, [p]), piece))
+
+    def look(p, values):
+        shared, own = values.atVector(0), values.atVector(p + 1)
+        if not at_once:
+            return (part[0] for part in rows(shared, own[None], *pieces[p]))
+        if not (np.array_equal(shared, last[0]) and np.array_equal(own, last[1][p])):
+            last[:2] = shared, np.stack([values.atVector(i + 1) for i in range(count)])
+            last[2] = rows(*last[:2])
+        return (part[p] for part in last[2])
+
+    def error(p, values, jacobians):
+        r, J = look(p, values)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.asfortranarray(J[:, :c]), np.asfortranarray(J[:, c:])
+        return r
+
+    graph, first = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Unit.Create(rows(np.zeros(c), last[1])[0].shape[1])
+    first.insert(0, np.zeros(c))
+    for p in range(count):
+        first.insert(p + 1, np.zeros(unknowns.own))
+        graph.add(gtsam.CustomFactor(noise, [0, p + 1], lambda _, values, H, p=p: error(p, values, H)))
+
+    def run():
+        found = gtsam.LevenbergMarquardtOptimizer(graph, first, gtsam.LevenbergMarquardtParams()).optimize()
+        own = np.stack([found.atVector(p + 1) for p in range(count)])
+        return move_state(start, (found.atVector(0), own), unknowns)
+
+    apart = np.abs(run().cameras - converged(start, data, unknowns, 1e-4).cameras).max()
+    assert apart < 1e-4, f"GTSAM and we end in different places, {apart}"
+    return run
+
+
+def joint(size):
+    """The whole joint estimate, start values included, against GTSAM's iterations alone (on less: no beams)."""
+    obs, count, none_of_them = problem(size["joint"]), size["joint"], [np.nan, np.nan]
+    ours = [lambda: solve_joint(obs)]
+    try:
+        theirs = [with_gtsam(count, at_once) for at_once in (False, True)]
+    except ImportError:
+        print("no GTSAM here (pip install gtsam): its ratios stay empty", file=sys.stderr)
+        theirs = []
+    taken, *others = seconds(size["repeats"], *ours, *theirs)
+    for key, how, other in zip(("", "_at_once"), ("a factor each", "at once"), others or none_of_them, strict=True):
+        against = f"GTSAM's iterations, placements evaluated {how}"
+        yield "joint_100_s", taken, f"joint_vs_gtsam{key}", against, other / taken, ours[0]
+
+
+def joint_core(size):
+    """The joint estimate's core against scipy's dense trust region with a numeric Jacobian."""
+    count = size["core"]
+    if not count:
+        return
+    start, data, unknowns, rows = core(count)
+    c = unknowns.shared
+
+    def residuals(x):
+        return rows(x[:c], x[c:].reshape(count, -1))[0].ravel()
+
+    ours = seconds(size["repeats"], lambda: converged(start, data, unknowns, 1e-4))[0]
+    begin = time.perf_counter()
+    x = least_squares(residuals, np.zeros(c + count * unknowns.own), method="trf", x_scale="jac").x
+    theirs = time.perf_counter() - begin
+    other = move_state(start, (x[:c], x[c:].reshape(count, -1)), unknowns)
+    apart = np.abs(converged(start, data, unknowns, 1e-4).cameras - other.cameras).max()
+    assert apart < 1e-5, "scipy and we end in different places"
+    yield "joint_core_5_ms", 1000 * ours, "joint_core_vs_scipy", "scipy trf, numeric Jacobian", theirs / ours, None
+
+
+def scene(rng, count):
+    """Points (n, 3) before a camera, and an image."""
+    points = rng.random((count, 3), np.float32)
+    points *= np.float32([2, 1.4, 2.5])
+    points += np.float32([-1, -0.7, 1.5])
+    return points
+
+
+def painter(image):
+    return Painter([View(0, "one", RigidTransform.identity(), MODEL, image)], 2 / 900, 0.05)
+
+
+def colouring(size):
+    """Points coloured from one image with occlusion, against OpenCV and a depth buffer."""
+    rng, count = np.random.default_rng(1), size["points"]
+    image, points = rng.integers(0, 255, (768, 1024, 3), dtype=np.uint8), scene(rng, count)
+    zero, ahead, some = np.zeros(3), np.tile(np.float32([0, 0, -1]), (count, 1)), points[::10].astype(float)
 
     def paint():
-        painter = Painter([View(0, "one", RigidTransform.identity(), model, image)], 2 / 900, 0.05)
-        painter.hide(points)
-        return painter.paint(points, ahead)
+        one = painter(image)
+        one.hide(points)
+        return one.paint(points, ahead)
 
     def with_opencv():
-        uv = cv2.projectPoints(some, zero, zero, model.matrix, model.distortion)[0][:, 0]
+        uv = cv2.projectPoints(some, zero, zero, MODEL.matrix, MODEL.distortion)[0][:, 0]
         depth, (column, row) = np.linalg.norm(some, axis=1), np.rint(uv / 4).astype(int).T
         inside = np.flatnonzero((uv > 0).all(axis=1) & (uv < [1023, 767]).all(axis=1))
         cells = row[inside] * 257 + column[inside]
@@ -80,24 +239,109 @@ def colouring():
         maps = np.resize(uv[seen].astype(np.float32), (-(-len(seen) // 4096), 4096, 2))
         return cv2.remap(image, maps, None, cv2.INTER_LINEAR)
 
-    taken, slow = seconds(paint), 10 * seconds(with_opencv)
-    yield "colour_mpoints_per_s", len(points) / 1e6 / taken, "Mpoint/s", "colour_vs_cv2", slow / taken
+    ours, tenth = seconds(size["repeats"], paint, with_opencv)
+    against = "cv2.projectPoints, depth buffer, cv2.remap"
+    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours, paint
 
 
-def decoding():
-    """Telegrams of an LMS2xx: found, checked and decoded."""
-    data = b"".join(encode_scan(r) for r in np.random.default_rng(2).uniform(1, 8, (200, 361))) * 100
+def decoding(size):
+    """Telegrams of an LMS2xx found, checked and decoded, against one by one in plain Python."""
+    raw = [encode_scan(r) for r in np.random.default_rng(2).uniform(1, 8, (size["telegrams"] // 100, 361))]
+    data = b"".join(raw) * 100
 
     def whole():
         stream = split_stream(data)
         return decode_scans(data, stream.offset, stream.length)
 
-    taken = seconds(whole)
-    speed = len(data) / 1e6 / taken
-    yield "telegrams with their checksums", speed, "MB/s", "the line at 500 kBd", 20 * speed
+    ours, theirs = seconds(size["repeats"], whole, lambda: [decode_scan(one) for one in raw])
+    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours, whole
+
+
+def commands(size):
+    """Whole commands on a shipped session, once each: nothing else does the same."""
+    for key, verb in (("calibrate_s", "calibrate"), ("report_s", "report")):
+        taken = np.nan
+        if size["session"]:
+            with TemporaryDirectory() as folder:
+                shutil.copytree(ROOT / "data" / size["session"], Path(folder, "session"))
+                out = ["--out", "out"] if verb == "report" else []
+                environment = os.environ | {"LRFCAL_CACHE": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+                begin = time.perf_counter()
+                command = [sys.executable, "-m", "lrfcal_lib", verb, "session", *out]
+                subprocess.run(command, check=True, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+                taken = time.perf_counter() - begin
+        yield key, taken, None, "", np.nan, None
+
+
+def paint_blocks(count):
+    """Colour so many points block by block: seconds and the largest memory of this process, MB."""
+    image = np.random.default_rng(1).integers(0, 255, (768, 1024, 3), dtype=np.uint8)
+    one, ahead, taken = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1)), 0.0
+    one.paint(scene(np.random.default_rng(0), 10), ahead[:10])  # loads the compiled loops
+    for work in (one.hide, lambda points: one.paint(points, ahead)):
+        rng = np.random.default_rng(2)  # the same points again
+        for start in range(0, count, CHUNK):
+            points = scene(rng, min(CHUNK, count - start))
+            begin = time.perf_counter()
+            work(points)
+            taken += time.perf_counter() - begin
+    status = Path("/proc/self/status").read_text()  # getrusage would count the parent's memory
+    return taken, int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def growth(size):
+    """Time and memory by number of points (a process each) and of placements."""
+    for count in size["growth"]:
+        command = [sys.executable, __file__, "--paint", str(count)]
+        taken, peak = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        yield "colouring", "points", count, taken, peak
+    for count in size["placements"]:
+        obs = problem(count)
+        taken = seconds(min(size["repeats"], 3), lambda obs=obs: solve_joint(obs))[0]
+        yield "joint estimate", "placements", count, taken, memory(lambda obs=obs: solve_joint(obs))
+
+
+def plot(table, path):
+    """Time and memory over size, both logarithmic."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for ax, (what, rows) in zip(axes, table.groupby("what"), strict=True):
+        ax.loglog(rows["count"], rows["seconds"], "o-", label="seconds")
+        ax.loglog(rows["count"], rows["peak_mb"], "s--", label="memory, MB")
+        ax.set(title=what, xlabel=rows["of"].iloc[0])
+        ax.grid(alpha=0.3)
+        ax.legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main(out, size=None):
+    """Measure everything at a size and write bench.json, bench.csv and growth.png."""
+    size, rows, figures = size or FULL, [], {}
+    for part in (cameras, joint, joint_core, colouring, decoding, commands):
+        for key, value, ratio_key, against, times_faster, call in part(size):
+            rows.append([key, value, against, times_faster, memory(call) if call else np.nan])
+            figures |= {key: value, ratio_key: times_faster} if ratio_key else {key: value}
+            print(f"{key} {value:.4g}" + (f", {times_faster:.3g} times {against}" if against else ""), flush=True)
+    grown = pd.DataFrame(growth(size), columns=["what", "of", "count", "seconds", "peak_mb"])
+    figures["peak_mb_1e8_points"] = grown[grown["of"] == "points"]["peak_mb"].iloc[-1]
+    print(grown.round(3).to_string(index=False))
+    out.mkdir(parents=True, exist_ok=True)
+    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster", "memory_mb"])
+    table.to_csv(out / "bench.csv", index=False, float_format="%.5g")
+    plot(grown, out / "growth.png")
+    figures = {key: None if np.isnan(value) else float(f"{value:.5g}") for key, value in figures.items()}
+    figures["growth"] = json.loads(grown.to_json(orient="records"))
+    figures["sizes"], figures["machine"] = size, {"cpus": os.cpu_count(), "load": os.getloadavg()[0]}
+    (out / "bench.json").write_text(json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    rows = [row for part in (solving, colouring, decoding) for row in part()]
-    table = pd.DataFrame(rows, columns=["what", "value", "unit", "against", "times_faster"])
-    print(table.round(2).to_string(index=False))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "reports" / "bench")
+    parser.add_argument("--without-commands", action="store_true", help="without the minutes of calibrate and report")
+    parser.add_argument("--paint", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.paint:
+        print(json.dumps(paint_blocks(options.paint)))
+    else:
+        main(options.out, FULL | ({"session": None} if options.without_commands else {}))

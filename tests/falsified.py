@@ -69,6 +69,20 @@ def longer_lens(obs, camera=0, factor=1.03):
     return replace(obs, view_pose=pose)
 
 
+def knocked(obs):
+    """One camera 30 mm aside from the middle of the recording on."""
+    pose = obs.view_pose.copy()
+    pose[(obs.view_camera == 0) & (obs.view_placement >= len(obs.placements) // 2), 0, 3] += 0.03
+    return replace(obs, view_pose=pose)
+
+
+def late(obs):
+    """The pitch of scan lines 0.3 deg late, up and down."""
+    behind = 0.005 * obs.direction
+    pitch = {f"{name}_pitch": getattr(obs, f"{name}_pitch") for name in ("face", "beam")}
+    return replace(obs, **{key: v - behind[getattr(obs, f"{key[:4]}_placement")] for key, v in pitch.items()})
+
+
 # what was done: change of the observations, kinds of reasons of which one has to be given (none: it must do no harm)
 FALSIFIED = {
     "squares 2 % too large": (scaled(squares=0.02), ("squares", "ranges")),
@@ -103,6 +117,8 @@ FALSIFIED = {
     "noise of ranges stated a tenth": (changed(face_sigma=lambda s: s / 10), ("noise",)),
     "noise of images stated a tenth": (changed(view_covariance=lambda c: c / 100), ("noise",)),
     "focal length of one camera 3 % too long": (longer_lens, ("misfit", "noise")),
+    "camera knocked aside half-way": (knocked, ("excluded", "misfit", "model error", "noise")),
+    "pitch of scan lines 0.3 deg late": (late, ("warning", "model error", "misfit")),
     "three placements": (lambda obs: obs.select(obs.placements[:3]), ("placements",)),
     "one pitch only": (
         pitched(lambda p: 0.02 * p), ("pitch", "unobservable", "pitch scale", "far from stated")

@@ -8,11 +8,12 @@ import pytest
 from joint_draws import draw, square_per_number
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
-from lrfcal_lib.evaluate import tables
+from lrfcal_lib.evaluate import scenes, tables
 from lrfcal_lib.evaluate.export import calibration_record
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
@@ -121,6 +122,86 @@ def test_boards_of_unknown_size_in_the_coloured_cloud(joint):
         for edge, length in fused_outline_of(joint, placement)[0].lengths.items()
     ]
     assert len(misses) >= 6 and np.mean(np.abs(misses)) < 3.0
+
+
+def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_board(joint):
+    table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint)
+    own = table[(table.source != "paper") & table.measured_mm.notna()].set_index("variant")
+    error = own.error_mm.abs().groupby("variant").mean()
+    assert error["combined"] < 1.0 and error["combined"] < error.drop(["combined", "fused"]).min() / 10
+    assert (own.loc["combined"].error_mm / own.loc["combined"].sigma_mm).abs().max() < 3.5
+    assert own.sigma_mm.notna().all() and set(own.loc["combined"].ends) <= {"image", "scan"}
+    larger = replace(joint.prepared.board, corners=joint.prepared.board.corners * 1.1)
+    other = combined.combined_outlines(replace(joint, prepared=replace(joint.prepared, board=larger)))
+    same = combined.combined_outlines(joint)
+    for placement, (board, _) in same.items():
+        for name, length in board.lengths.items():
+            assert other[placement][0].lengths[name] == pytest.approx(length, abs=1e-5)
+
+
+def other_session(found, **changes):
+    """The calibration of a session whose images are not as they were."""
+    session = found.prepared.session
+    records = tuple(replace(record, **changes) for record in session.image_records)
+    return replace(found, prepared=replace(found.prepared, session=replace(session, image_records=records)))
+
+
+BAD = {
+    "images without a known pitch": (lambda c: other_session(c, pitch=np.nan), "joint", "of none is the pitch known"),
+    "a method that was not run": (lambda c: c, "line_printed", "'line_printed' poses no camera"),
+    "another rig's cameras": (
+        lambda c: replace(c, solutions={("top", m): s for (_, m), s in c.solutions.items()}), "joint",
+        "they are of left, right, the calibration by 'joint' poses top",
+    ),
+    "another rig's lenses": (
+        lambda c: replace(c, prepared=replace(c.prepared, models={
+            name: replace(model, width=320, height=240) for name, model in c.prepared.models.items()})),
+        "joint", "has 320 x 240 pixels, its image",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_colour_a_cloud_is_refused(found, case):
+    change, method, words = BAD[case]
+    with pytest.raises(ValueError, match=words):
+        pipeline.color_cloud(change(found), method)
+
+
+def test_lengths_between_features_know_how_good_they_are(found):
+    """Two halves of one face are no distance apart across it, and half a board along it."""
+    cloud, solution, offs = pipeline.color_cloud(found, "joint"), found.joint.solution, []
+    for placement in np.unique(cloud.placement):
+        rows = np.flatnonzero(cloud.placement == placement)
+        x = cloud.points[rows, 0]
+        left, right = rows[x < np.median(x)], rows[x >= np.median(x)]
+        planes = [scenes.fit_feature(cloud, half, solution) for half in (left, right)]
+        length, sigma = scenes.length_between(scenes.fit_feature(cloud, rows, solution), planes[0])
+        offs.append(length / sigma)
+        points = [scenes.fit_feature(cloud, half, solution, plane=False) for half in (left, right)]
+        length, sigma = scenes.length_between(*points)
+        assert length == pytest.approx(np.linalg.norm(points[1].centre - points[0].centre)) and 0 < sigma < 0.01
+        length, sigma = scenes.length_between(points[0], planes[1])
+        assert length < 5 * sigma
+    assert 0.1 < np.sqrt(np.mean(np.square(offs))) < 3
+    with pytest.raises(DegenerateGeometry, match="no point"):
+        scenes.fit_feature(cloud, [], solution)
+
+
+def test_what_is_known_of_a_board_is_differentiated_exactly(joint):
+    views = {camera: list(found.values()) for camera, found in joint.prepared.views.items()}
+    case = combined.case_of(joint, observe_joint(joint.prepared, views), next(iter(joint.without)))
+    state, covariance = combined.fitted(case, case.start, 1.0)
+    own = len(covariance) - case.unknowns.shared
+
+    def sights(step):
+        change, step = (step[: case.unknowns.shared], step[case.unknowns.shared :][None])
+        return combined.sight_block(combined.moved(case, state, (change, step)), case, 1.0).residuals[0]
+
+    J = combined.sight_block(state, case, 1.0).jacobian[0]
+    steps = 1e-6 * np.eye(len(covariance))
+    numeric = np.stack([(sights(step) - sights(-step)) / 2e-6 for step in steps], axis=1)
+    assert own > 6 and J.any() and np.abs(numeric - J).max() < 2e-2 * np.abs(J).max()
 
 
 def test_an_image_edge_on_a_plane_projects_onto_itself(found):

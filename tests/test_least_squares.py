@@ -8,6 +8,7 @@ import scipy.optimize
 
 from lrfcal_lib.fit.least_squares import (
     Block,
+    medians,
     minimise,
     null_space,
     placement_covariance,
@@ -73,6 +74,14 @@ def test_weights_are_the_slope_of_the_loss():
     z = np.array([0.01, 0.5, 1.0, 1.4, 3.0, 20.0])
     slope = (robust(z + 1e-6, "cauchy")[0] - robust(z - 1e-6, "cauchy")[0]) / 2e-6
     np.testing.assert_allclose(robust(z, "cauchy")[1], slope / (2 * z), rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [1, 2, 5, 8])
+def test_medians_of_rows(width):
+    values = np.random.default_rng(0).normal(size=(40, width))
+    used = np.random.default_rng(1).random(values.shape) < 0.6
+    expected = [np.median(row[mine]) if mine.any() else 0.0 for row, mine in zip(values, used, strict=True)]
+    np.testing.assert_array_equal(medians(values, used), expected)
 
 
 def test_robust_result_matches_scipy(data):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct as rec
 from lrfcal_lib.calibrate.outline import as_recorded, measure_board
-from lrfcal_lib.evaluate.export import write_pcd
+from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
@@ -224,6 +224,9 @@ def test_a_moving_head_has_a_pitch_for_every_beam():
 
 BAD = {
     "an empty sweep": (lambda s: replace(s, ranges=s.ranges * np.nan), "placement 1: an empty sweep .49 scan lines"),
+    "the sweep of another LRF": (
+        lambda s: replace(s, bearings=s.bearings - 0.5), "bearings 31.35 to 91.35 deg, 'made up' sees 60.0 to 120.0 deg"
+    ),
     "no scan line": (lambda s: replace(s, ranges=s.ranges[:0], pitch=s.pitch[:0]), "an empty sweep .0 scan lines"),
 }
 
@@ -263,6 +266,37 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
     back = o3d.t.io.read_point_cloud(str(tmp_path / "deep" / "c.ply")).point
     for name in ("seen", "placement", "image", "pitch", "bearing", "range", "sigma"):
         np.testing.assert_allclose(back[name].numpy().ravel(), getattr(cloud, name), rtol=1e-6, err_msg=name)
+
+
+def test_a_mesh_of_a_wall_is_flat(tmp_path):
+    cloud = whole(scan(wall(2.0))[1], [view(plain_image(), pose=AHEAD)])
+    rec.write_ply(tmp_path / "wall.ply", cloud)
+    assert write_mesh(tmp_path / "mesh.ply", tmp_path / "wall.ply", 0.03) > 500
+    import open3d as o3d
+
+    corners = np.asarray(o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
+    assert np.median(np.abs(corners[:, 1] - 2.0)) < 0.005 and np.ptp(corners[:, 0]) > 2.0
+    rec.write_ply(tmp_path / "bare.ply", replace(cloud, normals=cloud.normals * np.nan))
+    with pytest.raises(ValueError, match="no point has a normal"):
+        write_mesh(tmp_path / "mesh.ply", tmp_path / "bare.ply")
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_real_sweeps_are_the_published_clouds(real_data, number):
+    """A pitching SICK in a corridor (3DTK's kurt3d): points to 0.1 mm, and its largest surface is flat to 10 mm."""
+    if not (real_data / "kurt3d").is_dir():
+        pytest.skip(f"no kurt3d in {real_data}")
+    raw = np.load(real_data / "kurt3d" / f"raw{number:03d}.npz")
+    ranges = np.where(raw["range_cm"] < 3000, raw["range_cm"].astype(float) / 100, np.nan)
+    bearings, pitch = np.radians(raw["beam_deg"]), np.radians(raw["tilt_deg"])
+    lrf = LrfInfo("SICK", (bearings[0], bearings[-1]), bearings[1] - bearings[0], 0.01)
+    sweep = Sweep(1, ranges, bearings, pitch, np.arange(len(pitch)) * 0.1)
+    cloud = rec.join(rec.reconstruct(sweep, (), STILL, as_recorded, lrf=lrf))
+    published = np.loadtxt(real_data / "kurt3d" / f"scan{number:03d}.3d")[np.isfinite(ranges).ravel()] / 100
+    miss = np.linalg.norm(cloud.points - published[:, [0, 2, 1]] * [1, 1, -1], axis=1)
+    assert miss.max() < 1e-4 and np.median(miss) < 1e-5
+    surface = largest_plane(cloud)
+    assert surface.sum() > 10_000 and 0.001 < flatness(cloud.points[surface])[1] < 0.010
 
 
 def test_a_bent_wall_is_not_flat():

@@ -33,7 +33,7 @@ def page(folder, count=2000):
 
 def test_the_page_holds_everything_itself(tmp_path):
     text = page(tmp_path).read_text()
-    shown = ("points", "points that no image saw", "tilt axis", "view of left", "board 1", "x of lrf, left")
+    shown = ("points", "points that no image saw", "tilt axis", "view of left", "boards", "x of lrf, left")
     assert all(f'"name":"{name}"' in text for name in shown)
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "nothing comes from the network"
 

@@ -55,7 +55,7 @@ def check_placement(session, placement, advice=None):
         share = np.isfinite(sweep.ranges).mean()
         text = f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
         return [Light("scan", "ok" if share > 0.2 else "warn", text)]
-    lights = check_scan(sweep, session.board, session.T_head_lrf)
+    lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
     if placement in session.scene_placements:
         return lights
     for name, camera in session.cameras.items():
@@ -72,12 +72,12 @@ def check_placement(session, placement, advice=None):
     return lights
 
 
-def check_scan(sweep, board, T_head_lrf=None):
+def check_scan(sweep, board, T_head_lrf=None, lrf=None):
     """Lights of a Sweep (None where there is no range at all): 'scan' and, where the board was found, 'edges'."""
     if sweep is None:
         return [Light("scan", "bad", "no scan line with a range: is something close before the window?")]
     try:
-        found = board_in_scan.find_board(sweep, board, T_head_lrf)
+        found = board_in_scan.find_board(sweep, board, T_head_lrf, lrf)
     except board_in_scan.BoardNotFound as error:
         return [Light("scan", "bad", f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls")]
     rows = np.flatnonzero(found.mask.any(axis=1))

@@ -15,20 +15,12 @@ LEAST_COSINE = 0.1  # of incidence
 
 
 @njit(**COMPILED)
-def _rows():
-    """Room for x, y, z of a tile's points, pixels u and v, distances, and cells of the depth buffer."""
-    x, y, z = np.empty(TILE, np.float32), np.empty(TILE, np.float32), np.empty(TILE, np.float32)
-    u, v, far = np.empty(TILE, np.float32), np.empty(TILE, np.float32), np.empty(TILE, np.float32)
-    return x, y, z, u, v, far, np.empty(TILE, np.int32)
-
-
-@njit(**COMPILED)
-def _locate(points, pose, lens, size, cell, rows):
-    """Fill `rows` with what an image makes of a tile of platform points; distances in metres.
+def _locate(points, pose, lens, size, cell, rows, at):
+    """Fill `rows` with x, y, z of a tile of platform points, their pixels and distances, `at` with their cells.
 
     The cell is -1 behind the camera, beyond the fold of its lens and outside the image.
     """
-    x, y, z, u, v, far, at = rows
+    x, y, z, u, v, far = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
     for i in range(len(points)):
         x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
     r00, r01, r02, t0 = pose[0]
@@ -57,11 +49,11 @@ def _locate(points, pose, lens, size, cell, rows):
 @njit(**COMPILED)
 def hide(points, pose, lens, size, cell, nearest):
     """Write the distances (metres) of points (n, 3) into a flat depth buffer of square cells, `cell` pixels wide."""
-    rows = _rows()
-    far, at = rows[5:]
+    rows, at = np.empty((6, TILE), np.float32), np.empty(TILE, np.int32)
+    far = rows[5]
     for start in range(0, len(points), TILE):
         count = min(TILE, len(points) - start)
-        _locate(points[start : start + count], pose, lens, size, cell, rows)
+        _locate(points[start : start + count], pose, lens, size, cell, rows, at)
         for i in range(count):
             if at[i] >= 0:
                 nearest[at[i]] = min(nearest[at[i]], far[i])
@@ -80,13 +72,13 @@ def paint(points, normals, pose, lens, image, cell, nearest, noise, exposure, su
     x0 = -(pose[0, 0] * pose[0, 3] + pose[1, 0] * pose[1, 3] + pose[2, 0] * pose[2, 3])
     y0 = -(pose[0, 1] * pose[0, 3] + pose[1, 1] * pose[1, 3] + pose[2, 1] * pose[2, 3])
     z0 = -(pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3])
-    rows, slack = _rows(), np.float32(noise)
+    rows, at, chosen = np.empty((6, TILE), np.float32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    slack, tone = np.float32(noise), np.empty(3)
     least = np.float32(1 - cell / lens[0] * math.sqrt(1 - LEAST_COSINE**2) / LEAST_COSINE)
-    x, y, z, us, vs, far, at = rows
-    chosen = np.empty(TILE, np.int32)
+    x, y, z, us, vs, far = rows
     for start in range(0, len(points), TILE):
         count, few = min(TILE, len(points) - start), 0
-        _locate(points[start : start + count], pose, lens, (width, height), cell, rows)
+        _locate(points[start : start + count], pose, lens, (width, height), cell, rows, at)
         for i in range(count):  # those that some incidence would let be seen, counted without a branch
             chosen[few] = i
             few += (at[i] >= 0) & (far[i] * least <= nearest[max(at[i], 0)] + slack)
@@ -102,19 +94,18 @@ def paint(points, normals, pose, lens, image, cell, nearest, noise, exposure, su
             column, row = min(int(u0), width - 2), min(int(v0), height - 2)
             f, g = u0 - column, v0 - row
             a, b, c, d = (1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g
-            first, second = image[row, column], image[row, column + 1]
-            third, fourth = image[row + 1, column], image[row + 1, column + 1]
-            blue = a * first[0] + b * second[0] + c * third[0] + d * fourth[0]
-            green = a * first[1] + b * second[1] + c * third[1] + d * fourth[1]
-            red = a * first[2] + b * second[2] + c * third[2] + d * fourth[2]
+            brightest = 0.0
+            for j in range(3):
+                near = a * image[row, column, 2 - j] + b * image[row, column + 1, 2 - j]
+                tone[j] = near + c * image[row + 1, column, 2 - j] + d * image[row + 1, column + 1, 2 - j]
+                brightest = max(brightest, tone[j])
             weight = cosine / (distance * distance)
-            if max(red, green, blue) > 248 or max(red, green, blue) < 6:
+            if not 6 <= brightest <= 248:
                 weight *= 1e-3
             radius = ((u - lens[2]) ** 2 + (v - lens[3]) ** 2) / (0.25 * (width * width + height * height))
             scale = weight * math.exp(-exposure[0] - exposure[1] * radius)
-            sums[k, 0] += scale * red
-            sums[k, 1] += scale * green
-            sums[k, 2] += scale * blue
+            for j in range(3):
+                sums[k, j] += scale * tone[j]
             sums[k, 3] += weight
             if weight > best[k]:
                 best[k], source[k] = weight, number

@@ -243,7 +243,7 @@ def rough_poses(prepared):
 
     Problems are placements that disagree with all others, and why a camera has no pose.
     """
-    rough, problems = {}, {}
+    rough, problems, misses = {}, {}, {}
     for camera in prepared.views:
         obs = observe(prepared, camera)
         try:
@@ -252,8 +252,16 @@ def rough_poses(prepared):
         except DegenerateGeometry as error:
             problems[f"camera {camera}"] = str(error)
             continue
-        for placement, miss in outlying.items():
-            problems[placement] = f"camera {camera}: its plane is {1000 * miss:.0f} mm rms off the scan; left out"
+        for placement in obs.placements.tolist():
+            misses.setdefault(placement, {})[camera] = outlying.get(placement, 0.0)
+    for placement, miss in misses.items():
+        wrong = [camera for camera, off in miss.items() if off]
+        if wrong:
+            off = f"its plane is {1000 * max(miss.values()):.0f} mm rms off the"
+            words = f"camera {wrong[0]}: {off} scan"
+            if len(wrong) == len(miss) > 1:
+                words = f"scan: {off} board in the images of all {len(miss)} cameras (another surface, mixed readings)"
+            problems[placement] = f"{words}; left out"
     return rough, problems
 
 

@@ -61,7 +61,7 @@ class MeasuredBoard:
         Sides that were measured, ``a x + b y + c = 0`` in the plane, metres, and where an edge meets the one before it.
     lengths, scatter, sigma : dict of str to float
         Metres: edges of which both ends are measured; rms distances of points from the lines (least squares only);
-        standard deviations of the lengths (likelihood only).
+        standard deviations of the lengths, by least squares from that scatter alone.
     """
 
     T_platform_plane: np.ndarray
@@ -97,16 +97,41 @@ def corners_and_lengths(lines, edges):
     return corners, {name: float(np.linalg.norm(corners[after] - corners[name])) for name, after in known}
 
 
-def measure_board(face, sides, edges):
+def measure_board(face, sides, edges, each=1):
     """Measure a board's outline in a cloud: plane through the face, lines through its sides, corners where they meet.
 
-    `face` are points (n, 3), `sides` edge points (k, 3) by edge name, metres; `edges` all edges in order around the
-    board.
+    `face` are points (n, 3), `sides` edge points (k, 3) by edge name, metres, of which `each` share one error; `edges`
+    all edges in order around the board. Standard deviations are those of the points about the lines alone.
     """
-    pose = plane_frame(face)
-    lines = {name: _flat_line((points - pose[:3, 3]) @ pose[:3, :2])[0] for name, points in sides.items()}
-    scatter = {name: fit_line(points)[2] for name, points in sides.items()}
-    return MeasuredBoard(pose, lines, *corners_and_lengths(lines, edges), scatter)
+    pose, fits = plane_frame(face), []
+    if not sides:
+        return MeasuredBoard(pose, {}, {}, {})
+    for points in sides.values():
+        flat = (points - pose[:3, 3]) @ pose[:3, :2]
+        line, middle = _flat_line(flat)
+        along, n = (flat - middle) @ [-line[1], line[0]], max(len(flat) / each, 1.0)
+        square = np.sum((flat @ line[:2] + line[2]) ** 2) / (len(flat) - each) if len(flat) > each else np.nan
+        fits.append((line, middle, square / n * np.array([1.0, 1 / max(np.mean(along**2), 1e-12)])))
+    lines, middle, spread = (np.array(part) for part in zip(*fits, strict=True))
+    outline, sigma = sized(lines, middle, np.diag(spread.ravel()), list(sides), edges)
+    return MeasuredBoard(pose, *outline, {name: fit_line(points)[2] for name, points in sides.items()}, sigma)
+
+
+def sized(lines, middle, covariance, names, edges):
+    """Sides by name, corners and lengths, and the standard deviations of these by edge.
+
+    `covariance` (2 s, 2 s) is of shifts and turns of the lines (s, 3) about their `middle` (s, 2).
+    """
+
+    def outline(lines):
+        sides = dict(zip(names, lines, strict=True))
+        return sides, *corners_and_lengths(sides, edges)
+
+    found = outline(lines)
+    size, steps = np.array(list(found[2].values())), 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
+    J = np.array([(list(outline(moved_lines(lines, middle, step))[2].values()) - size) / 1e-6 for step in steps])
+    sigma = np.sqrt(np.sum(J * (covariance @ J), axis=0))
+    return found, dict(zip(found[2], sigma.tolist(), strict=True))
 
 
 def _flat_line(points):
@@ -193,16 +218,10 @@ def measure_outline(cells, face, names, edges, model):
     common = model.sigma.get("edge_log_odds", 0.0) * slope
     covariance[::2, ::2] += np.outer(common, common) + np.diag((model.spread * slope) ** 2)
 
-    def measured(lines):
-        """Sides by name, corners and lengths."""
-        sides = dict(zip(found.values(), lines, strict=True))
-        return sides, *corners_and_lengths(sides, edges)
-
-    outline = measured(lines)
-    size, steps = np.array(list(outline[2].values())), 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    J = np.array([(list(measured(moved_lines(lines, middle, step))[2].values()) - size) / 1e-6 for step in steps])
-    variance = np.sum(J * (covariance @ J), axis=0) + _by_face(pose, face, size, model)
-    return MeasuredBoard(pose, *outline, sigma=dict(zip(outline[2], np.sqrt(variance), strict=True)))
+    outline, sigma = sized(lines, middle, covariance, list(found.values()), edges)
+    by_face = _by_face(pose, face, model)
+    sigma = {name: float(np.hypot(value, np.sqrt(by_face) * outline[2][name])) for name, value in sigma.items()}
+    return MeasuredBoard(pose, *outline, sigma=sigma)
 
 
 def face_surface(face, model):
@@ -300,8 +319,8 @@ def moved_lines(lines, middle, step):
     return np.column_stack([normal, at - np.sum(normal * middle, axis=1)])
 
 
-def _by_face(pose, face, size, model):
-    """Variance of lengths from the range offset, and the plane's noise: a tilt stretches what is seen at a slant."""
+def _by_face(pose, face, model):
+    """Variance of a metre from the range offset, and the plane's noise: a tilt stretches what is seen at a slant."""
     points, _, sigma = face
     away = np.linalg.norm(points, axis=1)
     cosine = np.median(np.abs(points @ pose[:3, 2]) / away)
@@ -309,7 +328,7 @@ def _by_face(pose, face, size, model):
     spread = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)) / 2)
     tilt_sigma = sigma * max(cosine, 0.1) / np.sqrt(len(points)) / max(spread, 1e-3)
     offset = model.sigma.get("range_offset", 0.0) / np.median(away)
-    return size**2 * ((slant * tilt_sigma) ** 2 + offset**2)
+    return (slant * tilt_sigma) ** 2 + offset**2
 
 
 def fused_outline_of(joint, placement):
@@ -320,6 +339,14 @@ def fused_outline_of(joint, placement):
     DegenerateGeometry if the sweep does not span a plane, or no image shows an edge.
     """
     solution, prepared = joint.without.get(placement, joint.solution), joint.prepared
+    face, sides = edges_in_cloud(solution, prepared, placement)
+    if not sides:
+        raise DegenerateGeometry(f"placement {placement}: no image shows an edge of the board")
+    return measure_board(face, sides, prepared.board.edges, len(ALONG)), None
+
+
+def edges_in_cloud(solution, prepared, placement):
+    """Face points (n, 3) of a placement under a JointSolution, and points of image edges in their plane, by edge."""
     points, pitch = solution.correct(placement, *face_points(prepared.scans[placement])[:2])
     face = lrf_to_platform(points, pitch, solution.T_head_lrf)
     pose, sides = plane_frame(face), {}
@@ -331,9 +358,7 @@ def fused_outline_of(joint, placement):
         for edge in view.edges:
             points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, pose[:3, 3], pose[:3, 2])
             sides.setdefault(edge.name, []).append(points)
-    if not sides:
-        raise DegenerateGeometry(f"placement {placement}: no image shows an edge of the board")
-    return measure_board(face, {k: np.concatenate(v) for k, v in sides.items()}, prepared.board.edges), None
+    return face, {name: np.concatenate(points) for name, points in sides.items()}
 
 
 def edge_on_plane(edge, model, T_platform_camera, centre, normal):

@@ -426,11 +426,15 @@ def cloud_blocks(calibration, method="line", scene=False):
 
 
 def views_of(calibration, method, placement):
-    """The images of a placement as a method poses them, a list of View; without those of which no pitch is known."""
+    """The images of a placement as a method poses them, a list of View; without those of which no pitch is known.
+
+    ValueError where there are images and none of them can be posed.
+    """
     session, axis, views = calibration.prepared.session, calibration.platform.axis_with(method), []
     correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
     back = calibration.platform.transform(axis).inv()
-    for record in session.images(placement=placement):
+    records, posed = session.images(placement=placement), [name for name, own in calibration.solutions if own == method]
+    for record in records:
         name, mount = record.camera, session.cameras[record.camera].mount
         if (name, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
             pose = calibration.solutions[name, method].transform
@@ -439,4 +443,10 @@ def views_of(calibration, method, placement):
                 pose = pose * back * RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0.0, 0.0]))
             number, model = session.image_records.index(record), calibration.prepared.models[name]
             views.append(reconstruct.View(number, name, pose, model, session.read_image(record)))
+    if records and not views:
+        asked, known = ", ".join(sorted({record.camera for record in records})), ", ".join(posed) or "no camera"
+        why = f"they are of {asked}, the calibration by '{method}' poses {known}: take that of the same rig"
+        if {record.camera for record in records} & set(posed):
+            why = "of none is the pitch known: state pitch_deg in images.csv"
+        raise ValueError(f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; {why}")
     return views

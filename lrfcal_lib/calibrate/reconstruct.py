@@ -216,16 +216,13 @@ def _single(points):
 
 def _share(some, count):
     """Call ``some(rows, worker)`` for slices of so many rows, in threads: the compiled loops free the interpreter."""
-    slices = [slice(start, min(start + SHARE, count)) for start in range(0, count, SHARE)]
 
     def work(worker):
-        for rows in slices[worker::WORKERS]:
-            some(rows, worker)
+        for start in range(worker * SHARE, count, WORKERS * SHARE):
+            some(slice(start, start + SHARE), worker)
 
-    if len(slices) < 2:
-        return work(0)
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(work, range(WORKERS)))
+        list(pool.map(work, range(WORKERS)))
 
 
 def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mask=None):
@@ -253,6 +250,10 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     """
     if not np.isfinite(sweep.ranges).any():
         raise ValueError(f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range)")
+    ends, view = (np.degrees([min(v), max(v)]).round(2) for v in (sweep.bearings, lrf.field_of_view))
+    if ends[0] < view[0] - np.degrees(lrf.bearing_step) or ends[1] > view[1] + np.degrees(lrf.bearing_step):
+        words = f"bearings {ends[0]} to {ends[1]} deg, '{lrf.model}' sees {view[0]} to {view[1]} deg"
+        raise ValueError(f"placement {sweep.placement}: {words}: take the calibration of the rig that recorded it")
     turns = np.abs(np.diff(sweep.pitch))
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
     painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
@@ -320,10 +321,10 @@ class _Blocks:
 def mixed(ranges, steps, lrf):
     """How far behind the nearer of two surfaces readings hang that mix them; 0 for sound ones.
 
-    A spot that meets two surfaces within one pulse reads between them: a ramp as wide as the spot joins them. So half a
-    spot farther on, on either side, are the surfaces themselves. A reading is sound in a direction if one of the two,
-    continued straight (a plane is straight in inverse range), meets it, or if it is not between or in front of them.
-    Unsound in two of four directions, beside another such one, it is mixed.
+    A spot that meets two surfaces within one pulse reads between them: a ramp as wide as the spot joins them. A reading
+    is asked about where, half a spot away on either side, one is nearer and one farther, or both are farther (something
+    narrower than the spot). It is sound if it lies on a plane (straight in inverse range) about as wide as the spot
+    both ways, in the middle, on a side or in a corner of it; or on a narrow long one that does not rise like a ramp.
 
     Parameters
     ----------
@@ -334,36 +335,61 @@ def mixed(ranges, steps, lrf):
     lrf : LrfInfo
         With `spot_exit` and `spot_divergence`.
     """
-    valid = np.isfinite(ranges)
-    r = np.where(valid, ranges, 1.0)
-    share = uniform_filter(valid.astype(float), 3)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        smooth = np.where(share > 0.3, uniform_filter(np.where(valid, 1 / r, 0.0), 3) / share, np.nan)
-    spot = 0.4 * (lrf.spot_exit / r + lrf.spot_divergence)
-    far = [np.clip(np.ceil(spot / s), 2, 2 * WINDOW).astype(int) if s > 0 else np.zeros(r.shape, int) for s in steps]
-    place, size, tol = np.indices(r.shape), np.array(r.shape)[:, None, None], SIGMAS * lrf.sigma_range
-    votes, nearer = np.zeros(r.shape, int), np.full(r.shape, np.inf)
+    r, far_off = np.where(np.isfinite(ranges), ranges, 1.0), 3 * lrf.sigma_range
+    spots = [(lrf.spot_exit / r + lrf.spot_divergence) / s if s > 0 else 1e-9 * r for s in steps]  # in samples
+    ways, place, size = _samples(spots, 0.5, 1), np.indices(r.shape), np.array(r.shape)[:, None, None]
+    asked, nearer = np.zeros(r.shape, bool), np.zeros(r.shape)
     for a, b in DIRECTIONS:
-        way, misses, behind = np.stack([a * far[0], b * far[1]]), [], []
-        for side in (1, -1):
-            there = [place + side * k * way for k in (1, 2)]
-            out = [((at < 0) | (at >= size)).any(axis=0) for at in there]
-            first, second = (
-                np.where(o, np.nan, smooth[tuple(np.clip(at, 0, size - 1))]) for at, o in zip(there, out, strict=True)
-            )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                misses.append(np.abs(r - 1 / (2 * first - second)))
-                behind.append(r - 1 / first)
-        low, high = np.minimum(*behind), np.maximum(*behind)  # NaN where a side shows nothing: no verdict
-        astray = np.minimum(*misses) > tol * np.sqrt(14 / 9)  # the reading's own noise and that of means of nine
-        between = (low < -tol) & (high > tol) & (high - low < PULSE)
-        thin = (high < -tol) & (high > -PULSE)  # something narrower than the spot before a background
-        found = astray & (between | thin) & valid
-        votes += found
-        nearer = np.where(found, np.minimum(nearer, np.maximum(high, 1e-6)), nearer)
-    unsound = votes >= 2
-    company = uniform_filter(unsound.astype(float), 5) * 25 > 1.5
-    return np.where(unsound & company, nearer, 0.0)
+        sides = [place + side * np.stack([a * ways[0], b * ways[1]]) for side in (1, -1)]
+        out = [((at < 0) | (at >= size)).any(axis=0) for at in sides]
+        there = [ranges[tuple(np.clip(at, 0, size - 1))] for at in sides]
+        away = [np.where(o, np.nan, value) - ranges for o, value in zip(out, there, strict=True)]
+        low, high = np.fmin(*away), np.fmax(*away)  # NaN only where both sides show nothing
+        between = (low < -far_off) & (high > far_off) & (high - low < PULSE + 4 * far_off)
+        asked |= between | ((low > far_off) & (low < PULSE))
+        nearer = np.where(between, np.maximum(nearer, -low), nearer)
+    at, wide, long = np.nonzero(asked), _samples(spots, 0.375, 1), _samples(spots, 1.0, 2)
+    least = np.full(len(at[0]), np.inf)
+    for half, narrow in ((wide, None), ((long[0], wide[1].clip(max=1)), 1), ((wide[0].clip(max=1), long[1]), 0)):
+        for h in sorted(set(zip(half[0][at].tolist(), half[1][at].tolist(), strict=True))):
+            mine = (half[0][at] == h[0]) & (half[1][at] == h[1])
+            own = tuple(index[mine] for index in at)
+            rise = None if narrow is None else (narrow, 4 * lrf.sigma_range / spots[narrow][own])
+            least[mine] = np.minimum(least[mine], _off_planes(ranges, own, h, 1.3 * lrf.sigma_range, rise))
+    found = np.zeros(r.shape)
+    found[at] = np.where(least > SIGMAS * lrf.sigma_range, np.maximum(nearer[at], 1e-6), 0.0)
+    return found
+
+
+def _samples(spots, share, fewest):
+    """A share of the spot in samples in both directions, none where there is no step."""
+    return [np.where(s > 1e-6, np.ceil(share * s).clip(fewest, 2 * WINDOW), 0).astype(int) for s in spots]
+
+
+def _off_planes(ranges, at, half, rough, rise):
+    """Least distance (metres) of readings at (line, beam) from planes through windows that hold them, inf if none fits.
+
+    Windows reach `half` samples about nine places. A plane fits where its residuals are not `rough`, and where it does
+    not rise by more than ``rise[1]`` metres a sample in direction ``rise[0]``.
+    """
+    valid, size = np.isfinite(ranges), (2 * half[0] + 1, 2 * half[1] + 1)
+    inverse, best = np.where(valid, 1 / np.where(valid, ranges, 1.0), 0.0), np.full(len(at[0]), np.inf)
+    x, y = np.indices(ranges.shape, dtype=float) - np.array(ranges.shape)[:, None, None] / 2
+    basis = [valid * value for value in (1.0, x, y, inverse)]
+    number = np.prod(size)
+    sums = {(i, j): number * uniform_filter(basis[i] * basis[j], size, mode="constant")
+            for i in range(4) for j in range(i, 4)}  # fmt: skip
+    for a, b in np.ndindex(3, 3):
+        centre = tuple(np.clip(at[i] + (k - 1) * half[i], 0, ranges.shape[i] - 1) for i, k in enumerate((a, b)))
+        G = np.array([[sums[min(i, j), max(i, j)][centre] for j in range(4)] for i in range(4)]).transpose(2, 0, 1)
+        fit = np.linalg.solve(G[:, :3, :3] + 1e-9 * np.eye(3), G[:, :3, 3:])[..., 0]
+        square = np.maximum(G[:, 3, 3] - np.sum(fit * G[:, :3, 3], axis=1), 0.0) / np.maximum(G[:, 0, 0] - 3, 1)
+        here = fit[:, 0] + fit[:, 1] * x[at] + fit[:, 2] * y[at]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            good = (G[:, 0, 0] >= max(4, 0.6 * number)) & (here > 0) & (np.sqrt(square) < rough * here**2)
+            good &= rise is None or np.abs(fit[:, 1 + rise[0]]) < rise[1] * here**2
+            best = np.minimum(best, np.where(good, np.abs(ranges[at] - 1 / here), np.inf))
+    return best
 
 
 def grid_normals(points, origins):

@@ -19,6 +19,7 @@ HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings 
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
+ALIKE = 0.15  # log odds; sides are expected to deviate no more than this while statements are weighed
 LEVER = 0.2  # metres, weighs turns against shifts
 LARGER = ("larger", "smaller")
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
@@ -77,6 +78,11 @@ ALTERNATIVES = {
         }), 0.004, 100.0, ("small", "large"),
         "bearings are {size} +- {sigma} % too {sign}", "check the angular step that session.json states",
     ),
+    "spot": Alternative(
+        lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)), 0.2, 100.0, LARGER,
+        "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
+        "check spot_exit_m and spot_divergence_rad, or leave them out",
+    ),
 }  # fmt: skip
 
 
@@ -105,7 +111,9 @@ def weigh(solution, admitted_offset):
         Of the range finder's maker, metres.
     """
     state, unknowns, obs = solution.state, solution.unknowns, solution.observations
-    before, c = named_blocks(state, gather(obs, **solution.data.levels), unknowns), unknowns.shared
+    # sides that may deviate, and beams that may say nothing, take up what a wrong statement does to edges
+    levels = solution.data.levels | {"side_sigma": min(solution.data.side_sigma, ALIKE), "lapse": 0.0}
+    before, c = named_blocks(state, gather(obs, **levels), unknowns), unknowns.shared
     before = {name: whiten(block) for name, block in before.items()}
     prior, pull = np.zeros((2, c + 1))
     if "range_offset" in unknowns.sensor:
@@ -114,7 +122,7 @@ def weigh(solution, admitted_offset):
         pull[where] = prior[where] * solution.sensor["range_offset"]
     found = []
     for kind, alternative in ALTERNATIVES.items():
-        after = named_blocks(state, gather(alternative.change(obs, STEP), **solution.data.levels), unknowns)
+        after = named_blocks(state, gather(alternative.change(obs, STEP), **levels), unknowns)
         hessian = gradient = 0.0
         for name, (r, J) in before.items():
             J = np.insert(J, c, (whiten(after[name], False)[0] - r) / STEP, axis=-1)

@@ -137,6 +137,36 @@ def write_pcd(path, ply):
         raise OSError(f"{path}: the cloud could not be written; is the disk full?")
 
 
+def write_mesh(path, ply, step=0.02):
+    """Write a surface mesh of a PLY of :func:`write_ply` as PLY: Poisson's, cut where there are no points.
+
+    Parameters
+    ----------
+    path, ply : path
+    step : float
+        Metres; points are thinned to cubes of this size first, and details are about as fine.
+
+    Returns
+    -------
+    int
+        Triangles; ValueError if no point has a normal, OSError if the file cannot be written.
+    """
+    import open3d as o3d
+
+    cloud = o3d.io.read_point_cloud(str(ply), remove_nan_points=True)
+    normals = np.isfinite(np.asarray(cloud.normals)).all(axis=1)
+    cloud = cloud.select_by_index(np.flatnonzero(normals)).voxel_down_sample(step)
+    if not len(cloud.points):
+        raise ValueError(f"{ply}: no point has a normal, a surface needs neighbouring scan lines")
+    depth = int(np.ceil(np.log2(np.ptp(np.asarray(cloud.points), axis=0).max() / step))) + 1
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=min(depth, 11), n_threads=1)
+    corners = o3d.geometry.PointCloud(mesh.vertices)
+    mesh.remove_vertices_by_mask(np.asarray(corners.compute_point_cloud_distance(cloud)) > 2 * step)
+    if not o3d.io.write_triangle_mesh(str(path), mesh):
+        raise OSError(f"{path}: the mesh could not be written; is the disk full?")
+    return len(mesh.triangles)
+
+
 def calibrate_session(path, out=None):
     """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and clouds.
 

@@ -5,27 +5,35 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.calibrate.pipeline import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.tables import read_truth
-from lrfcal_lib.evaluate.uncertainty import point_sigma
-from lrfcal_lib.model.geometry import fit_plane, tilt
+from lrfcal_lib.evaluate.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt
 from lrfcal_lib.session.stated import read_json
 
+AT_ONCE = 1 << 16  # points
+BESIDE = 0.05  # metres along the beam by which a reading is of another surface than the beam's centre meets
 PATCH = 40  # points that average the noise out of a patch of a wall
 
 
 def with_sigma(cloud, solution):
-    """A Cloud with the standard deviations (metres) that a JointSolution predicts: its own and the range noise."""
-    axes = [np.linspace(np.min(v), np.max(v) + 1e-6, n) for v, n in ((cloud.pitch, 9), (cloud.bearing, 9))]
-    distances = np.geomspace(max(cloud.range.min(), 0.05), cloud.range.max() + 1e-6, 12)
-    found = point_sigma(solution, axes[1], axes[0], distances)
-    whole = np.hypot(found.sigma, found.parts["range noise"])
-    at = np.stack([np.maximum(cloud.range, distances[0]), cloud.pitch, cloud.bearing], axis=1)
-    return replace(cloud, sigma=RegularGridInterpolator((distances, *axes), whole)(at))
+    """A Cloud with the standard deviations (metres) of its points that a JointSolution predicts.
+
+    Of the distance of a point from its surface: calibration, errors of the sweep's pitch and range noise along the
+    normal (along the beam where there is none). A turn of the whole cloud about the tilt axis does not count.
+    """
+    chain, noise, sigma = chain_of(solution), range_noise(solution), np.zeros(len(cloud.points))
+    for part in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
+        _, J, by_pitch = carried(chain, cloud.bearing[part], cloud.pitch[part], cloud.range[part])
+        normals, beams = cloud.normals[part] @ chain.head[:, :3], -J[..., COLUMNS.index("range_offset")]
+        normals = np.where(np.isfinite(normals), normals, beams)
+        sweep = np.hypot(chain.sweep_sigma[0], chain.sweep_sigma[1] * cloud.pitch[part])
+        sweep, own = (v * np.sum(normals * by, axis=1) for v, by in ((sweep, by_pitch), (noise, beams)))
+        sigma[part] = np.sqrt(spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None]) ** 2 + sweep**2 + own**2)
+    return replace(cloud, sigma=sigma)
 
 
 def largest_plane(cloud, tolerance=0.04):
@@ -54,6 +62,65 @@ def flatness(points):
     mean = (np.bincount(which, miss) / count)[count >= PATCH / 2]
     noise = np.var(miss - (np.bincount(which, miss) / count)[which]) / PATCH
     return miss, float(np.sqrt(max(np.mean(mean**2) - noise, 0.0)))
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A plane or a point fitted to some points of a Cloud, metres.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+    normal : ndarray, shape (3,), or None
+        Of a plane.
+    noise, tilt : ndarray, shape (3, 3)
+        Covariances of centre and normal from the range noise (or the points' scatter about the plane).
+    jacobian : ndarray, shape (3, 13)
+        Of the centre by what the calibration may have wrong; `chain` knows how much.
+    """
+
+    centre: np.ndarray
+    normal: np.ndarray | None
+    noise: np.ndarray
+    tilt: np.ndarray
+    jacobian: np.ndarray
+    chain: object
+
+
+def fit_feature(cloud, chosen, solution, plane=True):
+    """Fit a plane, or else take the middle, of chosen points (index or mask) of a Cloud: a Feature.
+
+    `solution` is the JointSolution that the cloud was made with. DegenerateGeometry if the points span no plane.
+    """
+    part, chain, noise = cloud.rows(chosen), chain_of(solution), range_noise(solution)
+    if not len(part.points):
+        raise DegenerateGeometry("no point of the cloud was chosen")
+    J, R, centre = carried(chain, part.bearing, part.pitch, part.range)[1], chain.head[:, :3], part.points.mean(axis=0)
+    beams = -J[..., COLUMNS.index("range_offset")] @ R.T
+    scatter, count, normal, tilted = noise**2 * beams.T @ beams, len(beams), None, np.zeros((3, 3))
+    if plane:
+        normal, _, rough = fit_plane(part.points)
+        variance = max(noise**2 * np.mean((beams @ normal) ** 2), rough**2)
+        size, axes = np.linalg.eigh(np.cov(part.points.T, bias=True))
+        scatter = variance * count * np.outer(normal, normal)
+        tilted = variance / count * (axes[:, 1:] / size[1:]) @ axes[:, 1:].T
+    return Feature(centre, normal, scatter / count**2, tilted, R @ J.mean(axis=0), chain)
+
+
+def length_between(first, second):
+    """Length between two Features and its standard deviation, metres.
+
+    Between two points along the line that joins them, otherwise along the normal of the plane, or the mean of both.
+    What the calibration has wrong counts as far as it moves the two apart.
+    """
+    way, planes = second.centre - first.centre, [f for f in (first, second) if f.normal is not None]
+    normals = [f.normal * np.copysign(1.0, f.normal @ planes[0].normal) for f in planes] or [way]
+    along = np.mean(normals, axis=0)
+    along = along / np.linalg.norm(along)
+    variance = along @ (first.noise + second.noise) @ along
+    variance += sum(way @ plane.tilt @ way for plane in planes) / len(normals) ** 2
+    common = spread(first.chain, (along @ (second.jacobian - first.jacobian))[None])
+    return float(abs(along @ way)), float(np.sqrt(variance + common**2))
 
 
 @dataclass(frozen=True)
@@ -94,7 +161,9 @@ def scene_errors(cloud, calibration, method):
     gauge = truth.T_head_lrf * T_head_lrf.inv()
     turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
-    sweep = session.sweep(placement)
+    sweep, axis = session.sweep(placement), calibration.platform.axis_with(method)
+    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
+    turn += np.mean(truth.pitch[placement] - correct(placement, np.zeros(3), sweep.pitch)[1])
     order = np.argsort(sweep.pitch)
     pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])
     points = tilt(cloud.points, turn) + shift
@@ -108,7 +177,8 @@ def scene_errors(cloud, calibration, method):
     ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
     light = np.clip(light * np.median(ratio), 0, 255)
     color = np.where(cloud.seen, np.abs(cloud.colors - light).mean(axis=1), np.nan)
-    blocked, true = np.zeros(len(points), bool), origins + hits.distance[:, None] * directions
+    own = np.abs(depth) < BESIDE  # else the rim of the spot read a surface beside the beam: the point is where it is
+    blocked, true = np.zeros(len(points), bool), origins + np.where(own, hits.distance, length)[:, None] * directions
     for view in views_of(calibration, method, placement):
         mine = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift

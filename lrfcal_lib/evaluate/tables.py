@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform
+from scipy.special import ndtri
 
+from lrfcal_lib.calibrate.combined import combined_outlines
 from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
 from lrfcal_lib.evaluate.next_placement import outline
 from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift, plane_residuals_m
@@ -429,59 +431,65 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
     T_head_lrf : RigidTransform, optional
         For the least-squares variants; the session's own platform when left out.
     joint : JointCalibration, optional
-        With its estimates without each placement. Adds 'likelihood' from its edge model, and 'fused': image edges on
-        the plane of the cloud. Neither knows the board's size, and neither calibration has seen the placement.
+        With its estimates without each placement. Adds 'combined', the one answer: all that is known, each weighted by
+        what it is worth; and to compare with it 'fused', image edges on the plane of the cloud, and 'likelihood', beams
+        about the edges. None knows the board's size, and their calibrations have not seen the placement.
 
     Returns
     -------
     DataFrame
-        source, placement, edge, ends, variant, true_mm, measured_mm, error_mm. One row for every edge that some camera
-        sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams decide both
-        ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan lines), 'image'
-        where images show them ('fused').
+        source, placement, edge, ends, variant, true_mm, measured_mm, sigma_mm, error_mm. One row for every edge that
+        some camera sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams
+        decide both ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan
+        lines), 'image' where images show both ('fused', 'combined'). `sigma_mm` holds all that is known to be
+        uncertain for 'combined' and 'likelihood', and only the scatter of points about the sides for the others.
     """
 
     measure = {v: lambda p, v=v: outline_of(prepared, p, v, T_head_lrf) for v in VARIANTS}
-    if joint is not None:
+    known = {} if prepared.board.corners is None else prepared.board.lengths()
+    if joint is not None and known:
+        combined = combined_outlines(joint)
+        measure["combined"] = lambda placement: combined.get(placement, (None, None))
         measure["fused"] = lambda placement: fused_outline_of(joint, placement)
         measure["likelihood"] = lambda placement: likely_outline_of(prepared, placement, joint.edge_model(placement))
-    known, edges, rows = {} if prepared.board.corners is None else prepared.board.lengths(), prepared.board.edges, []
+    edges, rows = prepared.board.edges, []
     for variant, placement in product(measure, prepared.session.board_placements):
-        lengths, across = {}, frozenset()
+        measured, weak = None, None
         with suppress(DegenerateGeometry):
             if placement in prepared.names:
-                measured, across = measure[variant](placement)
-                lengths = measured.lengths
+                measured, weak = measure[variant](placement)
+        lengths, sigma = ({}, {}) if measured is None else (measured.lengths, measured.sigma)
         views = [views[placement] for views in prepared.views.values() if placement in views]
         for name in (name for name in known if any(view.edge(name) is not None for view in views)):
             length = lengths.get(name, np.nan)
-            ends = ends_of(edges, name, across) if np.isfinite(length) else "not measured"
+            ends = ends_of(edges, name, weak or (), variant) if np.isfinite(length) else "not measured"
             row = prepared.session.name, placement, name, ends, variant
-            rows.append((*row, 1000 * known[name], 1000 * length))
-    rows += [("paper", np.nan, name, "scan", "last_beam", *lengths) for name, lengths in PAPER_EDGES_MM.items()]
-    columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm"]
+            rows.append((*row, 1000 * known[name], 1000 * length, 1000 * sigma.get(name, np.nan)))
+    rows += [("paper", np.nan, name, "scan", "last_beam", *lengths, np.nan) for name, lengths in PAPER_EDGES_MM.items()]
+    columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "sigma_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
 
 
-def ends_of(edges, name, across):
-    """What decides the ends of an edge: its neighbours in the image, beams, or the recorded pitch."""
-    if across is None:
-        return "image"
+def ends_of(edges, name, weak, variant):
+    """What decides the ends of an edge: its neighbours in images, beams, or the recorded pitch (the worse)."""
+    usual, worse = {"fused": ("image", ""), "combined": ("image", "scan")}.get(variant, ("scan", "pitch"))
     i = edges.index(name)
-    return "pitch" if {edges[i - 1], edges[(i + 1) % len(edges)]} & across else "scan"
+    return worse if {edges[i - 1], edges[(i + 1) % len(edges)]} & set(weak) else usual
 
 
 def edge_summary(table):
     """Errors of an :func:`edge_lengths` table, of measured edges only.
 
-    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm.
+    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm, within_90_percent (share of
+    the errors inside their 90 % intervals; NaN where nothing is said about them).
     """
     table = table[table.measured_mm.notna()]
-    groups = table.assign(size=table.error_mm.abs()).groupby(["source", "ends", "variant"], sort=False)
-    return groups.agg(
+    within = (table.error_mm.abs() < ndtri(0.95) * table.sigma_mm).where(table.sigma_mm.notna())
+    groups = table.assign(size=table.error_mm.abs(), within=100 * within.astype(float))
+    return groups.groupby(["source", "ends", "variant"], sort=False).agg(
         n=("size", "size"), mean_abs_error_mm=("size", "mean"), median_abs_error_mm=("size", "median"),
-        mean_error_mm=("error_mm", "mean"),
+        mean_error_mm=("error_mm", "mean"), within_90_percent=("within", "mean"),
     ).reset_index()  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
+from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import largest_range
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
@@ -25,7 +26,7 @@ YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
          NO: "This calibration cannot be trusted"}  # fmt: skip
 DISTANCES = (1.0, 2.0, 5.0)  # metres
-FEWEST, FEW = 3, 6  # placements
+FEWEST, FEW, MANY = 3, 6, 12  # placements: too few, few, enough to know their scatter
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
 SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
@@ -37,6 +38,7 @@ DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the 
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
 LARGE = {"squares": 0.02, "ranges": 0.02}  # errors of sizes that no estimate survives
 LARGE_SCALE = 0.01  # of the pitch
+RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
 LOST = 0.1  # share of the placements that may be left out without a warning
 SIZES = (
     "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
@@ -242,6 +244,10 @@ def judge(calibration, method=None, **options):
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
     notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
+    if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
+        known, within = 100 / np.sqrt(2 * (n - 1)), stdtrit(n - 1, 0.95)
+        words = f"The scatter over {n} placements is itself known to {known:.0f} % only"
+        notes += (f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",)
     return replace(_answered(found, lens + sizes + reasons), notes=notes)
 
 
@@ -306,7 +312,11 @@ def contradicts_stated(joint):
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    asked = doubtful(joint.solution, admitted, () if joint.prepared.board.pattern else ("squares",))
+    # the spot is to be stated, and before many backgrounds of different distance
+    many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
+    told = lrf.spot_exit is not None and bool(many)
+    known = {"squares": joint.prepared.board.pattern is not None, "spot": told}
+    asked = doubtful(joint.solution, admitted, [kind for kind, there in known.items() if not there])
     instead = not_an_offset(joint.solution)
     if instead and (not asked or asked[0].kind == instead.kind):
         asked, doubt = [instead], abs(offset)
@@ -325,6 +335,10 @@ def contradicts_stated(joint):
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = max(doubt, abs(offset))
+    if abs(bias := joint.solution.edge_bias) > RIM:
+        words = f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius outside the edges)"
+        words = f"{words}: state spot_exit_m and spot_divergence_rad as they are, or measure the board's edges"
+        reasons.append(Reason(CARE, "spot", words))
     scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (

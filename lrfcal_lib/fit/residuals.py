@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
@@ -21,24 +23,31 @@ def line_block(pose, obs):
     The sign of the distance is kept, and behind the camera the formula goes on (mirrored), so that a poor start value
     can still find its way. The whitener holds the crossing's covariance, projected, and the line's.
     """
-    lines, model = obs.crossing_lines, obs.model
-    rotated = rotate_points(pose, obs.crossing_points)
-    q = rotated + pose[..., None, :, 3]
-    a, b = lines[..., 0] * model.fx, lines[..., 1] * model.fy
-    x, y, z = q[..., 0], q[..., 1], q[..., 2]
-    slope = (a * x + b * y) / z
-    residuals = slope + lines[..., 0] * model.cx + lines[..., 1] * model.cy + lines[..., 2]
-    gradient = np.stack([a / z, b / z, -slope / z], axis=-1)
-    shift = geometry.moved_noise(pose, gradient, obs.crossing_covariance)
-    variance = np.sum(shift * gradient, axis=-1) + obs.crossing_line_sigma**2
-    jacobian = gradient_by_pose(rotated, gradient)
-    corrected = jacobian - geometry.noise_correction(rotated, q, gradient, shift, residuals / variance)
-    return Block(residuals, jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
+    from lrfcal_lib.fit.loops import line_rows  # numba, which few need
+
+    trials, m = np.broadcast_shapes(pose.shape[:-2], obs.crossing_points.shape[:-2]), obs.model
+    residuals, whitener = np.empty((2, *trials, obs.crossing_points.shape[-2]))
+    jacobian, corrected = np.empty((2, *residuals.shape, 6))
+    given = pose, obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma
+    out = residuals, whitener, jacobian, corrected
+
+    def flat(v, own):
+        """With one leading axis, of all trials or of one that stands for all."""
+        return v.reshape((math.prod(v.shape[: v.ndim - own]), *v.shape[v.ndim - own :]))
+
+    line_rows(
+        *(flat(np.ascontiguousarray(v, float), own) for v, own in zip(given, (2, 2, 3, 2, 1), strict=True)),
+        np.array([m.fx, m.fy, m.cx, m.cy]),
+        *(flat(v, own) for v, own in zip(out, (1, 1, 2, 2), strict=True)),
+    )
+    return Block(residuals, jacobian, whitener, corrected=corrected)
 
 
 def read_pose(pose):
     """Transform and parameters of a pose state."""
-    return pose_transform(pose), geometry.pose_parameters(pose)
+    rotation = Rotation.from_matrix(pose[..., :3])
+    parameters = np.concatenate([rotation.as_rotvec(), pose[..., 3]], axis=-1)
+    return RigidTransform.from_components(pose[..., 3], rotation), parameters
 
 
 def edge_residuals_px(obs, transform, model=None):
@@ -181,7 +190,8 @@ SIGMA_FLOOR = 1e-4  # metres; no printed board is flatter, and a board along the
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
 SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
 LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
-USUAL = {"edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}  # and how widely they may differ
+# and how widely they may differ: at the rim of the spot the odds say nothing any more
+USUAL = {"edge_log_odds": (0.0, 6.0), "edge_log_softness": (np.log(0.15), 1.0), "pitch_scale": (0.0, 0.05)}
 SIDE_FREEDOM = PRIOR_FREEDOM = 3.0
 AXIS_COLUMNS = np.array([1, 2, 4, 5])  # of the increments [w, v] of T_head_lrf: what the gauge leaves
 
@@ -345,10 +355,12 @@ def rays(state, data, group):
 def ray_columns(by_o, by_d, ray):
     """Columns of the axis (4), of the pitch's parts (4) from the gradients by origin and direction."""
     o, d, d_head, pitch, by_parts = ray
-    back_o, back_d = tilt(by_o, -pitch), tilt(by_d, -pitch)
-    head = np.concatenate([cross(d_head, back_d), back_o], axis=-1)[..., AXIS_COLUMNS]
-    turn = (cross(o, by_o) + cross(d, by_d))[..., :1]
-    return head, turn * by_parts
+    (x, y, z), (_, y_o, z_o), (x_d, y_d, z_d) = (np.moveaxis(v, -1, 0) for v in (d_head, by_o, by_d))
+    c, s = np.cos(pitch), np.sin(pitch)
+    back = c * y_d + s * z_d, c * z_d - s * y_d  # of by_d, in the head's frame
+    head = [z * x_d - x * back[1], x * back[0] - y * x_d, c * y_o + s * z_o, c * z_o - s * y_o]  # `AXIS_COLUMNS`
+    turn = o[..., 1] * z_o - o[..., 2] * y_o + d[..., 1] * z_d - d[..., 2] * y_d
+    return np.stack(head, axis=-1), turn[..., None] * by_parts
 
 
 def assemble(unknowns, **derivatives):
@@ -451,15 +463,19 @@ def view_block(state, data, unknowns):
     t = (A @ (y - head[..., 3])[..., None])[..., 0] + camera[..., 3]
     w = geometry.log_rotation(B @ board[..., :3] @ np.swapaxes(pose[..., :3, :3], -1, -2))
     residuals = np.concatenate([w, t - pose[..., :3, 3]], axis=-1)
-    left, zero, eye = inverse_left_jacobian(w), np.zeros(A.shape), np.broadcast_to(np.eye(3), A.shape)
+    left = inverse_left_jacobian(w)
 
-    def rows(turn, shift):
-        return np.concatenate([left @ turn, shift], axis=-2)
+    def by(columns, turn, shift):
+        """Derivatives by turns and shifts of a pose from what they do to the board's turn and shift in the camera."""
+        out = np.zeros(A.shape[:2] + (6, columns))
+        out[..., :3, : turn.shape[-1]], out[..., 3:, columns - shift.shape[-1] :] = left @ turn, shift
+        return out
 
-    axis = np.concatenate([rows(-A, A @ hat(y - head[..., 3])), rows(zero, -A)], axis=-1)[..., AXIS_COLUMNS] * moved
-    turn = rows(-A[..., :1], (A @ hat(y))[..., :1]) * moved
-    by_board = np.concatenate([rows(B, zero), rows(zero, B)], axis=-1)
-    own = np.concatenate([rows(eye, -hat(t - camera[..., 3])), rows(zero, eye)], axis=-1)
+    axis = by(4, -A[..., 1:], np.concatenate([(A @ hat(y - head[..., 3]))[..., 1:], -A[..., 1:]], axis=-1)) * moved
+    turn = by(1, -A[..., :1], A @ hat(y)[..., :1]) * moved
+    by_board = by(6, B, B)
+    eye = np.broadcast_to(np.eye(3), A.shape)
+    own = by(6, eye, np.concatenate([-hat(t - camera[..., 3]), eye], axis=-1))
     mine = view["camera"][..., None] == np.arange(unknowns.cameras)
     cameras = (own[..., None, :] * mine[:, :, None, :, None]).reshape(A.shape[:2] + (6, -1))
     J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
@@ -535,7 +551,8 @@ def named_blocks(state, data, unknowns):
         blocks["sweep"] = sweep_block(state, data, unknowns)
     if unknowns.sides:
         blocks["side"] = side_block(state, data, unknowns)
-    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in unknowns.sensor}
+    shown = set(unknowns.sensor) - (set() if "beam" in blocks else {"edge_log_odds"})
+    blocks |= {name: usual_block(state, unknowns, name) for name in USUAL if name in shown}
     if data.prior is not None and unknowns.axis:
         blocks["prior"] = prior_block(state, data, unknowns)
     return blocks

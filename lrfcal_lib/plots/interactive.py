@@ -62,6 +62,6 @@ def rig_lines(T_head_lrf, cameras, boards=None, size=0.15):
         rim = np.stack([(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones(5)], axis=1) * 3 * size
         legs = [np.vstack([np.zeros(3), corner, gap]) for corner in rim[:4]]
         lines[f"view of {name}"] = color_of(name), T.inv().apply(np.vstack([rim, gap, *legs]))
-    for name, corners in (boards or {}).items():
-        lines[name] = COLORS["fit"], np.vstack([corners, corners[:1]])
+    if boards:
+        lines["boards"] = COLORS["fit"], np.vstack([np.vstack([c, c[:1], gap]) for c in boards.values()])
     return lines

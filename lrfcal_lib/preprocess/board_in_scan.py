@@ -23,6 +23,7 @@ LARGEST_NOISE = 0.04  # metres; the farthest from its plane that a return of a n
 FEWEST_POINTS = 12
 LEAST_FILL = 0.5  # share of its convex hull that a board fills; what clutter leaves on a plane is patchy
 FEWEST_LINES = 4  # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
+CLEAR, MOST_MARGIN = 2.0, 1 / 3  # spot radii from the last beam on the board that see its face alone; share of a row
 RIGID_SIZES = (0.02, 4.0, 4.0)  # m2, m2, m: what may be a board when nothing is known about it
 
 
@@ -64,8 +65,10 @@ def surfaces(ranges, bearings, pitch):
     return np.where(pieces >= 0, np.append(joined, -1)[pieces], -1)
 
 
-def planar_surface(sweep, T_head_lrf, board, rng):
+def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
     """The nearest flat connected surface of a board's size: mask (L, B), normal and distance in the platform frame.
+
+    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its radius all around.
 
     With all scan lines at one pitch they do not determine the plane; the one at right angles to the scan plane is taken
     then. BoardNotFound says what was seen instead.
@@ -86,7 +89,8 @@ def planar_surface(sweep, T_head_lrf, board, rng):
             if sweep.ranges[mask].min() > best[0]:
                 continue
             reach = float(np.median(sweep.ranges[mask]))
-            mask, size, fits = _trimmed(points, mask, plane[0], _size_limits(board), upright)
+            limits = _size_limits(board, 0.0 if lrf is None else float(lrf.spot_radius(reach)))
+            mask, size, fits = _trimmed(points, mask, plane[0], limits, upright)
             fault = "" if single else _fault(sweep, T_head_lrf, points, mask, plane[0])
             seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m{fault}")
             if fits and not fault and reach < best[0]:
@@ -160,11 +164,11 @@ def _trimmed(points, mask, normal, limits, upright):
     return mask, size, least < area < most and length < longest
 
 
-def _size_limits(board):
-    """Least and largest area (m2) and greatest length (m) of what may be seen of a board."""
+def _size_limits(board, grown):
+    """Least and largest area (m2) and greatest length (m) of what may be seen of a board with its outline grown (m)."""
     if board is not None and board.corners is not None:
-        area, length = ConvexHull(board.corners).volume, pdist(board.corners).max()
-        return 0.25 * area, 1.35 * area, 1.2 * length
+        hull, length = ConvexHull(board.corners), pdist(board.corners).max()
+        return 0.25 * hull.volume, 1.35 * hull.volume + grown * hull.area, 1.2 * length + 2 * grown
     if board is not None and board.pattern is not None:
         sides = board.pattern.square * np.array([board.pattern.columns + 1, board.pattern.rows + 1])
         return 0.3 * np.prod(sides), 4 * np.prod(sides), 2.5 * np.linalg.norm(sides)
@@ -241,6 +245,8 @@ class BoardScan:
         Standard deviation of a range about the fitted lines, metres (noise, print and warp together).
     n_jump_points : int
         Returns within or next to the board that were rejected: mixed pixels and outliers.
+    spot : float
+        Angle that the radius of the spot takes up at the board, radians; 0 where nothing states it.
     """
 
     placement: int
@@ -255,9 +261,10 @@ class BoardScan:
     distance: float
     sigma_range: float
     n_jump_points: int
+    spot: float = 0.0
 
 
-def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
+def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
     """Find the board in a sweep, filter its ranges and fit a straight line to each scan line.
 
     Parameters
@@ -267,6 +274,8 @@ def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
         Tells the size by its outline, else by its pattern; anything from 0.02 to 4 m2 without it.
     T_head_lrf : RigidTransform, optional
         Roughly known platform; without it the tilt axis is taken to be the x axis of the LRF.
+    lrf : LrfInfo, optional
+        States the spot.
     rng : numpy.random.Generator, optional
         For the random sampling; by default always the same.
 
@@ -280,7 +289,7 @@ def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
         If no flat surface has the board's size.
     """
     T_head_lrf = RigidTransform.identity() if T_head_lrf is None else T_head_lrf
-    mask, *plane = planar_surface(sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng)
+    mask, *plane = planar_surface(sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng, lrf)
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
@@ -291,7 +300,9 @@ def find_board(sweep, board=None, T_head_lrf=None, *, rng=None):
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
     covariance, jumps = np.linalg.inv(information) * sigma**2, int(jump_points(sweep.ranges, fitted, sigma).sum())
     images = mask, filtered, fitted, lines, covariance
-    return BoardScan(sweep.placement, sweep, T_head_lrf, *images, *plane, sigma, jumps)
+    reach = float(np.nanmedian(fitted))
+    spot = 0.0 if lrf is None or lrf.spot_exit is None else float(lrf.spot_radius(reach)) / reach
+    return BoardScan(sweep.placement, sweep, T_head_lrf, *images, *plane, sigma, jumps, spot)
 
 
 def median_filter(ranges, mask, width=MEDIAN_WIDTH):
@@ -413,7 +424,9 @@ def face_points(scan, count=1000, margin=0.06):
     count : int
         At most.
     margin : float
-        What is left out at either end of a scan line and of a column, as a fraction of it; never less than two beams.
+        What is left out at either end of a scan line and of a column, as a fraction of it; never less than two beams,
+        nor than a spot that reaches over the edge: it reads the mean of its part on the board, and a slanted board
+        would seem less so.
 
     Returns
     -------
@@ -426,7 +439,9 @@ def face_points(scan, count=1000, margin=0.06):
     """
     with np.errstate(invalid="ignore"):
         good = scan.mask & (np.abs(scan.sweep.ranges - scan.fitted) < 4 * scan.sigma_range)
-    line, beam = np.nonzero(good & _interior(scan.mask, margin) & _interior(scan.mask.T, margin).T)
+    steps = (np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (scan.sweep.bearings, scan.sweep.pitch))
+    along, down = (CLEAR * scan.spot / max(step, 1e-6) for step in steps)
+    line, beam = np.nonzero(good & _interior(scan.mask, margin, along) & _interior(scan.mask.T, margin, down).T)
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
         line, beam = line[keep], beam[keep]
@@ -436,7 +451,12 @@ def face_points(scan, count=1000, margin=0.06):
     return polar_to_points(ranges, bearings), scan.sweep.pitch[line], covariance
 
 
-def _interior(mask, margin):
-    """Without the outer part of each row; a row too short for that (a sweep of one line, seen by columns) stays."""
+def _interior(mask, margin, spot):
+    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves half of the row.
+
+    A row too short for that (a sweep of one line, seen by columns) stays.
+    """
     _, first, last = row_ends(mask)
-    return _span(mask, np.where(last - first < 6, 0, np.maximum(2, (margin * (last - first)).astype(int))))
+    size = last - first
+    least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
+    return _span(mask, np.where(size < 6, 0, np.maximum(least, margin * size).astype(int)))

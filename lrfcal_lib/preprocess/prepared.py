@@ -105,7 +105,8 @@ def prepare_scans(session):
     edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
     for placement in session.board_placements:
         try:
-            scan = scans[placement] = find_board(session.sweep(placement), session.board, session.T_head_lrf)
+            known = session.board, session.T_head_lrf, session.lrf
+            scan = scans[placement] = find_board(session.sweep(placement), *known)
         except (BoardNotFound, SessionError) as error:
             problems[placement] = str(error)
             continue

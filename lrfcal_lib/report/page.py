@@ -17,7 +17,7 @@ from lrfcal_lib.report.notebook import in_words
 
 SHORT = 15  # rows of a table that is shown unfolded
 PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
-WIDTHS = ((9, "wide"), (4, "medium"), (0, "narrow"))  # columns from which a table is turned on screens as narrow
+WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))  # columns from which a table is turned on screens as narrow
 
 
 class Renderer(IPythonRenderer):

@@ -72,12 +72,15 @@ def crc16(data):
         return int(crc16(np.frombuffer(data, np.uint8)[None])[0])
     if data.shape[1] == 0:
         return np.zeros(len(data), np.uint16)
-    words = data.astype(np.uint16)
+    words = np.zeros((len(data), data.shape[1] + data.shape[1] % 2), np.uint16)  # zeros in front change nothing
+    words[:, words.shape[1] - data.shape[1] :] = data
     words[:, 1:] |= words[:, :-1] << 8
+    high = words[:, ::2]
+    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ words[:, 1::2]  # neighbours, by shifts: twice as fast
     while (n := words.shape[1]) > 1:
         last = 1 << ((n - 1).bit_length() - 1)
         rest = words[:, n - last :].copy()
-        rest[:, 2 * last - n :] ^= times_power(last)[words[:, : n - last]]
+        rest[:, 2 * last - n :] ^= times_power(2 * last)[words[:, : n - last]]
         words = rest
     return words[:, 0]
 
@@ -188,6 +191,8 @@ def alike(*keys):
     """Rows with the same keys, each group in order."""
     if not len(keys[0]):
         return []
+    if all((key == key[0]).all() for key in keys):
+        return [np.arange(len(keys[0]))]
     _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
     return np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
+from lrfcal_lib.fit.least_squares import eliminate, linearise, medians, whiten
 from lrfcal_lib.fit.residuals import SIDE_FREEDOM, SWEEPS, Unknowns, rays, view_block
 from lrfcal_lib.model.camera import project_jacobians
 
@@ -192,7 +192,7 @@ def misfits(blocks, data, groups=("face", "view")):
 def face_misses(state, data, boards, placement):
     """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
     x = face_points(state, data)[placement] - boards[:, None, :, 3]
-    return _medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
+    return medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
 
 
 def view_misses(state, data):
@@ -202,12 +202,7 @@ def view_misses(state, data):
         return np.zeros(len(used))
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=())
     shift = view_block(state, data, lone).residuals.reshape(used.shape + (6,))[..., 3:]
-    return _medians(np.linalg.norm(shift, axis=-1), used)
-
-
-def _medians(values, used):
-    """Medians of the used values of every row; 0 where there are none."""
-    return np.array([np.median(row[mine]) if mine.any() else 0.0 for row, mine in zip(values, used, strict=True)])
+    return medians(np.linalg.norm(shift, axis=-1), used)
 
 
 def joint_warnings(blocks, data, unknowns, found, names):
