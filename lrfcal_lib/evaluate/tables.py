@@ -585,7 +585,7 @@ def random_halves(joint, pairs=8):
     missing.
     """
     rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
-    for pair in range(pairs if len(numbers) >= 6 else 0):  # three placements are the fewest that may do
+    for pair in range(pairs if len(numbers) > 4 else 0):  # two placements determine no rig
         parts = np.array_split(rng.permutation(numbers), 2)
         halves = []
         with suppress(DegenerateGeometry):
