@@ -1,8 +1,10 @@
 """Reconstruction: occlusion, lenses, exposures, mixed pixels, normals, files, and measured boards."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -305,6 +307,14 @@ def test_a_bent_wall_is_not_flat():
     flat = flatness(cloud.points)[1]
     bent = flatness(cloud.points + np.array([[0, 0.05, 0]]) * cloud.points[:, :1] ** 2)[1]
     assert flat < 0.001 and 0.01 < bent < 0.03
+
+
+@pytest.mark.parametrize(("session", "least", "limit"), [("sim_lms221", 72, 0.7), ("lms400_zed", 60, 4.5)])
+def test_combined_lengths_of_left_out_placements_keep_their_promise(session, least, limit):
+    """In the stored tables (tests/golden), which the notebooks' own test compares."""
+    table = pd.read_csv(Path(__file__).parent / "golden" / session / "edge_summary.csv").set_index(["variant", "ends"])
+    found = table.loc["combined", "image"]
+    assert found.n >= least and found.mean_abs_error_mm <= limit and 83 <= found.within_90_percent <= 96
 
 
 def test_exact_edge_points_give_exact_lengths():

@@ -112,7 +112,8 @@ def case_of(joint, observations, placement):
     covariance = solution.solution.trusted
     known = np.isfinite(covariance)
     covariance = np.where(known, covariance, 0.0) + np.diag(np.where(np.diag(known), 1e-18, UNKNOWN))
-    whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+    variances, axes = np.linalg.eigh(covariance)
+    whitener = axes.T / np.sqrt(np.maximum(variances, 1e-18))[:, None]
     return Case(data, solution.unknowns, whitener, images, reach, middle, (state, lines, np.zeros(len(covariance))))
 
 

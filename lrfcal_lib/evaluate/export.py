@@ -162,6 +162,7 @@ def write_mesh(path, ply, step=0.02):
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=min(depth, 11), n_threads=1)
     corners = o3d.geometry.PointCloud(mesh.vertices)
     mesh.remove_vertices_by_mask(np.asarray(corners.compute_point_cloud_distance(cloud)) > 2 * step)
+    mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0, 1))
     if not o3d.io.write_triangle_mesh(str(path), mesh):
         raise OSError(f"{path}: the mesh could not be written; is the disk full?")
     return len(mesh.triangles)

@@ -299,7 +299,7 @@ def solve(
         iterations=iterations + sum(len(costs) - 1 for costs in earlier),
         cost_history=np.concatenate([*(costs[:-1] for costs in earlier), history]),
         residuals=r, jacobian=J, weights=weights,
-        covariance=_covariance(hessian, scales) * inflation[..., None, None],
+        covariance=_covariance(hessian, scales, lost) * inflation[..., None, None],
         covariance_placements=None if groups is None and shared is None else placement_covariance(hessians, scores)[0],
         unobservable=lost, method=method, n_observations=n_observations or r.shape[-1], chi2=chi2, inflation=inflation,
         state=state,
@@ -350,14 +350,14 @@ def pseudo_inverse(hessian):
     return (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 
-def _covariance(hessian, scales):
+def _covariance(hessian, scales, lost):
     """Inverse of normal equations. Unknowns that take part in an undetermined direction have an infinite variance.
 
     A pseudo-inverse calls such unknowns perfectly known; their covariances with others are set to zero.
     """
     unit = scales[:, None] * scales
     covariance = pseudo_inverse(hessian * unit) * unit
-    if hessian.ndim > 2:
+    if not lost:  # or many trials
         return covariance
     lost = np.any(np.abs(null_space(hessian, scales, np.inf)[0]) > 0.05, axis=0)
     covariance = np.where(lost[:, None] | lost, 0.0, covariance)
