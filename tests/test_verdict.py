@@ -47,7 +47,9 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
     monkeypatch.setattr(verdict, "not_an_offset", lambda *arguments: None)
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
     seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
-    solution = SimpleNamespace(solution=inner, sensor=sensor, observations=seen, transforms={}, boards={})
+    solution = SimpleNamespace(
+        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0
+    )
     prepared = SimpleNamespace(
         session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None, cameras={}),
         board=SimpleNamespace(pattern=None),
