@@ -113,7 +113,7 @@ def problem(count):
 def core(count):
     """Ranges and views of a problem: a start value, and whitened residuals and Jacobian of increments about one."""
     obs = none(problem(count), "beam")
-    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))
+    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
 
     def rows(shared, own, start=start, data=data):
         parts = [whiten(block) for block in joint_blocks(move_state(start, (shared, own), unknowns), data, unknowns)]

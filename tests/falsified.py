@@ -76,13 +76,6 @@ def knocked(obs):
     return replace(obs, view_pose=pose)
 
 
-def late(obs):
-    """The pitch of scan lines 0.3 deg late, up and down."""
-    behind = 0.005 * obs.direction
-    pitch = {f"{name}_pitch": getattr(obs, f"{name}_pitch") for name in ("face", "beam")}
-    return replace(obs, **{key: v - behind[getattr(obs, f"{key[:4]}_placement")] for key, v in pitch.items()})
-
-
 # what was done: change of the observations, kinds of reasons of which one has to be given (none: it must do no harm)
 FALSIFIED = {
     "squares 2 % too large": (scaled(squares=0.02), ("squares", "ranges")),
@@ -118,7 +111,6 @@ FALSIFIED = {
     "noise of images stated a tenth": (changed(view_covariance=lambda c: c / 100), ("noise",)),
     "focal length of one camera 3 % too long": (longer_lens, ("misfit", "noise")),
     "camera knocked aside half-way": (knocked, ("excluded", "misfit", "model error", "noise")),
-    "pitch of scan lines 0.3 deg late": (late, ("warning", "model error", "misfit")),
     "three placements": (lambda obs: obs.select(obs.placements[:3]), ("placements",)),
     "one pitch only": (
         pitched(lambda p: 0.02 * p), ("pitch", "unobservable", "pitch scale", "far from stated")

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from shared import ROOT, stages
 
-from lrfcal_lib.report import notebook
+from lrfcal_lib.report.notebook import asked, save
 from lrfcal_lib.session import cache
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -58,17 +58,27 @@ def run_nbval(path, report):
 def run_plainly(path, session, folder, report):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
-    After them the solutions of its exercises. Its figures must be legible, with titles and units.
+    After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures must be
+    legible, with titles and units.
     """
-    told, names, complaints = io.StringIO(), {"display": lambda shown: None}, []
+    ended, complaints = [], []
+
+    def heard(possible, why, *, rest=False):
+        ended.extend([why] * bool(rest and not possible))
+        return asked(possible, why)
+
+    told, names = io.StringIO(), {"display": lambda shown: None}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
-        patch.setattr(notebook, "save", figure_checks.checked(notebook.save, complaints))
+        patch.setattr("lrfcal_lib.report.notebook.save", figure_checks.checked(save, complaints))
+        patch.setattr("lrfcal_lib.report.notebook.asked", heard)
         for number, cell in enumerate(code_cells(read(path))):
+            if ended:
+                break
             exec(compile(cell.source, f"{path.stem}, code cell {number}", "exec"), names)
-        for number, code in enumerate(solutions(path), start=1):
+        for number, code in enumerate([] if ended else solutions(path), start=1):
             exec(compile(code, f"{path.stem}, solution {number}", "exec"), names)
     assert not complaints, "\n".join(complaints)
     return told.getvalue()

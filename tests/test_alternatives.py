@@ -6,11 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from joint_draws import MOUNTS, draw, rng
+from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras, weigh
+from lrfcal_lib.evaluate.alternatives import (
+    ALTERNATIVES,
+    doubtful,
+    far_from_stated,
+    not_an_offset,
+    places_of_cameras,
+    weigh,
+)
+from lrfcal_lib.evaluate.diagnosis import lens_words
+from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.solvers.joint import solve_joint
 
 ADMITTED = 0.025
+PATTERN = Chessboard(9, 5, 0.036, (0.1, 0.1))
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
@@ -41,6 +53,54 @@ def test_a_wrong_statement_is_named_with_its_size(mount, kind, value):
     found = next(doubt for doubt in doubts if doubt.kind == kind)
     assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 3 * found.sigma)
     assert ALTERNATIVES[kind].remedy in found.words and ALTERNATIVES[kind].signs[int(value > 0)] in found.words
+
+
+@MOUNTS
+@pytest.mark.parametrize("value", [0.03, -0.03])
+def test_an_angular_step_that_is_off_is_no_range_offset(mount, value):
+    found = not_an_offset(solved(7, lambda obs: ALTERNATIVES["bearings"].change(obs, value), mount=mount))
+    assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 5 * found.sigma)
+    assert "check the angular step" in found.words and "instead of a range offset" in found.words
+
+
+@MOUNTS
+@pytest.mark.parametrize("offset", [0.0, 0.03, 0.06])
+def test_a_range_offset_is_no_angular_step(mount, offset):
+    assert not_an_offset(solved(7, lambda obs: replace(obs, face_range=obs.face_range + offset), mount=mount)) is None
+
+
+def fisheye_views(field_deg, count, rng, size=(640, 480)):
+    """Corners of a chessboard as a lens of the equidistant law shows them (a pinhole below 90 deg)."""
+    points, views = PATTERN.points() - PATTERN.points().mean(axis=0), []
+    f = size[0] / 2 / np.radians(field_deg / 2)
+    while len(views) < count:
+        off, around = rng.uniform(0, np.radians(0.42 * field_deg)), rng.uniform(0, 2 * np.pi)
+        at = np.array([np.sin(off) * np.cos(around), 0.75 * np.sin(off) * np.sin(around), np.cos(off)])
+        face = Rotation.align_vectors([at], [[0, 0, 1]])[0] * Rotation.from_euler("xyz", rng.uniform(-0.7, 0.7, 3))
+        p = face.apply(points) + rng.uniform(0.35, 1.0) * at
+        across = np.hypot(p[:, 0], p[:, 1])
+        bent = f * (np.arctan2(across, p[:, 2]) if field_deg > 90 else across / p[:, 2])
+        uv = p[:, :2] * (bent / across)[:, None] + np.array(size) / 2 + rng.normal(0, 0.1, (len(p), 2))
+        if p[:, 2].min() > 0.02 and (np.abs(uv / size - 0.5) < 0.49).all():
+            views.append(uv)
+    return views
+
+
+@pytest.mark.parametrize(
+    ("field_deg", "scale", "named"),
+    [(60, 1.0, None), (140, 1.0, "the model folds back"), (60, 2.0, "as with intrinsics of another image size")],
+)
+def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
+    pixels = fisheye_views(field_deg, 15, rng(3))
+    model = estimate_intrinsics(pixels, PATTERN, (640, 480)).models[0]
+    model = model.with_parameters(model.parameters * np.r_[[scale] * 4, [1.0] * 5])
+    views = {i: SimpleNamespace(pixels=uv, T_camera_board=first_pose(PATTERN.points(), uv, model), reason="")
+             for i, uv in enumerate(pixels)}  # fmt: skip
+    prepared = SimpleNamespace(
+        board=SimpleNamespace(pattern=PATTERN), models={"left": model}, views={"left": views}, relief=None
+    )
+    words = lens_words(prepared)
+    assert words == {} if named is None else named in words["left"]
 
 
 def mirrored(obs):

@@ -219,3 +219,22 @@ def test_weights_never_hold_a_bad_start(seed, source):
     found = [solve_camera(obs, "zhang_pless", rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False)]
     rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in found]
     assert rms[0] < 1.3 * rms[1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_three_single_lines_have_the_truth_among_eight_poses(seed):
+    rig, obs = camera_case(seed)
+    sets = plane_sets(obs.select(obs.placements[:3]))
+    found = planes.three_planes(compress(sets, 1.0), sets.boards)
+    assert found.shape == (8, 3, 4)
+    assert min(max(transform_difference(pose_transform(pose), rig.T_camera_lrf)) for pose in found) < 1e-7
+
+
+def test_a_second_minimum_is_handed_back_beside_the_best():
+    """Three single lines fit several poses; nine fit one."""
+    rig, obs = camera_case(3, noise=0.2)
+    few = solve_camera(obs.select(obs.placements[:3]), "zhang_pless")
+    poses = [few.transform, few.rival]
+    assert min(transform_difference(pose, rig.T_camera_lrf)[0] for pose in poses) < 0.1
+    assert transform_difference(*poses)[0] > planes.SAME_TURN
+    assert solve_camera(obs, "zhang_pless").rival is None

@@ -43,7 +43,10 @@ def rectangle(shift=0.0, columns=9, rows=5, square=0.036, size=(0.46, 0.34)):
     return Board("plate", names, corners, Chessboard(columns, rows, square, tuple(origin)), ("top", "left"))
 
 
-def record(path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, image_pitch_deg=(0.0,)):
+def record(
+    path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, image_pitch_deg=(0.0,), cameras=CAMERAS,
+    platform=STATED, still=(),
+):  # fmt: skip
     """Write a simulated session with its truth.
 
     Parameters
@@ -57,25 +60,32 @@ def record(path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, 
         The board is a sheet on a wall of its own colour, and the rig is moved before it.
     image_pitch_deg : sequence of float
         Of the images of every placement.
+    cameras : sequence of str
+        Of `CAMERAS`.
+    platform : RigidTransform or None
+        As it is stated.
+    still : sequence of str
+        What does not change from placement to placement: 'turn', 'place'.
     """
     rng, pitch = np.random.default_rng(seed), np.radians(np.arange(-14, 14.1, 1.0) if pitch_deg is None else pitch_deg)
     info = LrfInfo("pinpoint", (BEARINGS[0], BEARINGS[-1]), np.radians(0.5), SIGMA_RANGE)
-    cameras = [CameraInfo(name, "head", MODEL.width, MODEL.height, MODEL) for name in CAMERAS]
+    infos = [CameraInfo(name, "head", MODEL.width, MODEL.height, MODEL) for name in cameras]
     stated = Board(board.name, board.edges, None, board.pattern, board.features) if on_wall else board
     truth = {"simulated": True, "T_head_lrf": transform_to_json(HEAD), "board": board_to_json(board), "boards": {}}
     lens = model_to_json(MODEL)
-    truth["cameras"] = {n: {"T_camera_lrf": transform_to_json(T), "intrinsics": lens} for n, T in CAMERAS.items()}
+    truth["cameras"] = {n: {"T_camera_lrf": transform_to_json(CAMERAS[n]), "intrinsics": lens} for n in cameras}
     truth |= {"images": {}, "sweeps": {}, "lrf": {}}
-    with SessionWriter(path, stated, info, cameras, STATED, simulated=True, platform_sigma=(0.03, 0.02)) as writer:
+    own = {"platform_sigma": (0.03, 0.02), "simulated": True}
+    with SessionWriter(path, stated, info, infos, platform, **own) as writer:
         for number in range(1, placements + 1):
-            pose = _pose(board, rng, number, on_wall)
+            pose = _pose(board, rng, number, on_wall, still)
             truth["boards"][number] = {"T_platform_board": transform_to_json(pose)}
             truth["sweeps"][number] = {"pitch_rad": pitch.tolist()}
             writer.add_sweep(number, _scan(pose, board, pitch, on_wall, rng), BEARINGS, pitch)
-            for name, mounting in CAMERAS.items():
+            for name in cameras:
                 for at in np.radians(image_pitch_deg):
                     back = RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0, 0]))
-                    seen = mounting * HEAD.inv() * back * pose
+                    seen = CAMERAS[name] * HEAD.inv() * back * pose
                     writer.add_image(name, _image(seen, board, on_wall, rng), number, pitch=float(at))
                     file = f"images/{name}/{writer.shots[name]:04d}.png"
                     truth["images"][file] = {"pitch_rad": float(at), "T_camera_board": transform_to_json(seen)}
@@ -83,12 +93,13 @@ def record(path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, 
     return path
 
 
-def _pose(board, rng, number, on_wall):
+def _pose(board, rng, number, on_wall, still):
     """The board a metre ahead, turned another way at every placement; a sheet on a wall hangs nearly upright."""
     roll = rng.uniform(-8, 8) if on_wall else 50.0 * number + rng.uniform(-10, 10)
     tilt = rng.uniform(-28, 28, 2)
-    turn = FACING * Rotation.from_euler("YXZ", [*tilt, roll], degrees=True)
+    turn = FACING * Rotation.from_euler("YXZ", [*tilt * ("turn" not in still), roll], degrees=True)
     at = rng.uniform([-0.08, 0.95, -0.05], [0.08, 1.35, 0.05])
+    at = np.array([0.0, 1.1, 0.0]) if "place" in still else at
     return RigidTransform.from_components(at - turn.apply([*board.corners.mean(axis=0), 0.0]), turn)
 
 
@@ -132,10 +143,12 @@ def _image(T_camera_board, board, on_wall, rng):
 
 def _face(x, y, board, ground, on_wall):
     """Grey values in the plane of the board."""
+    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines()], axis=0) & (not on_wall)
     p = board.pattern
+    if p is None:
+        return np.where(inside, 70.0, ground)
     u, v = (x - p.origin[0]) / p.square, (y - p.origin[1]) / p.square
     squares = (u >= -1) & (v >= -1) & (u < p.columns) & (v < p.rows)
     paper = (u > -1.25) & (v > -1.25) & (u < p.columns + 0.25) & (v < p.rows + 0.25)
-    inside = np.all([a * x + b * y + c < 0 for a, b, c in board.lines()], axis=0) & (not on_wall)
     face = np.where(inside, np.where(paper, 225.0, 70.0), ground)
     return np.where(squares, np.where((np.floor(u) + np.floor(v)) % 2 == 0, 25.0, 225.0), face)

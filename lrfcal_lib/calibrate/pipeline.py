@@ -26,6 +26,11 @@ from lrfcal_lib.solvers.platform import solve_platform, solve_projected
 
 LAPSE = 0.01  # share of beams about an edge that something else than the edge decides
 PITCH_POINTS = 300  # of a placement's face, for the errors of its pitch
+ASSUMED = np.radians(10.0), 0.1  # how well an axis is known that nothing tells
+UNKNOWN_AXIS = (
+    "the tilt axis is neither stated nor determined by the sweeps, and taken to lie along x through the mirror: state "
+    "the platform in session.json, or record sweeps of straight edges and images at several pitch angles"
+)
 LEAST_SIDES = 8  # of all placements, for a spread of the edge bias from side to side
 
 
@@ -217,11 +222,7 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     Returns
     -------
     PlatformCalibration
-
-    Raises
-    ------
-    DegenerateGeometry
-        If the session neither states its platform nor holds sweeps that determine it.
+        Where the platform is neither stated nor determined, 'combined' is an assumption, and so named in `problems`.
     """
     T0, sigma = prepared.session.T_head_lrf, prepared.session.platform_sigma
     stated = None if T0 is None else (T0, stated_covariance(sigma))
@@ -239,7 +240,7 @@ def calibrate_platform(prepared, sigma_pitch=0.0):
     axes = {name: (found.T_head_lrf, found.solution.trusted) for name, found in solutions.items()}
     best = combine(solutions["line_3d"], stated) if "line_3d" in solutions else stated
     if best is None:
-        raise DegenerateGeometry(f"the platform is neither stated nor determined by the sweeps: {problems}")
+        problems["combined"], best = UNKNOWN_AXIS, (RigidTransform.identity(), stated_covariance(ASSUMED))
     axes |= ({} if stated is None else {"stated": stated}) | {"combined": best}
     return PlatformCalibration(axes, solutions, problems, sigma)
 

@@ -15,6 +15,7 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
+HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
@@ -148,6 +149,20 @@ def doubtful(solution, admitted_offset, without=()):
     found = [doubt for doubt in weigh(solution, admitted_offset) if doubt.kind not in without]
     asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
     return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
+
+
+def not_an_offset(solution):
+    """The Doubt about bearings where they explain the data far better than the range offset found does, or None.
+
+    Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with the offset held.
+    """
+    names, offset = solution.solution.names, solution.sensor["range_offset"]
+    if "range_offset" in names:
+        square = (offset / solution.solution.trusted_sigma[names.index("range_offset")]) ** 2
+        best = weigh(solution, HELD)[0] if square > ASKED**2 else None
+        if best and best.kind == "bearings" and best.ratio > max(square / AS_GOOD, INSTEAD**2):
+            return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
+    return None
 
 
 def far_from_stated(joint):

@@ -9,13 +9,19 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.observe import rough_poses
 from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import lrf_to_source
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.steadiness import camera_steadiness
 from lrfcal_lib.solvers.pitch import PitchErrors
 
 SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
 SHEET_SHARE = 0.5  # a sheet bent less than this share of what the scan shows does not explain the scan
+LENS_PARTS, LENS_CORNERS, LENS_MISS = np.array([6, 4]), 20, 0.15  # of an image; corners in a part; pixels
+OFF_MIDDLE = 0.2  # of the image's size
+OTHER_SIZE = "as with intrinsics of another image size"
+REMEDY = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
 SAME_TURN = 0.5  # two cameras whose turns differ by less than this share of the larger one moved together
 
 
@@ -79,6 +85,39 @@ def findings_in_words(diagnosis):
     """What a recording says about itself, one sentence a finding; none for a recording without fault."""
     found = pitch_words(diagnosis.pitch_errors) + motion_words(diagnosis.steadiness)
     return found + bend_words(diagnosis.bends) + problem_words(diagnosis.problems)
+
+
+def lens_words(prepared):
+    """Cameras whose lens its model does not fit, one sentence each by camera, from the corners of the chessboard.
+
+    What corners miss by on the average over parts of the image is of the lens: noise and waves of the sheet differ from
+    view to view. And radii that the model folds back inside the image.
+    """
+    out, r = {}, np.linspace(0.0, 10.0, 5001)
+    for camera, views in prepared.views.items() if prepared.board.pattern else ():
+        model, seen = prepared.models[camera], [v for v in views.values() if v.pixels is not None and not v.reason]
+        if not seen:
+            continue
+        points, uv = raised_points(prepared.board.pattern, prepared.relief), np.concatenate([v.pixels for v in seen])
+        off = uv - np.concatenate([project(v.T_camera_board.apply(points), model) for v in seen])
+        part, parts = np.floor(LENS_PARTS * uv / [model.width, model.height]), []
+        for own in np.unique(part[np.isfinite(off).all(axis=1)], axis=0):
+            mine = off[(part == own).all(axis=1)]
+            if len(mine) >= LENS_CORNERS:
+                parts.append(np.sum(mine.mean(axis=0) ** 2) - mine.var(axis=0).sum() / len(mine))
+        alike = np.sqrt(max(np.mean(parts), 0.0)) if parts else 0.0
+        k1, k2, _, _, k5 = model.distortion
+        bent = r * (1 + k1 * r**2 + k2 * r**4 + k5 * r**6)
+        ends = np.array([[0, 0], [0, model.height], [model.width, 0], [model.width, model.height]])
+        corner = np.linalg.norm((ends - [model.cx, model.cy]) / [model.fx, model.fy], axis=1).max()
+        fold = np.append(bent[1:][np.diff(bent) < 0], np.inf)[0] / corner
+        words = [f"corners of the chessboard miss by {alike:.2f} px alike"] * int(alike > LENS_MISS)
+        words += [f"the model folds back at {100 * fold:.0f} % of the way to the image's corners"] * int(fold < 1)
+        if np.abs(np.array([model.cx / model.width, model.cy / model.height]) - 0.5).max() > OFF_MIDDLE:
+            words.append(f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, {OTHER_SIZE}")
+        if words:
+            out[camera] = f"the lens of camera '{camera}' is not that of its model ({'; '.join(words)}): {REMEDY}"
+    return out
 
 
 def pitch_words(errors):

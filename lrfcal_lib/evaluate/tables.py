@@ -269,12 +269,16 @@ def best_method(comparison, among=("line", "zhang_pless")):
 def handed_over(calibration):
     """The method of a Calibration whose result goes into ``calibration.json`` and colours the cloud.
 
-    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says.
+    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says. None where no
+    camera was calibrated, or none could be judged.
     """
     joint = calibration.joint
     if joint is not None and joint.solution.converged and not joint.solution.unobservable:
         return "joint"
-    return best_method(method_comparison(calibration.observations, calibration.solutions))
+    compared = method_comparison(calibration.observations, calibration.solutions)
+    with suppress(ValueError):
+        return best_method(compared)
+    return None
 
 
 def _parameter_table(keys, found):
@@ -581,7 +585,7 @@ def random_halves(joint, pairs=8):
     missing.
     """
     rng, numbers, rows = np.random.default_rng(0), np.array(list(joint.solution.boards)), []
-    for pair in range(pairs):
+    for pair in range(pairs if len(numbers) > 4 else 0):  # two placements determine no rig
         parts = np.array_split(rng.permutation(numbers), 2)
         halves = []
         with suppress(DegenerateGeometry):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -10,13 +11,16 @@ from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import largest_range
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, places_of_cameras
+from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
+from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.tables import handed_over, placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.planes import rival_words
 
 YES, CARE, NO = "yes", "with care", "no"
 FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
@@ -44,6 +48,12 @@ POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
 LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
+LEFT_OUT = 0.2  # share of the placements that is a finding of its own
+RECORD = (
+    f"Record next: {FEW} or more placements that all cameras see, the board leaning every way by 20 deg and more, at "
+    "several distances, with a sweep over its edges and images at several pitch angles each."
+)
+REGIONS = [" ".join(both).strip() or "middle" for both in product(("top", "", "bottom"), ("left", "", "right"))]
 SAID = ("not converged", "the data do not determine")  # warnings of the solver that are findings of their own
 
 LIES = {
@@ -63,8 +73,8 @@ class Reason:
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', of
         :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
-        'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error', 'noise',
-        'warning', 'error'.
+        'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
+        'model error', 'noise', 'warning', 'error'.
     words : str
     """
 
@@ -85,6 +95,8 @@ class Verdict:
     errors : dict of float to dict of str to float
         By distance in metres: 'cloud_mm' and, by camera, '<camera>_px', one standard deviation (root mean square over
         the field), errors of the model included as far as they scatter over placements; inf where nothing bounds them.
+    regions : dict of str to dict of str to float
+        By camera and ninth of its image ('top left', 'top', ..., 'middle'): pixels at 2 m; NaN where no scan reaches.
     range_noise_mm : float
         Of every single point, on top.
     sweep_mm : float
@@ -104,17 +116,23 @@ class Verdict:
     suggestion: Suggestion | None
     no_suggestion: str = ""
     notes: tuple = ()
+    regions: dict = field(default_factory=dict)
 
     def record(self):
         """Answer, reasons and expected errors, ready for JSON."""
         reasons, errors = [vars(reason) for reason in self.reasons], {f"{d:g}": e for d, e in self.errors.items()}
-        return {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
+        found = {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
+        return found | {"expected_px_at_2_m": self.regions}
 
     def sentences(self):
         """For the first page: the warning before anything else, the errors, what to record next."""
         why = "; ".join(reason.words for reason in self.reasons)
         out = [f"{FIRST[self.answer]}: {why}." if why else f"{FIRST[self.answer]}."]
         out += [f"Expected error at {d:g} m: {_error_words(e)}." for d, e in self.errors.items()]
+        for camera, own in self.regions.items():
+            known = sorted((value, name) for name, value in own.items() if np.isfinite(value))
+            ends = [f"{brief(value)} px {name}" for value, name in (known[:1] + known[-1:])]
+            out += [f"In the image of '{camera}' at 2 m: {' to '.join(ends)}."] if ends else []
         out += self.notes
         if self.errors:
             out.append(
@@ -170,10 +188,12 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
     field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
     cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
     looks = {"image_pitch": sum(field) / 2, "pitches": field}
-    maps = {"cloud_mm": 1000 * cloud.rms()} | {
-        f"{camera}_px": projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks).rms()
+    seen = {
+        camera: projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks)
         for camera, chain in chains.items() if camera is not None
     }  # fmt: skip
+    maps = {"cloud_mm": 1000 * cloud.rms()} | {f"{camera}_px": found.rms() for camera, found in seen.items()}
+    regions = {camera: _regions(found.sigma[DISTANCES.index(2.0)]) for camera, found in seen.items()}
     errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
     if large:
@@ -181,7 +201,14 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
         words = f"the expected error at 2 m is {_error_words(large)}"
         reasons = [*reasons, Reason(NO if bad else CARE, "error", words)]
     sweep = 1000 * float(np.sqrt(np.mean(cloud.parts["sweep"][DISTANCES.index(2.0)] ** 2)))
-    return _answered(Verdict(YES, (), errors, 1000 * float(noise), sweep, None), reasons)
+    return _answered(Verdict(YES, (), errors, 1000 * float(noise), sweep, None, regions=regions), reasons)
+
+
+def _regions(sigma):
+    """Root mean square of a map (rows, columns) over the ninths of an image, by their names."""
+    parts = [part for rows in np.array_split(sigma, 3) for part in np.array_split(rows, 3, axis=1)]
+    known = [part[~np.isnan(part)] for part in parts]
+    return {n: float(np.sqrt(np.mean(p**2))) if p.size else np.nan for n, p in zip(REGIONS, known, strict=True)}
 
 
 def _answered(found, reasons):
@@ -194,25 +221,25 @@ def _answered(found, reasons):
 def judge(calibration, method=None, **options):
     """Judge what a calibration hands over, by itself and by what became of the recording: a :class:`Verdict`.
 
-    'no' without errors where nothing is handed over. `method` is that whose camera poses are handed over, as
-    :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out; options of :func:`verdict` (what the LRF sees and
-    the board's features are known).
+    'no' without errors, and with what to record, where nothing is handed over. `method` is that whose camera poses are
+    handed over, as :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out; options of :func:`verdict` (what
+    the LRF sees and the board's features are known).
     """
     prepared, joint = calibration.prepared, calibration.joint
+    lens = [Reason(NO if OTHER_SIZE in words else CARE, "lens", words) for words in lens_words(prepared).values()]
     # also where the joint estimate is not handed over: a wrong size may be why
     sizes, doubt = ([], 0.0) if joint is None else contradicts_stated(joint)
-    try:
-        method = method or handed_over(calibration)
-    except ValueError as error:
-        found = calibration.problems.items()
-        why = "; ".join([f"nothing can be handed over ({error})", *(f"{' '.join(k)}: {v}" for k, v in found)])
-        return _answered(Verdict(NO, (), {}, np.nan, 0.0, None), [*sizes, Reason(NO, "handed over", why)])
+    method = method or handed_over(calibration)
+    if method is None:
+        refused, lost = Reason(NO, "handed over", _refusal(calibration)), problem_words(prepared.problems)
+        notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",) if lost else ()
+        return replace(_answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]), notes=notes)
     if method == "joint":
         found = verdict(joint.solution, prepared.models, doubt=doubt, **sight_of(prepared) | options)
     else:
         found = _without_joint(calibration, method, doubt)
     reasons, words = _left_out(calibration, method)
-    if reasons:  # with the words of those that the estimate excluded
+    if any("placements are left out" in reason.words for reason in reasons):  # with words of what was excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
@@ -221,7 +248,17 @@ def judge(calibration, method=None, **options):
         known, within = 100 / np.sqrt(2 * (n - 1)), stdtrit(n - 1, 0.95)
         words = f"The scatter over {n} placements is itself known to {known:.0f} % only"
         notes += (f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",)
-    return replace(_answered(found, sizes + reasons), notes=notes)
+    return replace(_answered(found, lens + sizes + reasons), notes=notes)
+
+
+def _refusal(calibration):
+    """Why nothing can be handed over: what keeps the joint estimate, or else every camera, from an answer."""
+    prepared, problems = calibration.prepared, calibration.problems
+    why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
+    if not prepared.views:
+        why = prepared.problems.get("images", "the session has no camera")
+        why += "; the tilt axis is known from the edges in the sweeps" * bool(calibration.platform.solutions)
+    return f"nothing can be handed over: {why}"
 
 
 def sight_of(prepared):
@@ -244,6 +281,13 @@ def _without_joint(calibration, method, doubt):
         reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
     lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
     reasons += [Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})") for c, why in lost.items()]
+    reasons += [
+        Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
+        for camera, found in solved.items() if found.rival is not None
+    ]  # fmt: skip
+    unknown = calibration.platform.problems.get("combined")
+    if unknown and any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()):
+        reasons.append(Reason(NO, "far from stated", unknown))
     # the range offset of the cloud may be what the maker admits
     platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
     rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
@@ -273,6 +317,9 @@ def contradicts_stated(joint):
     told = lrf.spot_exit is not None and bool(many)
     known = {"squares": joint.prepared.board.pattern is not None, "spot": told}
     asked = doubtful(joint.solution, admitted, [kind for kind, there in known.items() if not there])
+    instead = not_an_offset(joint.solution)
+    if instead and (not asked or asked[0].kind == instead.kind):
+        asked, doubt = [instead], abs(offset)
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
@@ -280,10 +327,11 @@ def contradicts_stated(joint):
         reasons.append(Reason(NO if large else CARE, best.kind, words))
         off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
         doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
-    if abs(offset) > admitted + margin:
+    if abs(offset) > admitted + margin and instead not in asked:
         words = (
             f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
-            f"the range finder (session.json may state systematic_error_m): {SIZES}; and the unit of the ranges"
+            f"the range finder (session.json may state systematic_error_m): {SIZES}; the unit of the ranges; the "
+            "angular step"
         )
         reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
         doubt = max(doubt, abs(offset))
@@ -330,13 +378,23 @@ def _left_out(calibration, method):
     used = set(table.index[table.used]) - set(prepared.problems)
     if method == "joint":
         used, excluded = set(calibration.joint.solution.boards), calibration.joint.solution.excluded
-    lost = [p for p in table.index if p not in used]
+    lost, reasons = [p for p in table.index if p not in used], []
+    for camera, views in prepared.views.items():
+        why = {p: views[p].reason if p in views else "no image" for p in table.index}
+        unseen = [f"{p} ({words})" for p, words in why.items() if words]
+        if len(unseen) > LEFT_OUT * len(table):
+            words = f"camera '{camera}' does not see the board in {len(unseen)} of {len(table)} placements"
+            reasons.append(Reason(CARE, "left out", f"{words}: {', '.join(unseen)}"))
+    large = len(lost) > LOST * len(table)
+    every = prepared.problems | (excluded if large else {})
+    parts = [words for key, words in every.items() if key not in table.index]
+    also = f"Parts left out beside whole placements: {len(parts)} ({'; '.join(parts)})." if parts else ""
     if not lost:
-        return [], f"All {len(table)} placements were used."
+        return reasons, f"All {len(table)} placements were used. {also}".strip()
     why = [f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})" for p in lost]
     words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
-    reasons = [Reason(CARE, "left out", words)] if len(lost) > LOST * len(table) else []
-    return reasons, "" if reasons else f"{words}."
+    reasons += [Reason(CARE, "left out", words)] * large
+    return reasons, f"{'' if large else f'{words}.'} {also}".strip()
 
 
 def diagnose(solution):

@@ -60,6 +60,8 @@ class Solution:
         Refined intrinsics.
     board_poses : ndarray, shape (p, 4, 4), or None
         Refined ``T_camera_board`` in the order of the observations' `placements`.
+    rival : RigidTransform or None
+        Another minimum, far from this one, that explains the data nearly as well.
     state : object
         What the core moved about: everything that was unknown, shared or not.
     """
@@ -82,6 +84,7 @@ class Solution:
     inflation: float | np.ndarray
     model: CameraModel | None = None
     board_poses: np.ndarray | None = None
+    rival: RigidTransform | None = None
     state: Any = None
 
     @property

@@ -238,6 +238,8 @@ def pose_from_edges(edges, board, model, start, covariance=None):
         residual, jacobian = np.r_[residual.ravel(), white @ moved], np.concatenate([jacobian.reshape(-1, 6), white])
         if rounds == 0 or np.abs(step).max() < 1e-12:
             break
+        if not np.isfinite(jacobian).all():
+            raise np.linalg.LinAlgError("no pose explains these lines")
         step, rounds = np.linalg.lstsq(jacobian, -residual, rcond=1e-12)[0], rounds - 1
         pose = move_pose(pose, step)
     return pose_transform(pose), np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), float(residual @ residual)
@@ -348,7 +350,10 @@ def board_poses(edges, board, model):
             start = RigidTransform.from_components(t.ravel(), Rotation.from_rotvec(w.ravel()))
             if start.translation[2] <= 0 or frontal(start) <= 0:
                 continue
-            pose, covariance, chi2 = pose_from_edges(named, board, model, start)
+            try:
+                pose, covariance, chi2 = pose_from_edges(named, board, model, start)
+            except np.linalg.LinAlgError:  # sides that bear wrong names
+                continue
             off = np.linalg.norm(pinhole(pose.apply(flat), model) - corners, axis=1).max()
             known = any((pose.rotation * p.rotation.inv()).magnitude() < 1e-3 for p, _, _ in found)
             if frontal(pose) > 0 and (off < EXACT_PX or chi2 < 16 * len(corners)) and not known:

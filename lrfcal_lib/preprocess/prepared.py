@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.survey import Outline, views_of
@@ -119,7 +120,10 @@ def prepare_scans(session):
 
 def prepare_images(prepared):
     """The same with the board in every image of the session, the cameras' intrinsics, and the board's outline."""
-    seen = views_of(prepared.session, one_per_placement=True)
+    try:
+        seen = views_of(prepared.session, one_per_placement=True)
+    except DegenerateGeometry as error:  # what remains is a session without cameras
+        return replace(prepared, problems=prepared.problems | {"images": f"no image can be used: {error}"})
     # an image that belongs to no placement is left out
     views = {c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
              for c, own in seen.views.items()}  # fmt: skip

@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
+from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
@@ -232,7 +233,7 @@ def _intrinsics(camera, images, board, read):
     try:
         return estimate_intrinsics(_for_intrinsics(images, camera), board.pattern, size).models[0]
     except ValueError as error:
-        raise ValueError(f"camera '{camera}': {error}") from error
+        raise DegenerateGeometry(f"camera '{camera}': {error}") from error
 
 
 def _with_relief(images, board, models, flat):
@@ -263,7 +264,7 @@ def _ordered(images, read, board, models):
         )
     seen = [(r, v, models[v.camera]) for r, v in images if v.pixels is not None]
     if not known and not seen:
-        raise ValueError(f"none of {len(images)} images shows the pattern of board '{board.name}'")
+        raise DegenerateGeometry(f"none of {len(images)} images shows the pattern of board '{board.name}'")
     points, orders = board.pattern.points(), pattern_orders(board.pattern, mirrored=known)
     middle = points.mean(axis=0)
     turns = [Rotation.align_vectors(points[order] - middle, points - middle)[0] for order in orders]
@@ -388,7 +389,7 @@ def measure_outline(views, board, models):
     for name in board.edges:
         lines.append(np.array([own[name] for own in seen if name in own]))
         if not len(lines[-1]):
-            raise ValueError(
+            raise DegenerateGeometry(
                 f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: pick it by hand "
                 "in edges.csv or give the corners of the board"
             )

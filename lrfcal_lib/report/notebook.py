@@ -50,6 +50,8 @@ def set_up():
     if get_ipython() is not None:  # the same pixels must give the same bytes: no version of matplotlib in the PNG
         kwargs = {"bbox_inches": None, "metadata": {"Software": None}}
         get_ipython().run_line_magic("config", f"InlineBackend.print_figure_kwargs = {kwargs}")
+        while _only_start in get_ipython().input_transformers_cleanup:
+            get_ipython().input_transformers_cleanup.remove(_only_start)
     for kind in _found.values():
         kind.clear()
 
@@ -184,11 +186,20 @@ def verdict(title, sentences, record=None):
     print(title, *(f"  {sentence}" for sentence in sentences), sep="\n")
 
 
-def asked(possible, why):
-    """Whether a question can be put to a session; prints why not: what the session does not have."""
+def asked(possible, why, *, rest=False):
+    """Whether a question can be put to a session; prints why not: what the session does not have.
+
+    With `rest` nothing that follows can be asked either: until :func:`start` cells do nothing.
+    """
     if not possible:
         print(f"not asked: {why}")
+        if rest and get_ipython() is not None:
+            get_ipython().input_transformers_cleanup.append(_only_start)
     return bool(possible)
+
+
+def _only_start(lines):
+    return lines if any("notebook.start(" in line for line in lines) else []
 
 
 def _record(kind, name, entry):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, transform_difference
 from lrfcal_lib.solvers import lines, planes
 
 
@@ -78,7 +78,7 @@ STARTS = {
 
 
 def starting_transform(obs, uses="crossing"):
-    """A start value of ``T_camera_source`` from whatever the observations hold, in the order that suits a method.
+    """Start values of ``T_camera_source`` (one, or a stack with the best one first) from what the observations hold.
 
     Raises DegenerateGeometry when no way determines the pose, with the reason of each.
     """
@@ -128,14 +128,14 @@ def solve_camera(observations, method="line", T0=None, *, search=True, **options
     obs = observations.along() if row.along else observations
     obs.require(row.uses, row.fewest)
     options, found, problem = {"method": method, "uses": row.uses} | row.options | options, [], None
-    starts = [] if T0 is None else [T0]
+    starts = [] if T0 is None else [pose_array(T0)]
     if T0 is None or (search and T0.single and getattr(obs, f"{row.uses}_points").ndim == 2):
         try:
-            starts.append(starting_transform(obs, row.uses))
+            starts += [*pose_array(starting_transform(obs, row.uses)).reshape(-1, 3, 4)]
         except DegenerateGeometry:
             if T0 is None:
                 raise
-    for pose in map(pose_array, starts):
+    for pose in starts:
         trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
         try:
             found.append(row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options))
@@ -143,7 +143,16 @@ def solve_camera(observations, method="line", T0=None, *, search=True, **options
             problem = problem or error
     if not found:
         raise problem
-    return found[0] if len(found) == 1 else min(found, key=lambda solution: misfit(obs, row.uses, solution.transform))
+    return found[0] if len(found) == 1 else best_minimum(obs, row.uses, found)
+
+
+def best_minimum(obs, uses, found):
+    """The best of some Solutions, with another one as `rival` that explains the data nearly as well."""
+    judged = sorted(((*misfit(obs, uses, solution.transform), i) for i, solution in enumerate(found)))
+    behind, miss, best = judged[0][0], judged[0][1], found[judged[0][2]]
+    rivals = (found[i].transform for back, other, i in judged if back == behind and other <= planes.NEARLY * miss)
+    far = (T for T in rivals if transform_difference(T, best.transform)[0] > planes.SAME_TURN)
+    return replace(best, rival=next(far, None))
 
 
 def misfit(obs, uses, transform):

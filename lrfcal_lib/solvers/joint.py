@@ -16,13 +16,14 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_param
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
+from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
 START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 300
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
-LEFT_OUT = 1000.0  # what a start value that needs all placements left out counts: try others before
+LEFT_OUT = 1000.0  # times the squared share: what a start value that leaves out placements counts against others
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
@@ -218,9 +219,10 @@ def solve_joint(
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
+    rivals = ()
     if start is None:
         obs, lost = without_lost_placements(obs)
-        obs, start, bad = best_start(obs, unknowns, sweep_sigma, T0)
+        obs, start, bad, rivals = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
     data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     state = converged(start, data, coarse(unknowns))
@@ -234,7 +236,8 @@ def solve_joint(
             state, data = settle(state, data, unknowns)
     if noise == "estimate" or lapse:
         state = converged(state, data, unknowns, LAST_STEP)
-    return finished(obs, state, data, unknowns, excluded, required)
+    found = finished(obs, state, data, unknowns, excluded, required)
+    return replace(found, warnings=rivals + found.warnings)
 
 
 def solve_again(obs, like):
@@ -320,23 +323,25 @@ def image_name(obs, row):
 
 
 def best_start(obs, unknowns, sweep_sigma, T0=None):
-    """The most promising start value, what is left of the observations with it, and in words what is not.
+    """The most promising start value: the observations left with it, itself, what is not left, and its rivals (words).
 
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
-    data, least = gather(obs, sweep_sigma=tuple(sweep_sigma)), np.inf
-    for number, state in enumerate(start_states(obs, T0)):
-        if not unknowns.axis:
-            known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
-            state = replace(state, head=pose_array(known))
-        misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
-        found = agreeing_start(obs, state, data, unknowns)
-        badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2]))
-        if number == 0 or badness < least:
-            (kept, start, bad, _), rough, least = found, np.median(misses), badness
-        if least < GOOD_START and (T0 is None or number):
+    data, tried = gather(obs, sweep_sigma=tuple(sweep_sigma)), []
+    for number, states in enumerate(start_states(obs, T0)):
+        for state in states:
+            if not unknowns.axis:
+                known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
+                state = replace(state, head=pose_array(known))
+            misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
+            found = agreeing_start(obs, state, data, unknowns)
+            badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2
+            tried.append((badness, *found[:3], np.median(misses)))
+        if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
             break
+    tried.sort(key=lambda one: one[0])
+    kept, start, bad, rough = tried[0][1:]
     miss = np.median(joint_noise.view_misses(start, gather(kept)))
     if min(rough, miss) > ROUGH_MISS:
         raise DegenerateGeometry(
@@ -349,7 +354,16 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, start, bad
+    return kept, start, bad, second_minima(obs, tried)
+
+
+def second_minima(obs, tried):
+    """In words, which start values with cameras far from the best one's explain the data nearly as well."""
+    best, *others = [state.cameras for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
+    named = [zip(obs.cameras, best, poses, strict=True) for poses in others]
+    pairs = [(name, *map(pose_transform, both)) for poses in named for name, *both in poses]
+    far = [pair for pair in pairs if geometry.transform_difference(*pair[1:])[0] > SAME_TURN]
+    return tuple(dict.fromkeys(rival_words(*pair) for pair in far))
 
 
 def left_out_shares(obs, bad):

@@ -23,7 +23,7 @@ FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
 def start_states(obs, T0=None):
-    """Start values (JointState) to choose from, made one by one.
+    """Start values (JointState) to choose from, made one by one: each with those of the cameras' other minima.
 
     From the closed form of the axis, from T0, from the stated platform, from an axis along x through the mirror; with
     cameras from scan lines at the pitch of their images, then from whole sweeps. Raises DegenerateGeometry when no
@@ -39,14 +39,15 @@ def start_states(obs, T0=None):
     for head in (h for h in heads if h is not None):
         for known in [direct, {}] if direct else [{}]:
             try:
-                state = state_of(obs, head, [
-                    known[i] if i in known else _camera(obs, i, head) for i in range(len(obs.cameras))
-                ])  # fmt: skip
+                poses = [known[i] if i in known else _camera(obs, i, head) for i in range(len(obs.cameras))]
+                first = [some[0] for some in poses]
+                others = [first[:i] + [T] + first[i + 1 :] for i, some in enumerate(poses) for T in some[1:]]
+                states = [state_of(obs, head, cameras) for cameras in (first, *others)]
             except (DegenerateGeometry, np.linalg.LinAlgError) as error:
                 reasons.append(str(error))
                 continue
             made += 1
-            yield state
+            yield states
     if not made:
         raise DegenerateGeometry("no start value for the joint estimate: " + "; ".join(dict.fromkeys(reasons)))
 
@@ -57,7 +58,7 @@ def thin(rows, count):
 
 
 def _camera(obs, camera, head=None):
-    """Pose of a camera from its views of boards and points on these.
+    """Poses of a camera, the best one first, from its views of boards and points on these.
 
     From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines at the pitch of its
     images, which needs no axis.
@@ -86,7 +87,7 @@ def _camera(obs, camera, head=None):
 
 def _axis_from_cameras(obs, poses):
     """The tilt axis from how a fixed board turns in the images of a camera that pitches, by least squares."""
-    for camera, T_camera_lrf in poses.items():
+    for camera, (T_camera_lrf, *_) in poses.items():
         turns, motions = [], []
         for placement in range(len(obs.placements)):
             mine = np.flatnonzero((obs.view_camera == camera) & (obs.view_placement == placement))

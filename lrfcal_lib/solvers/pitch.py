@@ -250,7 +250,7 @@ def estimate_pitch_errors(cameras, direction, middle):
         When a camera is not fixed to the platform.
     """
     data, models, turn, before, wanted = gather(cameras, direction, middle), {}, (np.nan, np.nan), None, None
-    poses, zeros = [pose_array(start_from_planes(obs)) for obs in cameras.values()], 0.0 * data.middle
+    poses, zeros = [pose_array(start_from_planes(obs))[0] for obs in cameras.values()], 0.0 * data.middle
     state, numbers = (np.array(poses), 0.0, zeros, zeros), data.n_numbers
     for name in MODELS:
         if name == "direction" and not {-1, 1} <= set(data.direction.tolist()):

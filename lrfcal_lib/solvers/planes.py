@@ -140,7 +140,10 @@ def check_normals(sets, camera, least=0.02):
         )
 
 
-SUBSETS = 400
+SUBSETS, MINIMAL = 400, 40
+SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
+NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
+SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 TILT_LEVER = 0.3  # metres, about half a board: turns an offset into the tilt that bends as much
@@ -149,30 +152,70 @@ INTRINSIC_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 
 
 def start_from_planes(obs):
-    """A start value of ``T_camera_source``: closed form in random subsets of the placements, least trimmed squares."""
+    """Start values of ``T_camera_source``, the best one first: a stack, mostly of one.
+
+    Minimal and closed forms in random subsets of the placements, least trimmed squares. Others than the best are minima
+    far from it that explain the placements nearly as well.
+    """
     sets = plane_sets(obs)
     check_normals(sets, obs.camera)
     triangles, p = compress(sets, 1.0), len(sets.placements)
-    (frame, flat), found = common_plane(triangles), []
+    frame, flat = common_plane(triangles)
+    lines, threes = triangles @ frame, _subsets(p, 3)
+    found = [three_planes(lines[threes[:MINIMAL]], sets.boards[threes[:MINIMAL]]).reshape(-1, 3, 4) @ frame.T]
+    every = np.arange(p)[None]
     if not flat:
-        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in _subsets(p, 3)]
+        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in (threes, every)]
     if p >= 5:
-        found += [closed_form(triangles[rows] @ frame, sets.boards[rows], False) @ frame.T for rows in _subsets(p, 5)]
-    candidates = np.concatenate(found) if found else _rotation_grid_on_planes(sets, triangles)
+        own = _subsets(p, 5), every
+        found += [closed_form(lines[rows], sets.boards[rows], False) @ frame.T for rows in own]
+    candidates = _before_boards(np.concatenate(found), sets, _centred(triangles)[1])
 
-    def trimmed(candidates):
-        """Mean square (m^2) of candidates over more placements than a closed form uses."""
+    least = max(p // 2 + 2, 7 if flat else 5)  # more placements than a closed form uses
+
+    def trimmed(candidates, count=least):
+        """Mean square (m^2) of candidates over so many placements, those they suit best."""
         residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
         squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
-        return squares[:, : max(squares.shape[1] // 2 + 2, 7 if flat else 5)].mean(axis=1)
+        return squares[:, :count].mean(axis=1)
 
     def evaluate(pose):
         return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
 
-    best = candidates[np.argsort(trimmed(candidates))[:8]]
+    order = np.argsort(trimmed(candidates))
+    best = candidates[[*order[:4], *_apart(candidates, order[:100])]]
     refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
     every = np.concatenate([refined, best])
-    return pose_transform(every[np.argmin(trimmed(every))])
+    apart = every[_apart(every, np.argsort(trimmed(every)))]
+    most = trimmed(apart, max(least, round(SEEN * p)))
+    return pose_transform(apart[most <= NEARLY**2 * most[0]])
+
+
+def _apart(poses, order):
+    """Indices of poses, the first ones in some order that are turned against all before, at most 6."""
+    found = []
+    for i in order:
+        turns = np.trace(np.swapaxes(poses[found, :, :3], -1, -2) @ poses[i, :, :3], axis1=1, axis2=2)
+        if len(found) < 6 and (turns < 1 + 2 * np.cos(SAME_TURN)).all():
+            found.append(i)
+    return found
+
+
+def rival_words(camera, best, other):
+    """That another pose of a camera explains the data nearly as well."""
+    turn, shift = geometry.transform_difference(best, other)
+    return (
+        f"a second minimum explains the data nearly as well: camera '{camera}' {np.degrees(turn):.0f} deg and "
+        f"{1000 * shift:.0f} mm from where it is handed over; record more placements that lean other ways"
+    )
+
+
+def _before_boards(poses, sets, centres):
+    """Poses that put (most of) the boards before the camera, and the range finder on the side that the camera sees."""
+    normal, point = sets.boards[..., 2], sets.boards[..., 3]
+    side = np.sum((poses[:, None, :, 3] - point) * normal, axis=-1) * -np.sum(point * normal, axis=-1) > 0
+    seen = np.mean(side & (apply_pose(poses, centres)[..., 2] > 0), axis=1)
+    return poses[(seen >= min(SEEN, seen.max())) & np.isfinite(poses).all(axis=(1, 2))]
 
 
 def common_plane(triangles):
@@ -220,11 +263,62 @@ def closed_form(triangles, boards, solid):
         found = (np.linalg.pinv(left, rcond=1e-14, hermitian=True) @ right[..., None]).reshape(p[:-1] + (3, 3))
         first, second = found[..., 0, :], found[..., 1, :]
         rotation = np.stack([first, second, np.cross(first, second)], axis=-1)
+    return _on_planes(rotation, normal, boards[..., 3], centre)
+
+
+def _on_planes(rotation, normal, point, centre):
+    """Poses with the proper rotations nearest to some matrices that put centroids on planes as well as they can."""
     u, _, vt = np.linalg.svd(rotation)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None, None]
-    rotation = np.concatenate([u[..., :2], u[..., 2:] * sign], axis=-1) @ vt  # the nearest proper rotation
+    rotation = np.concatenate([u[..., :2], u[..., 2:] * sign], axis=-1) @ vt
     moved = (rotation[..., None, :, :] @ centre[..., None])[..., 0]
-    return shifted(rotation, normal, offset - np.sum(normal * moved, axis=-1))
+    return shifted(rotation, normal, np.sum(normal * (point - moved), axis=-1))
+
+
+def three_planes(triangles, boards):
+    """The minimal solution of Vasconcelos, Barreto and Nunes (2012), ``T_camera_source`` (..., 8, 3, 4).
+
+    For stacks of three single scan lines (z = 0). That their directions lie in the boards' planes leaves three
+    dimensions to the first two columns of R; two quadrics there make these orthogonal and of one length. Each of four
+    solutions has both signs; complex ones keep their real part.
+    """
+    normal, (root, centre) = boards[..., 2], _centred(triangles)
+    along = np.linalg.svd(root[..., :2])[2][..., 0, :]
+    rows = (along[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:-1], 6)
+    null = np.linalg.svd(rows)[2][..., 3:, :]
+    first, second = null[..., :3], null[..., 3:]
+    lengths, angle = ([a @ np.swapaxes(b, -1, -2) for a, b in pairs] for pairs in (
+        ((first, first), (second, second)), ((first, second), (second, first))))
+    columns = _common_points(lengths[0] - lengths[1], angle[0] + angle[1]) @ null
+    columns = np.concatenate([columns, -columns], axis=-2)
+    one, two = columns[..., :3], columns[..., 3:]
+    rotation = np.stack([one, two, np.cross(one, two)], axis=-1)
+    rotation /= np.maximum(np.linalg.norm(one, axis=-1), 1e-12)[..., None, None]
+    return _on_planes(rotation, normal[..., None, :, :], boards[..., None, :, :, 3], centre[..., None, :, :])
+
+
+@np.errstate(all="ignore")
+def _common_points(one, two):
+    """The four points ``[x, y, 1]`` (..., 4, 3) that two conics (..., 3, 3) share; real parts of complex ones."""
+
+    def at(y):
+        """Numerator and denominator of x at y, and the resultant, which is zero where the conics meet."""
+        (a, b, c), (d, e, f) = (
+            (Q[0, 0], 2 * (Q[0, 1] * y + Q[0, 2]), Q[1, 1] * y**2 + 2 * Q[1, 2] * y + Q[2, 2])
+            for Q in (np.moveaxis(Q, (-2, -1), (0, 1))[..., None] for Q in (one, two))
+        )  # a x^2 + b x + c
+        up, down = d * c - a * f, a * e - d * b
+        return up, down, up**2 - down * (b * f - e * c)
+
+    nodes = np.arange(-2.0, 3.0)
+    resultant = at(nodes)[2] @ np.linalg.inv(np.vander(nodes)).T
+    companion = np.zeros(resultant.shape[:-1] + (4, 4))
+    companion[..., 0, :] = -resultant[..., 1:] / resultant[..., :1]
+    companion[..., [1, 2, 3], [0, 1, 2]] = 1.0
+    y = np.linalg.eigvals(np.nan_to_num(companion, posinf=0.0, neginf=0.0))  # parallel boards leave nothing
+    up, down, _ = at(y)
+    found = np.stack([(up / down).real, y.real, np.ones(y.shape)], axis=-1)
+    return np.nan_to_num(found, posinf=0.0, neginf=0.0)
 
 
 def shifted(rotation, normal, right):
@@ -236,20 +330,10 @@ def shifted(rotation, normal, right):
 
 
 def _subsets(p, size):
-    """Sets of placements to try: many minimal ones, and all together."""
+    """Sets of placements to try: all minimal ones, or many of them."""
     if comb(p, size) <= SUBSETS:
-        return np.array(list(combinations(range(p), size))), np.arange(p)[None]
-    return np.argsort(np.random.default_rng(0).random((SUBSETS, p)), axis=1)[:, :size], np.arange(p)[None]
-
-
-def _rotation_grid_on_planes(sets, triangles):
-    """Candidates for too few placements: many start rotations at once, on the planes that are there."""
-    rotations, (_, centre), normal = start_rotations(), _centred(triangles), sets.boards[:, :, 2]
-    moved = np.sum(normal * (centre @ np.swapaxes(rotations, -1, -2)), axis=-1)
-    start = shifted(rotations, normal, np.sum(normal * sets.boards[:, :, 3], axis=1) - moved)
-    found = minimise(lambda pose: plane_block(pose, triangles / 0.005, sets.boards), start, move_pose)[0]
-    ahead = (apply_pose(found, centre)[..., 2] > 0).all(axis=1)
-    return found[ahead] if ahead.any() else found
+        return np.array(list(combinations(range(p), size)))
+    return np.argsort(np.random.default_rng(0).random((SUBSETS, p)), axis=1)[:, :size]
 
 
 def start_rotations():
@@ -332,11 +416,11 @@ def estimate_with_lens(residual, obs, pose, *, method, uses, lens=9, **options):
     estimate from planes with the board poses and the model that the observations hold; points are compressed once more
     at the first solution. An error that all points of a placement have in common (a bent board, a wrong pitch; see
     :func:`plane_error`) is allowed for: without it thousands of points would overrule the pattern. The solution's
-    ``model`` holds the refined intrinsics with their covariance, ``board_poses`` the refined boards. Raises ValueError
-    without pattern corners.
+    ``model`` holds the refined intrinsics with their covariance, ``board_poses`` the refined boards. Raises
+    DegenerateGeometry without pattern corners.
     """
     if obs.pattern_points.shape[0] < 4 or not np.isfinite(obs.pattern_pixels).any():
-        raise ValueError(
+        raise DegenerateGeometry(
             f"camera '{obs.camera}': {len(obs.pattern_points)} pattern corners, a joint "
             "refinement needs a printed pattern"
         )
