@@ -100,9 +100,3 @@ def checked(save, told=None):
         told is None or told.extend(words)
 
     return save_and_look
-
-
-if __name__ == "__main__":  # the start of a kernel, see run_nbval
-    from lrfcal_lib.report import notebook
-
-    notebook.save = checked(notebook.save)

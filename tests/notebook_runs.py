@@ -51,7 +51,9 @@ def run_nbval(path, report):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
     environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem}
-    environment |= {"PYTHONSTARTUP": figure_checks.__file__}  # kernels look at the figures they save
+    tests = Path(__file__).parent
+    environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [environment.get("PYTHONPATH")])])
+    environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")  # kernels look at the figures they save
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 

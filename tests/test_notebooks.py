@@ -57,6 +57,13 @@ def test_formulas_are_formulas(path):
 
 
 @each_notebook
+def test_no_figure_is_shown_before_it_is_complete(path):
+    for cell in code_cells(read(path)):
+        shows = any("image/png" in output.get("data", {}) for output in cell.outputs)
+        assert "notebook.save(" in cell.source or not shows, cell.source
+
+
+@each_notebook
 def test_outputs_show_no_errors_and_no_machine(path):
     for cell in code_cells(read(path)):
         for output in cell.outputs:

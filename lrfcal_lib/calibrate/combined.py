@@ -69,16 +69,21 @@ def combined_outlines(joint):
             cases[placement] = case_of(joint, observations, placement)
         except DegenerateGeometry:
             continue
-    found = {placement: case.start for placement, case in cases.items()}
-    for _ in range(SCALE_ROUNDS):
+    found, measured = {placement: case.start for placement, case in cases.items()}, {}
+    for last in [False] * SCALE_ROUNDS + [True]:
         total = np.zeros(2)
-        for placement, case in cases.items():
-            found[placement], covariance = fitted(case, found[placement], scale)
+        for placement, case in list(cases.items()):
+            try:
+                found[placement], covariance = fitted(case, found[placement], scale)
+                if last:
+                    measured[placement] = _measured(case, found[placement], covariance, joint.prepared.board.edges)
+            except (DegenerateGeometry, np.linalg.LinAlgError):  # what is left open, as by single scans, has no answer
+                del cases[placement]
+                continue
             r, J = whiten(sight_block(found[placement], case, scale))
             total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
         scale = max(scale * np.sqrt(total[0] / total[1]) if total[1] > 0 else 1.0, LEAST_SCALE)
-    edges = joint.prepared.board.edges
-    return {p: _measured(case, *fitted(case, found[p], scale), edges) for p, case in cases.items()}
+    return measured
 
 
 def case_of(joint, observations, placement):
@@ -203,6 +208,8 @@ def _measured(case, state, covariance, edges):
     beams = np.bincount(case.data.beam["edge"][case.data.beam["used"]], minlength=len(edges))
     shown = [number for _, number, _, _ in case.images]
     good = np.union1d(np.flatnonzero(beams >= outline.FEWEST_CELLS), shown).astype(int)
+    if not len(good):
+        raise DegenerateGeometry("nothing shows a side")
     index = (len(covariance) - 2 * len(edges) + 2 * good[:, None] + [0, 1]).ravel()
     names = [edges[i] for i in good]
     shape, sigma = outline.sized(lines[good], case.middle[good], covariance[np.ix_(index, index)], names, edges)

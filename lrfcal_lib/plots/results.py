@@ -9,6 +9,7 @@ import numpy as np
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of
 
 BINS, LEVELS = 8, 5
+LEAST_HEIGHT = 20.0  # degrees of a map: that of a head which hardly moves would be a line
 SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
 
 
@@ -92,6 +93,8 @@ def projection_map(ax, found, index=0, name=""):
 def point_map(ax, found, index=0):
     """Standard deviation of reconstructed points over the field of view, a SigmaMap of ``uncertainty.point_sigma``."""
     _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
+    middle, height = np.mean(ax.get_ylim()), max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
+    ax.set_ylim(middle - height / 2, middle + height / 2)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
 
