@@ -110,12 +110,14 @@ def test_results_are_those_of_the_stored_tables(row):
 
 
 def test_edge_lengths_are_those_of_the_stored_tables():
-    tables = {name: golden(name, "edge_summary").set_index(["source", "variant"]) for name in WORDS}
-    text = " ".join(README.split())
+    tables = {name: golden(name, "edge_summary").set_index(["source", "variant", "ends"]) for name in WORDS}
+    text, shares = " ".join(README.split()), []
     for name, words in WORDS.items():
-        found = tables[name].loc[name, "fused"].squeeze()
+        found = tables[name].loc[name, "combined", "image"]
         shown, count = re.search(rf"([\d.]+) mm \((\d+) edges, {words}\)", text).groups()
         assert float(shown) == pytest.approx(found.mean_abs_error_mm, abs=0.06) and int(count) == found.n
+        shares.append(f"{found.within_90_percent:.0f} %")
+    assert f"{' and '.join(shares)} of them within the 90 % intervals" in text
     assert f"reports {tables['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm" in text
 
 
