@@ -43,7 +43,7 @@ def test_half_a_step_outwards_is_better_than_the_last_beam():
     by_method = stored("method_comparison").groupby("method").left_out_edge_rms_px.mean()
     assert by_method["line"] < by_method["line_last_beam"]
     lengths = stored("edge_summary").query("ends == 'scan'").set_index(["source", "variant"])
-    assert (lengths.loc["lms400_zed"].n >= 30).all()
+    assert (lengths.loc["lms400_zed"].drop("combined").n >= 30).all()  # whose ends are mostly those of images
     error = lengths.mean_abs_error_mm
     assert error["lms400_zed", "half_step"] < error["lms400_zed", "last_beam"] < error["paper", "last_beam"]
     assert error["paper", "last_beam"] == pytest.approx(8.841, abs=0.001)
