@@ -307,7 +307,7 @@ def write_pages(out, session, runs, found, seconds):
     made = jinja.get_template("report.html.jinja").render(
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         numbers=numbers, drawn=drawn, verdicts=verdicts, told=told, main=main, headline=_headline(out, main),
-        rest=[words for words in main["sentences"][1:] if not words.startswith("Expected error")] if main else [],
+        rest=[s for s in main["sentences"][1:] if not s.startswith(("Expected error", "In the image of"))] if main else [],
         picture=next((figures[n] for n in ("scene", "cloud", "clouds_of_boards", "frames") if figures.get(n)), ""),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
