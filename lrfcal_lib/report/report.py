@@ -43,6 +43,7 @@ OWN_FILES = (  # folders, files to link to, the page itself
     "figures", "tables", "parts", "calibration.json", "scene.html", "cloud.ply", "scene.ply", "scene.pcd",
     "findings.json", "index.html",
 )  # fmt: skip
+BESIDE = ("Expected error", "In the image of")  # begin sentences of a verdict that the first screen tells in numbers
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
@@ -307,7 +308,7 @@ def write_pages(out, session, runs, found, seconds):
     made = jinja.get_template("report.html.jinja").render(
         session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
         numbers=numbers, drawn=drawn, verdicts=verdicts, told=told, main=main, headline=_headline(out, main),
-        rest=[s for s in main["sentences"][1:] if not s.startswith(("Expected error", "In the image of"))] if main else [],
+        rest=[s for s in main["sentences"][1:] if not s.startswith(BESIDE)] if main else [],
         picture=next((figures[n] for n in ("scene", "cloud", "clouds_of_boards", "frames") if figures.get(n)), ""),
         files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
         provenance=_provenance(session),
