@@ -155,6 +155,7 @@ class Painter:
         """Let points (n, 3) hide what is behind them."""
 
         def some(rows, worker):
+            """A share of the points, into the depth buffers of one thread."""
             part = _single(points[rows])
             for v, cell, nearest in zip(self.views, self.cells, self.nearest, strict=True):
                 self.loops.hide(part, v.pose, v.lens, v.image.shape[1::-1], cell, nearest[worker])
@@ -169,6 +170,7 @@ class Painter:
         colors, seen, source = np.empty((n, 3), np.float32), np.empty(n, bool), np.full(n, -1, np.int32)
 
         def some(rows, _):
+            """A share of the points, seen by all images."""
             part = _single(points[rows]), _single(normals[rows])
             sums, best = np.zeros((len(part[0]), 4), np.float32), np.zeros(len(part[0]), np.float32)
             for k in views:
