@@ -46,7 +46,7 @@ class Cloud:
     pitch, bearing, range, intensity : ndarray, shape (n,)
         As measured (radians, radians, metres; NaN where no intensity was recorded).
     sigma : ndarray, shape (n,)
-        Predicted standard deviation, metres.
+        Standard deviation across the surface, metres: scatter of the readings about it; see `scenes.with_sigma`.
     removed : int
         Mixed pixels that were left out.
     """
@@ -263,11 +263,11 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
     blocks = list(blocks) if sweep.ranges.size <= 4 * BLOCK else blocks  # they are gone through twice
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
-    for points, normals, hiding, good, _ in blocks:
+    for points, normals, _, hiding, good, _ in blocks:
         painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
         some.append([part[good][::every] for part in (points, normals)])
     painter.compare_exposures(*(np.concatenate(part) for part in zip(*some, strict=True)))
-    for points, normals, _, good, rows in blocks:
+    for points, normals, scatter, _, good, rows in blocks:
         wanted = np.isfinite(sweep.ranges[rows]) if mask is None else mask[rows]
         take = good & wanted
         line, beam = np.nonzero(take)
@@ -276,14 +276,15 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
         ranges, echo = sweep.ranges[rows][take], np.full(len(line), np.nan)
         if sweep.intensities is not None:
             echo = sweep.intensities[rows][take].astype(float)
-        number, sigma = np.full(len(line), sweep.placement), np.full(len(line), lrf.sigma_range)
+        number, sigma = np.full(len(line), sweep.placement), scatter[take]
+        sigma = np.where(np.isfinite(sigma), sigma, lrf.sigma_range)
         measured = sweep.pitch[rows][line], sweep.bearings[beam], ranges, echo
         at = points[take], normals[take], colors, seen, number, source, *measured, sigma
         yield Cloud(*at, removed=int((wanted & ~good).sum()))
 
 
 class _Blocks:
-    """Points, normals, what hides others, which are no mixed pixels, and the scan lines, block by block."""
+    """Points, normals, scatter, what hides others, which are no mixed pixels, and the scan lines, block by block."""
 
     def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
         self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
@@ -305,8 +306,8 @@ class _Blocks:
             good, toward = np.isfinite(ranges) & (nearer == 0), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
             hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
             origin = geometry.lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
-            normals = grid_normals(np.where(good[..., None], points, np.nan), origin)
-            yield points[inner], normals[inner], hiding[inner], good[inner], rows
+            normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
+            yield points[inner], normals[inner], scatter[inner], hiding[inner], good[inner], rows
 
     def _pitch(self, rows):
         """Recorded pitch of every beam, shape (l, B): between scan lines the mirror turns while the head moves."""
@@ -453,10 +454,10 @@ def _thin(ranges, at, spots, lrf):
 
 
 def grid_normals(points, origins):
-    """Unit normals (l, b, 3) towards `origins` of points on a grid (l, b, 3): of the flattest window that holds them.
+    """Unit normals (l, b, 3) towards `origins` of points on a grid (l, b, 3), and the scatter (l, b) along them.
 
-    Nine windows, the point in the middle, on a side or in a corner of them, so that an edge spoils none of its sides.
-    NaN where less than a third of every window is there.
+    Of the flattest window that holds the point: nine windows, the point in the middle, on a side or in a corner of
+    them, so that an edge spoils none of its sides. NaN where less than a third of every window is there.
     """
     valid, n = np.isfinite(points).all(axis=-1), 2 * WINDOW + 1
     centre = np.nanmean(points[valid], axis=0) if valid.any() else np.zeros(3)
@@ -477,7 +478,7 @@ def grid_normals(points, origins):
         best = np.where(flatter, rough[at], best)
         normals = np.where(flatter[..., None], vectors[at][..., :, 0], normals)
     away = np.sum(normals * (points - origins), axis=-1, keepdims=True) > 0
-    return np.where(away, -normals, normals)
+    return np.where(away, -normals, normals), np.sqrt(np.where(np.isfinite(best), best, np.nan))
 
 
 COLUMNS = {  # of a PLY file, of attributes that are no single float by the attribute's own name
