@@ -45,13 +45,12 @@ def real_data():
 
 
 @pytest.fixture(scope="module")
-def browser():
+def browser(request):
     program = chromium()
     from playwright.sync_api import sync_playwright
 
-    # CI runs as root, in a container; scenes are drawn by the processor
-    options = ["--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
-               "--enable-unsafe-swiftshader"]  # fmt: skip
+    options = ["--no-sandbox", "--disable-dev-shm-usage"]  # CI runs as root, in a container
+    options += getattr(request, "param", ["--disable-gpu"])
     with sync_playwright() as playwright:
         yield (browser := playwright.chromium.launch(executable_path=program, args=options, timeout=120_000))
         browser.close()

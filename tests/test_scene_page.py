@@ -4,11 +4,13 @@ import re
 
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots import interactive
 
+BY_THE_PROCESSOR = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 def page(folder, count=2000):
     rng = np.random.default_rng(0)
@@ -35,6 +37,7 @@ def test_too_many_points_are_thinned(tmp_path, monkeypatch):
     assert page(tmp_path).stat().st_size < whole - 1500 * 16
 
 
+@pytest.mark.parametrize("browser", [BY_THE_PROCESSOR], indirect=True, ids=["webgl"])
 def test_a_browser_draws_it(tmp_path, browser):
     view = browser.new_page(viewport={"width": 900, "height": 700})
     view.set_default_timeout(280_000)
