@@ -89,14 +89,11 @@ def test_a_camera_that_sees_nothing_is_named(mount):
 
 
 @MOUNTS
-@pytest.mark.parametrize("factor", [1e-3, 0.1, 10.0, 1e3])
+@pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 10.0, 1e3])
 @pytest.mark.parametrize("kind", ["face", "view"])
 def test_contradictory_noise_is_repaired_from_the_data(mount, factor, kind):
     obs, truth, _ = draw(rng(), mount=mount)
     found = solve_joint(mis_stated(obs, kind, factor), noise="estimate")
-    if (mount, kind, factor) == ("platform", "face", 1e-3):  # known gap: it gets stuck on the way, and says so
-        assert not found.solution.converged
-        return
     level = found.noise["face_scale" if kind == "face" else "view_scale"]
     assert 0.7 < level * factor < 1.4
     assert worst(found, truth) < 4.5

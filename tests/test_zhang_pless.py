@@ -193,7 +193,7 @@ def test_single_lines_near_by_are_no_sweeps(seed):
         poses.append(RigidTransform.from_components(T.apply(centre) - turn.apply([*corners.mean(axis=0), 0.0]), turn))
     rig, rng = replace(rig, T_camera_lrf=T), np.random.default_rng(100)
     obs = camera_observations(rng, rig, poses, corners=corners, noise=1.0, sigma=(0.004, 1e-3), pattern=False)
-    halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(40)]
+    halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(15)]
     for some in (obs, *halves):
         found, right = solve_camera(some, "zhang_pless"), solve_camera(some, "zhang_pless", rig.T_camera_lrf)
         assert transform_difference(found.transform, right.transform)[0] < 1e-6
@@ -207,18 +207,6 @@ def test_any_start_value_reaches_the_best_minimum(method, source):
     for turn in Rotation.random(12, rng=rng):
         far = RigidTransform.from_components(best.translation + rng.normal(0, 0.5, 3), turn * best.rotation)
         assert transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
-
-
-@pytest.mark.parametrize("source", ["lrf", "platform"])
-@pytest.mark.parametrize("seed", range(6))
-def test_weights_never_hold_a_bad_start(seed, source):
-    """Renewed at the pose of a start that is 80 degrees off, they would call it converged at half a metre."""
-    rig, obs = camera_case(seed, noise=1.0, source=source)
-    rng = np.random.default_rng(seed)
-    bad = RigidTransform.from_components(rng.normal(0, 0.5, 3), Rotation.from_rotvec(rng.normal(0, 0.9, 3)))
-    found = [solve_camera(obs, "zhang_pless", rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False)]
-    rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in found]
-    assert rms[0] < 1.3 * rms[1]
 
 
 @pytest.mark.parametrize("seed", range(4))

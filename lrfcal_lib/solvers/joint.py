@@ -20,7 +20,7 @@ from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
-START_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 10, 10, 300
+START_STEPS, FIRST_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 60, 10, 10, 300
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 LEFT_OUT = 1000.0  # times the squared share: what a start value that leaves out placements counts against others
@@ -225,8 +225,9 @@ def solve_joint(
         obs, start, bad, rivals = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
     data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
-    state = converged(start, data, coarse(unknowns))
-    state = converged(state, data, unknowns, LAST_STEP)
+    # stated levels of the noise may be wrong by far: what takes many steps with them leads away
+    state = converged(start, data, coarse(unknowns), steps=FIRST_STEPS)
+    state = converged(state, data, unknowns, LAST_STEP, FIRST_STEPS)
     data = replace(data, lapse=lapse)
     if noise == "estimate":
         state, data = settle(state, data, unknowns)
