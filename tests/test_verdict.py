@@ -44,8 +44,9 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
     monkeypatch.setattr(verdict, "not_an_offset", lambda *arguments: None)
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
     seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
+    level = {"converged": True, "noise": {"face_scale": 1.0}}
     solution = SimpleNamespace(
-        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0
+        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0, **level
     )
     prepared = SimpleNamespace(
         session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None, cameras={}),
