@@ -69,6 +69,11 @@ def longer_lens(obs, camera=0, factor=1.03):
     return replace(obs, view_pose=pose)
 
 
+def late(obs, by=0.005):
+    """Pitch of scan lines that lags behind the motion, radians."""
+    return ALTERNATIVES["lag"].change(obs, -by)
+
+
 def knocked(obs):
     """One camera 30 mm aside from the middle of the recording on."""
     pose = obs.view_pose.copy()
@@ -111,6 +116,8 @@ FALSIFIED = {
     "noise of images stated a tenth": (changed(view_covariance=lambda c: c / 100), ("noise",)),
     "focal length of one camera 3 % too long": (longer_lens, ("misfit", "noise")),
     "camera knocked aside half-way": (knocked, ("excluded", "misfit", "model error", "noise")),
+    "pitch of scan lines 0.3 deg late": (late, ("lag",)),
+    "pitch of scan lines 0.15 deg early": (lambda obs: late(obs, -0.0025), ("lag",)),
     "three placements": (lambda obs: obs.select(obs.placements[:3]), ("placements",)),
     "one pitch only": (
         pitched(lambda p: 0.02 * p), ("pitch", "unobservable", "pitch scale", "far from stated")

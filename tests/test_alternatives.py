@@ -45,7 +45,7 @@ def test_honest_statements_are_not_doubted(mount):
 @pytest.mark.parametrize(
     ("kind", "value"),
     [("squares", 0.02), ("squares", -0.05), ("outline", 0.03), ("ranges", 0.02), ("ranges", -0.05),
-     ("bearings", 0.02)],
+     ("bearings", 0.02), ("lag", 0.003), ("lag", -0.005)],
 )  # fmt: skip
 def test_a_wrong_statement_is_named_with_its_size(mount, kind, value):
     doubts = doubtful(solved(5, lambda obs: ALTERNATIVES[kind].change(obs, value), mount=mount), ADMITTED)

@@ -83,6 +83,14 @@ ALTERNATIVES = {
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
         "check spot_exit_m and spot_divergence_rad, or leave them out",
     ),
+    "lag": Alternative(
+        lambda obs, s: replace(obs, **{
+            f"{group}_pitch": getattr(obs, f"{group}_pitch") + s * obs.direction[getattr(obs, f"{group}_placement")]
+            for group in ("face", "beam")
+        }), np.radians(0.05), np.degrees(1.0), ("late", "early"),
+        "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
+        "check the time stamps of pitch and scans, sweep slower or stop for every scan",
+    ),
 }  # fmt: skip
 
 
