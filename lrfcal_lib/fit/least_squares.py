@@ -182,7 +182,7 @@ def _step(hessian, gradient, damping, shared):
     return (step, length, promised) if shared is None else (step, np.sum(length), np.sum(promised))
 
 
-def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max_iterations=60, tolerance=1e-7):
+def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max_iterations=60, tolerance=1e-8):
     """Run the damped Gauss-Newton iteration.
 
     Parameters
@@ -199,8 +199,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         Unit of the loss in standard deviations; 'auto' takes it from the median of the residuals in every iteration.
     max_iterations : int
     tolerance : float
-        A trial has converged when the next step will be shorter than this many standard deviations of the estimate, if
-        it is to this one as this one is to the last (but not below a hundredth).
+        A trial has converged when a step is shorter than this many standard deviations of the estimate.
 
     Returns
     -------
@@ -210,7 +209,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
     blocks = _blocks(evaluate, state)
     hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
     history, converged = [cost], np.zeros(np.shape(cost), bool)
-    damping, iteration, last = np.full(np.shape(cost), 1e-7), 0, 0.0
+    damping, iteration = np.full(np.shape(cost), 1e-7), 0
     while iteration < max_iterations and not converged.all():
         iteration += 1
         step, length, promised = _step(hessian, gradient, damping, shared)
@@ -219,8 +218,7 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         before = cost if loss is None else _frozen_cost(blocks, roots, axes)
         after = _frozen_cost(tried, roots, axes)
         accepted = after <= before * (1 + 1e-12) + 1e-26
-        shorter = np.minimum(np.maximum(length / np.maximum(last, 1e-30), 1e-4), 1.0)
-        small, last = (shorter * length < tolerance**2) | (length < 1e-14 * before), length
+        small = (length < tolerance**2) | (length < 1e-14 * before)
         converged = converged | (small & np.isfinite(after) & (damping < 10.0))
         if accepted.all():
             state, blocks = trial, tried
