@@ -2,11 +2,11 @@
 
 import json
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shared import DATA
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib import __main__
@@ -15,8 +15,6 @@ from lrfcal_lib.evaluate import verdict
 from lrfcal_lib.evaluate.export import UNTRUSTED, calibrate_session
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import LrfInfo, from_json, lrf_to_json
-
-DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def lrf(model="SICK LMS400", **options):
