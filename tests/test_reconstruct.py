@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import DATA
 
 from lrfcal_lib.calibrate import reconstruct as rec
 from lrfcal_lib.calibrate.outline import as_recorded, measure_board
@@ -14,7 +15,6 @@ from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
@@ -210,7 +210,7 @@ def test_mixed_pixels_of_a_furnished_room():
     noise nor a second surface made it. In between, nobody minds whether a reading goes.
     """
     setup, lines = SETUPS["sim_lms221"](), slice(None, None, 3)
-    placement, session = placements_of(setup)[-1], open_session(ROOT / "data" / "sim_lms221")
+    placement, session = placements_of(setup)[-1], open_session(DATA / "sim_lms221")
     sweep, sigma = session.sweep(placement.number), setup.rig.beam.sigma_range
     off, pull = spots_alone(setup, placement, lines)
     gone = rec.mixed(sweep.ranges, (STEP, STEP), session.lrf)[lines] > 0
