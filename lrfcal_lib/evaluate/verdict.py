@@ -317,14 +317,8 @@ def contradicts_stated(joint):
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
-    # the spot is to be stated, and before many backgrounds of different distance
-    many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
-    told = lrf.spot_exit is not None and bool(many)
-    known = {"squares": joint.prepared.board.pattern is not None, "spot": told}
-    asked = doubtful(joint.solution, admitted, [kind for kind, there in known.items() if not there])
-    instead = not_an_offset(joint.solution)
-    if instead and (not asked or asked[0].kind == instead.kind):
-        asked, doubt = [instead], abs(offset)
+    asked, instead = _asked(joint)
+    doubt = abs(offset) if instead in asked else 0.0
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
@@ -354,6 +348,17 @@ def contradicts_stated(joint):
     for words, angle in far_from_stated(joint):
         reasons.append(Reason(NO if angle > np.pi / 2 else CARE, "far from stated", words))
     return reasons, doubt
+
+
+def _asked(joint):
+    """Statements that the data contradict (Doubts), and one that stands for a range offset, which may be of them."""
+    # the spot is to be stated, and before many backgrounds of different distance
+    many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
+    told, lrf = bool(many), joint.prepared.session.lrf
+    known = {"squares": joint.prepared.board.pattern is not None, "spot": lrf.spot_exit is not None and told}
+    asked = doubtful(joint.solution, lrf.admitted_offset, [kind for kind, there in known.items() if not there])
+    instead = not_an_offset(joint.solution)
+    return [instead] if instead and (not asked or asked[0].kind == instead.kind) else asked, instead
 
 
 def falsified(joint):
