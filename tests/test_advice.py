@@ -139,13 +139,10 @@ def test_observability_lists_what_is_known_least_first(good):
     assert 1e-4 < sigmas[0] < 0.05
 
 
-@pytest.mark.parametrize(
-    ("direction", "words"),
-    [
-        ({"left_tx": 0.9, "right_tx": 0.9, "range_offset": 1.0}, "the range offset with shift along x of all cameras"),
-        ({"left_tx": 0.9, "range_offset": 0.1}, "shift along x of camera 'left'"),
-    ],
-)
+@pytest.mark.parametrize(("direction", "words"), [
+    ({"left_tx": 0.9, "right_tx": 0.9, "range_offset": 1.0}, "the range offset with shift along x of all cameras"),
+    ({"left_tx": 0.9, "range_offset": 0.1}, "shift along x of camera 'left'"),
+])  # fmt: skip
 def test_directions_in_words(direction, words):
     names = ["offset_in_scan_plane", "range_offset", *(f"{c}_{p}" for c in ("left", "right") for p in POSE_NAMES)]
     x = [direction.get(name, 0.0) for name in names]

@@ -69,15 +69,12 @@ def test_plane_and_line_fits_recover_exact_data():
     assert rms < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments", "words"),
-    [
-        (g.fit_plane, [np.zeros((2, 3))], "plane needs three"),
-        (g.fit_plane, [np.outer(np.arange(5.0), [1, 1, 1])], "unobservable"),
-        (g.fit_line, [np.ones((4, 3))], "two distinct points"),
-        (g.lrf_to_source, [np.zeros((1, 3)), 0.0, RigidTransform.identity(), "roof"], "'platform', got 'roof'"),
-    ],
-)
+@pytest.mark.parametrize(("function", "arguments", "words"), [
+    (g.fit_plane, [np.zeros((2, 3))], "plane needs three"),
+    (g.fit_plane, [np.outer(np.arange(5.0), [1, 1, 1])], "unobservable"),
+    (g.fit_line, [np.ones((4, 3))], "two distinct points"),
+    (g.lrf_to_source, [np.zeros((1, 3)), 0.0, RigidTransform.identity(), "roof"], "'platform', got 'roof'"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused(function, arguments, words):
     with pytest.raises(ValueError, match=words):
         function(*arguments)

@@ -151,7 +151,7 @@ def seen(picture, board=SHEET, picks=()):
 
 
 # squares along the pixel grid are the hard case of the sector-based detector (and no limit on real prints)
-@pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (0.6, 0.05), (-1.2, 0.05)])
+@pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (-1.2, 0.05)])
 def test_corners_are_found_at_subpixel_level(roll, limit):
     pose = pose_of(roll)
     off = up_to_a_turn(find_pattern(render(pose)), on_board(pose, PATTERN.points()[:, :2], project))
@@ -177,16 +177,6 @@ def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
     pulled[8] += [1.0, 0.0]
     assert grid_noise(pulled, (6, 4)) > 0.1
     assert grid_noise(pixels_of(poses[:1], points=small.points())[0], (3, 3)) < 0.05
-
-
-def test_views_that_differ_most_come_first():
-    groups = np.repeat(pixels_of(view_poses(5, seed=1)), 6, axis=0)
-    views = groups + np.random.default_rng(0).normal(0, 0.1, groups.shape)
-    chosen = pattern_in_image.spread_views(views, 5)
-    assert sorted(i // 6 for i in chosen) == [0, 1, 2, 3, 4]
-    assert np.ptp(views, axis=1).prod(axis=1).argmax() == chosen[0]
-    assert sorted(pattern_in_image.spread_views(views[:3], 25)) == [0, 1, 2]
-    assert pattern_in_image.spread_views([], 25) == []
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
@@ -371,7 +361,7 @@ def noisy_edges(pose, seed, sigma=0.1):
 
 def test_corners_and_edges_together_are_better_and_know_how_much():
     chi2, alone, both = [], [], []
-    for seed in range(60):
+    for seed in range(30):
         view = far_view(0.1, seed, noisy_edges(FAR, 100 + seed))
         pose, covariance = pose_with_edges(view, SHEET, MODEL)
         chi2.append(score(pose, covariance, FAR))
@@ -405,7 +395,7 @@ def test_an_edge_that_contradicts_the_corners_is_left_out():
 # --- edges ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("roll", [0.0, 0.7, np.pi / 2, np.pi, -2.5])
+@pytest.mark.parametrize("roll", [0.0, np.pi / 2, -2.5])
 def test_edges_of_a_known_board_at_any_roll(roll):
     pose = pose_of(roll)
     view = seen(render(pose))
@@ -422,10 +412,9 @@ def test_edges_before_clutter():
     assert len(view.edges) == 4 and worst_edge(view, pose) < 0.3
 
 
-@pytest.mark.parametrize("cluttered", [False, True])
-def test_the_order_of_corners_follows_the_outline(cluttered):
-    for i, pose in enumerate(view_poses(4, seed=6)):
-        picture, exact = render(pose, background=clutter(i) if cluttered else 170.0), pixels_of([pose])[0]
+def test_the_order_of_corners_follows_the_outline():
+    for pose, background in zip(view_poses(3, seed=6), (170.0, clutter(1), clutter(2)), strict=True):
+        picture, exact = render(pose, background=background), pixels_of([pose])[0]
         for start in pattern_orders(PATTERN):
             orders = exact[start][pattern_orders(PATTERN)]
             poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
@@ -445,7 +434,7 @@ def test_line_covariance_tells_the_error_over_noise():
     pose, scores = pose_of(0.2), []
     clean, exact = render(pose, noise=0.0).astype(float), true_line("top", pose)
     start, end = (e - line_distance(e, exact) * exact[:2] for e in on_board(pose, CORNERS[[0, 1]] * 0.9))
-    for seed in range(60):
+    for seed in range(40):
         noisy = np.clip(clean + np.random.default_rng(seed).normal(0, 18, clean.shape), 0, 255)
         edge = refine_edge(np.rint(noisy).astype(np.uint8), MODEL, "top", start, end, exact[:2], 6.0)
         # what the covariance says beyond the fixed systematic part
@@ -646,7 +635,7 @@ def shown(pixels):
 
 def test_stereo_check_recovers_the_mounting_and_its_covariance_tells_the_error():
     poses, mount, chi2 = view_poses(6, seed=8), pose_of(0.02, (0.01, -0.02), (-0.12, 0.002, 0.004), (0, 0)), []
-    for seed in range(30):
+    for seed in range(16):
         first = shown(pixels_of(poses, 0.2, 2 * seed))
         second = shown(pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1))
         chi2.append(score(*survey.stereo_check(first, second, PATTERN, [MODEL, MODEL])[:2], mount))
@@ -663,7 +652,7 @@ def nearest(view, pose):
     return min([view, *view.alternatives], key=lambda v: turned(v.T_camera_board, pose))
 
 
-@pytest.mark.parametrize("roll", [0.4, 2.0, -1.5])
+@pytest.mark.parametrize("roll", [0.4, -1.5])
 def test_a_plain_triangle_is_found_in_all_its_poses_with_the_names_of_its_edges(roll):
     pose = triangle_pose(roll)
     found = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL)

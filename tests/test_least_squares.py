@@ -168,16 +168,13 @@ def test_no_placement_covariance_from_too_few_placements(data, groups):
 NOISE = np.array([[4.0, 1.8], [1.8, 1.0]])
 
 
-@pytest.mark.parametrize(
-    ("noise", "scatter", "sigma"),
-    [
-        (NOISE, None, [2, 1]),
-        (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # larger one by one: neither matrix as a whole
-        (NOISE, np.diag([16.0, 0.25]), [4, 1]),
-        (np.diag([np.inf, 1.0]), np.diag([1.0, 9.0]), [np.inf, 3]),
-        (np.diag([0.0, 1.0]), np.diag([0.0, np.nan]), [0, 1]),
-    ],
-)
+@pytest.mark.parametrize(("noise", "scatter", "sigma"), [
+    (NOISE, None, [2, 1]),
+    (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # larger one by one: neither matrix as a whole
+    (NOISE, np.diag([16.0, 0.25]), [4, 1]),
+    (np.diag([np.inf, 1.0]), np.diag([1.0, 9.0]), [np.inf, 3]),
+    (np.diag([0.0, 1.0]), np.diag([0.0, np.nan]), [0, 1]),
+])  # fmt: skip
 def test_the_larger_of_noise_and_scatter_is_trusted(data, noise, scatter, sigma):
     found = replace(fit(line_problem(*data), np.zeros(2)), covariance=noise, covariance_placements=scatter)
     np.testing.assert_allclose(found.trusted_sigma, sigma)
@@ -223,14 +220,11 @@ def test_large_residual_problem_converges_where_gauss_newton_diverges():
     assert state[0] == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "delta, words",
-    [
-        ([0, 0, 0, 0, 0, -1], "translation along z of the right frame"),
-        ([0, 1, 0, 0, 0, 0], "rotation about y of the right frame"),
-        ([0, 0, 0, 1, 1, 0], "translation along (0.71, 0.71, 0.00) of the right frame"),
-        ([1, 0, 0, 0, 1, 0], "rotation about x of the right frame with translation along y"),
-    ],
-)
+@pytest.mark.parametrize("delta, words", [
+    ([0, 0, 0, 0, 0, -1], "translation along z of the right frame"),
+    ([0, 1, 0, 0, 0, 0], "rotation about y of the right frame"),
+    ([0, 0, 0, 1, 1, 0], "translation along (0.71, 0.71, 0.00) of the right frame"),
+    ([1, 0, 0, 0, 1, 0], "rotation about x of the right frame with translation along y"),
+])  # fmt: skip
 def test_motions_in_words(delta, words):
     assert motion_words(delta, "right") == words

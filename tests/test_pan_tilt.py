@@ -14,7 +14,7 @@ import pytest
 import virtual
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.head import PanTilt, drawn_to_readings
+from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, PortError, Refused, WrongDevice
 from lrfcal_lib.drivers.rig_file import HeadSettings
 from lrfcal_lib.emulators.head import EmulatedHead, Head
@@ -309,13 +309,6 @@ def test_sweep_at_the_slowest_line(opened):
     wrong = np.abs(device.head.motor(device.clock.device(times)) - pitches)
     assert sum(measured) >= 5 and pitches[-1] == near(30, 1.0)
     assert wrong.max() < 1.0 * DEGREE  # 30 deg/s and half of the query's 60 ms
-
-
-def test_dead_reckoning_is_drawn_to_the_readings():
-    rows = [(0, 0.0, True, 0.0), (1, 1.0, False, 1.0), (2, 2.0, False, 2.0), (3, 6.0, True, 3.0), (4, 7.0, False, 7.0)]
-    drawn = [(0, 0.0, True), (1, 2.0, False), (2, 4.0, False), (3, 6.0, True), (4, 7.0, False)]
-    assert drawn_to_readings(rows) == drawn
-    assert drawn_to_readings(rows[1:2]) == [(1, 1.0, False)]
 
 
 def test_sweep_is_ended_by_a_stop(opened):

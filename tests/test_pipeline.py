@@ -39,14 +39,11 @@ def test_the_chart_of_the_axis_is_undone():
     assert max(axis_difference(axis_of(head(0)), again)) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("scale", "scatter", "wins"),
-    [
-        (1e-8, None, head(2)),
-        (1e8, None, head(1)),
-        (1e8, 1e-8 * STATED, head(1)),  # placements that agree by chance do not outweigh the stated axis
-    ],
-)
+@pytest.mark.parametrize(("scale", "scatter", "wins"), [
+    (1e-8, None, head(2)),
+    (1e8, None, head(1)),
+    (1e8, 1e-8 * STATED, head(1)),  # placements that agree by chance do not outweigh the stated axis
+])  # fmt: skip
 def test_the_better_known_axis_wins(scale, scatter, wins):
     found, covariance = pipeline.combine(estimate(head(2), scale * STATED, scatter), (head(1), STATED))
     assert apart(found, wins) < 1e-6

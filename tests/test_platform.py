@@ -142,14 +142,14 @@ def test_error_agrees_with_the_predicted_covariance(faces, monkeypatch):
     monkeypatch.setattr(platform, "SIGMA_GAP", 1e-4)
     rng = np.random.default_rng(11)
     boards, scores, errors = sweep_boards(rng, 20), [], []
-    for _ in range(30):
+    for _ in range(16):
         obs = swept(rng, boards, noise=1.0)
         found = solve_platform(obs if faces else without_faces(obs), ROUGH)
         e, covariance = chart_error(found.T_head_lrf), found.solution.covariance
         scores.append(e @ np.linalg.solve(covariance, e) / 4)
         errors.append(e / np.sqrt(np.diag(covariance)))
-    assert 0.7 < np.mean(scores) < 1.35
-    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(30)
+    assert 0.6 < np.mean(scores) < 1.5
+    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(16)
 
 
 def test_one_edge_with_a_face_serves_too():
@@ -180,15 +180,12 @@ def test_one_placement_leaves_the_axis_uncertain():
     assert found.covariance_placements is None and np.linalg.norm(found.trusted_sigma[2:]) > 0.02
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("edge_points", np.nan, "edge_points holds 3 values that are not finite, the first in row 4"),
-        ("edge_pitch", np.inf, "edge_pitch holds 1 values that are not finite, the first in row 4"),
-        ("face_points", np.nan, "face_points holds 3 values that are not finite"),
-        ("edge_number", 3, r"edge_number must be 1 or 2 \(the two perpendicular edges\), got \[1 2 3\]"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "message"), [
+    ("edge_points", np.nan, "edge_points holds 3 values that are not finite, the first in row 4"),
+    ("edge_pitch", np.inf, "edge_pitch holds 1 values that are not finite, the first in row 4"),
+    ("face_points", np.nan, "face_points holds 3 values that are not finite"),
+    ("edge_number", 3, r"edge_number must be 1 or 2 \(the two perpendicular edges\), got \[1 2 3\]"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused(field, value, message):
     obs = make(18, count=2)
     values = getattr(obs, field).copy()

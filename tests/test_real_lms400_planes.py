@@ -11,7 +11,6 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers import solve_camera
-from lrfcal_lib.solvers.pitch import estimate_pitch_errors
 
 HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])  # the authors' platform
 
@@ -31,15 +30,13 @@ def published(folder, side):
 
 
 @pytest.fixture(scope="module")
-def sweeps(real_data):
-    """Cameras, direction and middle of every sweep."""
-    parts, direction, middle, found = [], {}, {}, {}
+def cameras(real_data):
+    parts, found = [], {}
     for placement in range(1, 21):
         raw = np.load(real_data / "lms400_zed" / "raw" / f"pose_{placement:02d}.npz")
         points = polar_to_points(raw["range_m"], np.pi / 2 - np.radians(raw["bearing_deg"]))
         pitch = raw["pitch_rad"] - np.pi / 2
         parts.append((points[::50], pitch[::50], np.full(len(pitch[::50]), placement)))
-        direction[placement], middle[placement] = int(np.sign(pitch[-1] - pitch[0])), pitch[::50].mean()
     points, pitch, placement = map(np.concatenate, zip(*parts, strict=True))
     for side in ("left", "right"):
         model, poses = published(real_data / "lms400_zed", side)
@@ -50,17 +47,11 @@ def sweeps(real_data):
             plane_points=lrf_to_platform(points, pitch, HEAD),
             plane_covariance=np.tile(0.005**2 * np.eye(3), (len(points), 1, 1)),
             plane_placement=placement,
-            plane_pitch=pitch,
             placements=np.arange(1, 21),
             board_poses=np.array([pose.as_matrix() for pose in poses]),
             board_covariance=np.tile(np.diag([1e-6] * 3 + [2.5e-7] * 3), (20, 1, 1)),
         )
-    return found, direction, middle
-
-
-@pytest.fixture(scope="module")
-def cameras(sweeps):
-    return sweeps[0]
+    return found
 
 
 def test_zhang_pless_reaches_the_reference(cameras):
@@ -79,9 +70,3 @@ def test_weights_leave_the_planes_about_as_well_fitted(cameras):
         assert np.all(found.sigma_placements[3:] > 3 * found.sigma[3:])  # errors are common to a placement
 
 
-def test_the_recorded_pitch_is_off_by_direction(sweeps):
-    found = estimate_pitch_errors(*sweeps)
-    assert list(found.direction) == [1, -1] * 10
-    assert 0.15 < np.degrees(found.direction_offset) < 0.35
-    assert found.direction_offset > 3 * found.direction_sigma
-    assert found.wanted == "direction" and found.models["direction"].p_value < 1e-3

@@ -275,11 +275,6 @@ def test_nothing_is_held_back():
     events.close()
 
 
-@pytest.mark.parametrize("feedback", [True, False])
-def test_a_head_without_feedback_says_so(feedback):
-    assert {e.measured for e in events_of(make_rig(feedback=feedback), kind=Moved)} == {feedback}
-
-
 def scans(moving, noise, step=0.0):
     """Ranges of 40 scans of a wall, 361 beams, while a head moves by 20 deg or not; a person walks by."""
     rng, pitch = np.random.default_rng(5), np.linspace(-10, 10, 40) * moving

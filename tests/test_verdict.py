@@ -23,15 +23,12 @@ def lrf(model="SICK LMS400", **options):
     return LrfInfo(model, (0.9, 2.2), 0.002, 0.005, **options)
 
 
-@pytest.mark.parametrize(
-    ("stated", "admitted"),
-    [
-        ({"model": "LMS221-30206 (simulated)"}, 0.035),
-        ({"model": "LMS221-30206", "range_resolution": 0.01}, 0.05),
-        ({"model": "home-made"}, 0.025),
-        ({"model": "SICK LMS400", "systematic_error": 0.012}, 0.012),
-    ],
-)
+@pytest.mark.parametrize(("stated", "admitted"), [
+    ({"model": "LMS221-30206 (simulated)"}, 0.035),
+    ({"model": "LMS221-30206", "range_resolution": 0.01}, 0.05),
+    ({"model": "home-made"}, 0.025),
+    ({"model": "SICK LMS400", "systematic_error": 0.012}, 0.012),
+])  # fmt: skip
 def test_what_the_maker_admits_is_stated_or_known_of_the_model(stated, admitted):
     assert lrf(**stated).admitted_offset == admitted
     assert from_json(LrfInfo, json.loads(json.dumps(lrf_to_json(lrf(**stated))))).admitted_offset == admitted

@@ -209,18 +209,6 @@ def test_any_start_value_reaches_the_best_minimum(method, source):
         assert transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
 
 
-@pytest.mark.parametrize("source", ["lrf", "platform"])
-@pytest.mark.parametrize("seed", range(6))
-def test_weights_never_hold_a_bad_start(seed, source):
-    """Renewed at the pose of a start that is 80 degrees off, they would call it converged at half a metre."""
-    rig, obs = camera_case(seed, noise=1.0, source=source)
-    rng = np.random.default_rng(seed)
-    bad = RigidTransform.from_components(rng.normal(0, 0.5, 3), Rotation.from_rotvec(rng.normal(0, 0.9, 3)))
-    found = [solve_camera(obs, "zhang_pless", rig.T_camera_lrf * bad, weighted=w).transform for w in (True, False)]
-    rms = [np.sqrt(np.mean(plane_residuals_m(obs, T) ** 2)) for T in found]
-    assert rms[0] < 1.3 * rms[1]
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_three_single_lines_have_the_truth_among_eight_poses(seed):
     rig, obs = camera_case(seed)

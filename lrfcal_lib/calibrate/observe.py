@@ -112,8 +112,8 @@ def source_of(prepared, camera, placement, T_head_lrf, correct=as_recorded):
 
 def _rotation(turn, pitch):
     """From the LRF at some pitch angles to the frame that points are turned to, shape (n, 3, 3)."""
-    origin = turn(np.zeros((len(pitch), 3)), pitch)
-    return np.stack([turn(np.tile(e, (len(pitch), 1)), pitch) - origin for e in np.eye(3)], axis=-1)
+    origin, *axes = turn(np.broadcast_to(np.eye(4, 3, -1)[:, None], (4, len(pitch), 3)), pitch)
+    return np.stack(axes, axis=-1) - origin[..., None]
 
 
 def _crossings(prepared, placement, view, variant, turn, count, one_scan):
@@ -133,11 +133,11 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         if one_scan:
             rows = np.flatnonzero((found.side == side) & np.isin(found.line, both[len(both) // 2 :][:1]))
         p_lrf, pitch, n, step = found.points[rows], found.pitch[rows], len(rows), 1e-6
-        by_pitch = (turn(p_lrf, pitch + step) - turn(p_lrf, pitch - step)) / (2 * step)
-        moved = by_pitch * prepared.pitch_noise.sigma(pitch, middle)[:, None]
+        points, *beside = turn(np.stack([p_lrf] * 3), pitch + step * np.array([[0.0], [1.0], [-1.0]]))
+        moved = (beside[0] - beside[1]) / (2 * step) * prepared.pitch_noise.sigma(pitch, middle)[:, None]
         R, error = _rotation(turn, pitch), moved[:, :, None] * moved[:, None, :]  # of the recorded pitch
         yield {
-            "points": turn(p_lrf, pitch),
+            "points": points,
             "pitch": pitch,
             "covariance": R @ found.covariance[rows] @ R.swapaxes(-1, -2) + error,
             "noise": R @ found.noise[rows] @ R.swapaxes(-1, -2) + error,

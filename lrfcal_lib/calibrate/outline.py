@@ -89,12 +89,12 @@ def plane_frame(points):
 
 
 def corners_and_lengths(lines, edges):
-    """Corners where two neighbouring sides were found, and lengths between them, by edge."""
+    """Corners where two neighbouring sides were found (..., 2), and lengths between them (...), by edge."""
     pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
-    both = {after: np.stack([lines[k], lines[after]]) for k, after in pairs if k in lines and after in lines}
-    corners = {name: corners_of_lines(sides)[1] for name, sides in both.items()}
+    both = {after: np.stack([lines[k], lines[after]], axis=-2) for k, after in pairs if k in lines and after in lines}
+    corners = {name: corners_of_lines(sides)[..., 1, :] for name, sides in both.items()}
     known = [(name, after) for name, after in pairs if name in corners and after in corners]
-    return corners, {name: float(np.linalg.norm(corners[after] - corners[name])) for name, after in known}
+    return corners, {name: np.linalg.norm(corners[after] - corners[name], axis=-1) for name, after in known}
 
 
 def measure_board(face, sides, edges, each=1):
@@ -124,14 +124,17 @@ def sized(lines, middle, covariance, names, edges):
     """
 
     def outline(lines):
-        sides = dict(zip(names, lines, strict=True))
+        sides = dict(zip(names, np.moveaxis(lines, -2, 0), strict=True))
         return sides, *corners_and_lengths(sides, edges)
 
-    found = outline(lines)
-    size, steps = np.array(list(found[2].values())), 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
-    J = np.array([(list(outline(moved_lines(lines, middle, step))[2].values()) - size) / 1e-6 for step in steps])
-    sigma = np.sqrt(np.sum(J * (covariance @ J), axis=0))
-    return found, dict(zip(found[2], sigma.tolist(), strict=True))
+    sides, corners, size = outline(lines)
+    steps = 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
+    after = outline(moved_lines(lines, middle, steps))[2]
+    lengths, sigma = {name: float(value) for name, value in size.items()}, {}
+    for name, value in lengths.items():
+        J = (after[name] - value) / 1e-6
+        sigma[name] = float(np.sqrt(np.sum(J * (covariance @ J))))
+    return (sides, corners, lengths), sigma
 
 
 def _flat_line(points):
@@ -313,10 +316,10 @@ def fit_sides(rays, lines, middle, model):
 
 def moved_lines(lines, middle, step):
     """Lines shifted outwards and turned about the middle of their cells."""
-    c, s = np.cos(step[:, 1]), np.sin(step[:, 1])
-    at = np.sum(lines[:, :2] * middle, axis=1) + lines[:, 2] - step[:, 0]
-    normal = np.stack([c * lines[:, 0] - s * lines[:, 1], s * lines[:, 0] + c * lines[:, 1]], axis=1)
-    return np.column_stack([normal, at - np.sum(normal * middle, axis=1)])
+    c, s = np.cos(step[..., 1]), np.sin(step[..., 1])
+    at = np.sum(lines[:, :2] * middle, axis=1) + lines[:, 2] - step[..., 0]
+    x, y = c * lines[:, 0] - s * lines[:, 1], s * lines[:, 0] + c * lines[:, 1]
+    return np.stack([x, y, at - (x * middle[:, 0] + y * middle[:, 1])], axis=-1)
 
 
 def _by_face(pose, face, model):

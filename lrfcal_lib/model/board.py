@@ -82,10 +82,10 @@ def outline_lines(corners):
 
 
 def corners_of_lines(lines):
-    """Corners (n, 2) of a polygon from its sides (n, 3): corner i is where side i - 1 meets side i."""
+    """Corners (..., n, 2) of a polygon from its sides (..., n, 3): corner i is where side i - 1 meets side i."""
     lines = np.asarray(lines, float)
-    points = np.cross(np.roll(lines, 1, axis=0), lines)
-    return points[:, :2] / points[:, 2:]
+    points = np.cross(np.roll(lines, 1, axis=-2), lines)
+    return points[..., :2] / points[..., 2:]
 
 
 def triangle_board(ab=0.315, ac=0.380, name="triangle", pattern=None):
