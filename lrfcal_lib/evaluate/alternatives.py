@@ -197,6 +197,10 @@ def far_from_stated(joint):
             far.append(
                 (f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?", turn)
             )
+    if {"left", "right"} <= set(solution.transforms) and not far:  # their names state sides
+        left, right = (_place(solution, camera)[0] for camera in ("left", "right"))
+        words = "camera 'left' sits to the right of camera 'right': exchanged folders, or bearings of the other sense?"
+        far += [(words, 0.0)] * bool(left > right)
     return far
 
 
@@ -204,11 +208,16 @@ def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
 
 
+def _place(solution, camera):
+    """Where a camera stands in the LRF frame when the platform's pitch is zero, metres."""
+    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+
+
 def places_of_cameras(solution):
     """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it here."""
     words = []
     for camera in solution.transforms:
-        x, y, z = 1000 * (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
+        x, y, z = 1000 * _place(solution, camera)
         sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
         places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
         words.append(f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder.")
