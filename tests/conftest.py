@@ -10,7 +10,7 @@ from tempfile import mkdtemp
 
 import matplotlib
 import pytest
-from shared import FOLDER, ROOT, shared_folder, stages
+from shared import FOLDER, ROOT, chromium, shared_folder, stages
 
 matplotlib.use("Agg")
 sys.modules["rfc3987_syntax"] = None  # a grammar of internet addresses, which nbformat would load: 3 s a process
@@ -42,6 +42,18 @@ def real_data():
             pytest.fail(reason + " (a CI server must have them)")
         pytest.skip(reason)
     return folder
+
+
+@pytest.fixture(scope="module")
+def browser(request):
+    program = chromium()
+    from playwright.sync_api import sync_playwright
+
+    options = ["--no-sandbox", "--disable-dev-shm-usage"]  # CI runs as root, in a container
+    options += getattr(request, "param", ["--disable-gpu"])
+    with sync_playwright() as playwright:
+        yield (browser := playwright.chromium.launch(executable_path=program, args=options, timeout=120_000))
+        browser.close()
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,11 @@
 """What the processes of a test run share, and where things are."""
 
 import os
+import shutil
+from importlib.util import find_spec
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = ROOT / "data" / "sim_quick"
@@ -17,3 +21,14 @@ def shared_folder():
 def stages():
     """Folder for the stages that notebooks and fixtures begin with (see lrfcal_lib.session.cache)."""
     return shared_folder() / "stages"
+
+
+def chromium():
+    """The program; skips where no browser can be had, which CI must have."""
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    reasons = [] if found else ["there is no Chromium: run 'sudo apt-get install -y chromium'"]
+    if find_spec("playwright") is None:
+        reasons.append("there is no playwright: run 'pip install -r environment.txt'")
+    if reasons:
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("; ".join(reasons))
+    return found

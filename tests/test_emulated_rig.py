@@ -248,9 +248,8 @@ def test_own_placements_and_unknown_setups(tmp_path):
     assert list((tmp_path / "rig").iterdir()) == []
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         EmulatedRig("x")
-    for scale in ("0", "16"):
-        with pytest.raises(ValueError, match=f"time_scale is {scale}.0"):
-            main(["sim_quick", "--no-cameras", "--time-scale", scale])
+    with pytest.raises(ValueError, match="time_scale is 16.0"):
+        main(["sim_quick", "--no-cameras", "--time-scale", "16"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -18,15 +18,16 @@ STATED = np.radians(3.0), 0.03
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
-def judged(change, seed, mount="head"):
+def judged(change, seed, mount="head", stated=True):
     """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
     obs, truth, rig = draw(rng(seed), 16, mount=mount)
     prior = PlatformPrior(rig.T_head_lrf, *STATED)
     settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
-    solution = solve_joint(change(replace(obs, T_head_lrf=rig.T_head_lrf)), required=False, **settings)
-    cameras = {name: SimpleNamespace(guess=pose) for name, pose in rig.cameras.items()}
+    T_head_lrf, settings["prior"] = (rig.T_head_lrf, prior) if stated else (None, None)
+    solution = solve_joint(change(replace(obs, T_head_lrf=T_head_lrf)), required=False, **settings)
+    cameras = {name: SimpleNamespace(guess=pose if stated else None) for name, pose in rig.cameras.items()}
     lrf = LrfInfo("home-made", (0.9, 2.2), 0.002, 0.005)
-    session = SimpleNamespace(lrf=lrf, T_head_lrf=rig.T_head_lrf, platform_sigma=STATED, cameras=cameras)
+    session = SimpleNamespace(lrf=lrf, T_head_lrf=T_head_lrf, platform_sigma=STATED, cameras=cameras)
     prepared = SimpleNamespace(session=session, board=SimpleNamespace(pattern="a chessboard"))
     joint = SimpleNamespace(prepared=prepared, solution=solution, settings=settings)
     reasons, doubt = contradicts_stated(joint)
@@ -42,6 +43,15 @@ def test_what_is_falsified_is_named(name):
     named = {reason.kind for reason in reasons} & set(kinds)
     harmless = errors is not None and np.abs(errors / solution.solution.trusted_sigma[:16]).max() < 3.5
     assert named or (harmless and not kinds), [reason.words for reason in reasons]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("bearings mirrored", "other sense"), ("pitch reversed", "other sense"), ("cameras exchanged", "folders?")],
+)
+def test_what_is_named_where_no_platform_and_no_guess_is_stated(name, words):
+    reasons, *_ = judged(FALSIFIED[name][0], 7, "platform", stated=False)
+    assert words in "".join(reason.words for reason in reasons)
 
 
 @pytest.mark.parametrize("mount", ["head", "platform"])

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 from shared import QUICK, ROOT
-from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_report import write_notebook
 
 from lrfcal_lib.acquire import panel
@@ -107,17 +106,12 @@ def hostile(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def page():
-    require_browser()
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=120_000)
-        page = browser.new_page()
-        page.set_default_timeout(120_000)  # a busy machine takes its time
-        page.route("http*://**", lambda route: route.abort())  # nothing from the network
-        yield page
-        browser.close()
+def page(browser):
+    page = browser.new_page()
+    page.set_default_timeout(120_000)  # a busy machine takes its time
+    page.route("http*://**", lambda route: route.abort())  # nothing from the network
+    yield page
+    page.close()
 
 
 def seen(page):

@@ -179,6 +179,16 @@ def test_grid_noise_is_that_of_the_corners_not_of_lens_and_tilt():
     assert grid_noise(pixels_of(poses[:1], points=small.points())[0], (3, 3)) < 0.05
 
 
+def test_views_that_differ_most_come_first():
+    groups = np.repeat(pixels_of(view_poses(5, seed=1)), 6, axis=0)
+    views = groups + np.random.default_rng(0).normal(0, 0.1, groups.shape)
+    chosen = pattern_in_image.spread_views(views, 5)
+    assert sorted(i // 6 for i in chosen) == [0, 1, 2, 3, 4]
+    assert np.ptp(views, axis=1).prod(axis=1).argmax() == chosen[0]
+    assert sorted(pattern_in_image.spread_views(views[:3], 25)) == [0, 1, 2]
+    assert pattern_in_image.spread_views([], 25) == []
+
+
 def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
     picture = render(pose_of())
     found = find_pattern(picture[:, ::-1].copy()).reshape(4, 6, 2)

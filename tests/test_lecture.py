@@ -8,7 +8,6 @@ from notebook_runs import NOTEBOOKS, code_cells, read, solutions
 
 LECTURE = [path for path in NOTEBOOKS if path.stem[:2] in ("00", "01", "02", "03", "04", "05")]
 WITH_EXERCISES = [path for path in NOTEBOOKS if path.stem[:2] in ("02", "03", "04", "05", "06")]
-LONGEST_CELL = 12  # lines, imports not counted
 
 
 def texts(path):
@@ -49,13 +48,6 @@ def test_program_and_table_of_the_paper_have_counterparts():
     shown = next(cell for cell in by_stem["09"].cells if "Fig. 5 (a) of the paper" in cell.source)
     assert "attachment:panel.jpg" in shown.source and "panel.jpg" in shown.attachments
     assert any('"edge_table"' in cell.source for cell in code_cells(by_stem["06"]))
-
-
-@pytest.mark.parametrize("path", LECTURE, ids=lambda p: p.stem)
-def test_cells_are_short(path):
-    for cell in code_cells(read(path)):
-        lines = [line for line in cell.source.strip().splitlines() if not line.startswith(("import ", "from "))]
-        assert len(lines) <= LONGEST_CELL, f"{len(lines)} lines: {lines[0]}"
 
 
 @pytest.mark.parametrize("path", WITH_EXERCISES, ids=lambda p: p.stem)

@@ -7,7 +7,7 @@ import nbformat
 import pytest
 from notebook_runs import NOTEBOOKS, check_tables, code_cells, read, run_nbval
 
-LONGEST_CELL, LONGEST_FUNCTION = 15, 10
+LONGEST_FUNCTION = 10  # lines
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
@@ -33,7 +33,7 @@ def test_begins_with_title_and_thesis(path):
 def test_cells_are_short_and_plain(path):
     for cell in code_cells(read(path)):
         lines = [line for line in cell.source.splitlines() if line and not line.startswith(("import ", "from "))]
-        assert len(lines) <= LONGEST_CELL, f"{len(lines)} lines: {lines[0]}"
+        assert len(lines) <= (12 if path.stem < "06" else 15), f"{len(lines)} lines: {lines[0]}"  # 00 to 05: a lecture
         assert not any(line.rstrip().endswith(";") for line in lines), "nbval runs cells so that ';' hides nothing"
         for node in ast.walk(ast.parse(cell.source)):
             assert not isinstance(node, ast.ClassDef | ast.Try), f"belongs in lrfcal_lib, with a test: {lines[0]}"

@@ -9,30 +9,17 @@ import subprocess
 import sys
 import time
 import urllib.request
-from importlib.util import find_spec
 from pathlib import Path
 
 import nbformat
 import pytest
+from shared import chromium
 
 NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-OPTIONS = ["--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"]  # CI runs as root, in a container
 # dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
 QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
 START_S, ACTION_S = 90, 120  # guards against hanging
 PLACEMENTS = 3
-
-
-def require_browser():
-    """Skip where no browser can be had; CI must have one."""
-    reasons = []
-    if CHROMIUM is None:
-        reasons.append("there is no Chromium: run 'sudo apt-get install -y chromium'")
-    if find_spec("playwright") is None:
-        reasons.append("there is no playwright: run 'pip install -r environment.txt'")
-    if reasons:
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)("; ".join(reasons))
 
 
 def panel_only(folder):
@@ -49,7 +36,6 @@ def panel_only(folder):
 @pytest.fixture
 def lab(tmp_path):
     """Address of a JupyterLab with the panel's notebook, its token included."""
-    require_browser()
     work, log, token = tmp_path / "work", tmp_path / "log", secrets.token_hex(16)
     work.mkdir()
     panel_only(work)
@@ -87,16 +73,12 @@ def lab(tmp_path):
 
 
 @pytest.fixture
-def page(lab):
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-        page = browser.new_page(viewport={"width": 1400, "height": 1150})
-        page.set_default_timeout(1000 * ACTION_S)
-        page.goto(lab)
-        yield page
-        browser.close()
+def page(browser, lab):
+    page = browser.new_page(viewport={"width": 1400, "height": 1150})
+    page.set_default_timeout(1000 * ACTION_S)
+    page.goto(lab)
+    yield page
+    page.close()
 
 
 def run_all(page):
@@ -151,7 +133,7 @@ def test_buttons_record_and_calibrate(page):
 
 @pytest.mark.parametrize(("ci", "error"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
 def test_without_a_browser_only_ci_fails(monkeypatch, ci, error):
-    monkeypatch.setattr(sys.modules[__name__], "CHROMIUM", None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setenv("CI", ci)
     with pytest.raises(error, match="there is no Chromium: run 'sudo apt-get install -y chromium'"):
-        require_browser()
+        chromium()

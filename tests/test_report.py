@@ -18,7 +18,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from shared import ROOT
-from test_panel_browser import CHROMIUM, OPTIONS, require_browser
 from test_session import wall, write
 
 from lrfcal_lib.report import notebook, report
@@ -134,16 +133,6 @@ OVER = """() => {
     }
     return over;
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    require_browser()
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        yield (browser := playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=120_000))
-        browser.close()
 
 
 @pytest.fixture(scope="module")

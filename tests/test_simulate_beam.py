@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.lms2xx_codec import REASONS
-from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, measured, scan, spot_pattern
+from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, measured, scan
 from lrfcal_lib.simulate.scene import Thing, World, plain, rectangle
 
 HEAD = RigidTransform.identity()
@@ -75,13 +75,6 @@ def test_echo_takes_the_first_that_is_strong_enough():
     reading, total = echo(beam, distance, energy)
     np.testing.assert_allclose(reading, [1.375, 4.1, np.nan, np.nan, 3.0])
     np.testing.assert_allclose(total, [0.9, 1.1, 0.1, 0.0, 2.25])
-
-
-def test_the_spot_has_the_moments_of_a_disc():
-    disc = spot_pattern(4)
-    assert len(disc) == LMS221.rays == 61
-    np.testing.assert_allclose(disc.mean(axis=0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(disc.T @ disc / len(disc), np.eye(2) / 4, atol=0.01)
 
 
 @pytest.mark.parametrize("unit", [0.001, 0.01])

@@ -193,7 +193,7 @@ def test_single_lines_near_by_are_no_sweeps(seed):
         poses.append(RigidTransform.from_components(T.apply(centre) - turn.apply([*corners.mean(axis=0), 0.0]), turn))
     rig, rng = replace(rig, T_camera_lrf=T), np.random.default_rng(100)
     obs = camera_observations(rng, rig, poses, corners=corners, noise=1.0, sigma=(0.004, 1e-3), pattern=False)
-    halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(40)]
+    halves = [obs.select(np.sort(rng.permutation(36)[:18]) + 1) for _ in range(15)]
     for some in (obs, *halves):
         found, right = solve_camera(some, "zhang_pless"), solve_camera(some, "zhang_pless", rig.T_camera_lrf)
         assert transform_difference(found.transform, right.transform)[0] < 1e-6

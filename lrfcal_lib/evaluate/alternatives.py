@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import eliminate, whiten
 from lrfcal_lib.fit.residuals import gather, named_blocks
-from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
+from lrfcal_lib.solvers.joint import solve_joint
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
-HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset
+HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset,
+LEAST_INSTEAD = 0.015  # and how wrong they have to be: less is hardly told from an offset, and makers are better
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
 ALIKE = 0.15  # log odds; sides are expected to deviate no more than this while statements are weighed
 LEVER = 0.2  # metres, weighs turns against shifts
 LARGER = ("larger", "smaller")
+BETTER = 3.0  # times less scatter of ranges with the other sense
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
 
 
@@ -168,16 +173,33 @@ def not_an_offset(solution):
     if "range_offset" in names:
         square = (offset / solution.solution.trusted_sigma[names.index("range_offset")]) ** 2
         best = weigh(solution, HELD)[0] if square > ASKED**2 else None
-        if best and best.kind == "bearings" and best.ratio > max(square / AS_GOOD, INSTEAD**2):
+        asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and abs(best.value) > LEAST_INSTEAD
+        if asked and best.kind == "bearings":
             return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
     return None
+
+
+def other_sense(joint):
+    """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way round; else ''.
+
+    Everything is estimated again. A pitch of the other sense is the same but for a half turn of the range finder. A
+    camera on the base contradicts either; without one a mirrored rig fits as well, see :func:`far_from_stated`.
+    """
+    obs, level = joint.solution.observations, joint.solution.noise["face_scale"]
+    turned = replace(obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing)
+    with suppress(DegenerateGeometry):
+        again = solve_joint(turned, required=False, **joint.settings)
+        better = level / again.noise["face_scale"]
+        if again.converged and not again.unobservable and better > (BETTER if joint.solution.converged else 1.0):
+            return f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} times as well then"
+    return ""
 
 
 def far_from_stated(joint):
     """What lies far from where session.json puts it (JointCalibration): list of words and by what angle (radians).
 
     A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of the other sense turns
-    the axis about: only the statement of the platform, or a camera's guess, can tell.
+    the axis about: only the statement of the platform, a camera's guess, or its name can tell.
     """
     session, solution, far = joint.prepared.session, joint.solution, []
     why = "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras look like this"
@@ -197,27 +219,28 @@ def far_from_stated(joint):
             far.append(
                 (f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?", turn)
             )
-    if {"left", "right"} <= set(solution.transforms) and not far:  # their names state sides
-        left, right = (_place(solution, camera)[0] for camera in ("left", "right"))
-        words = "camera 'left' sits to the right of camera 'right': exchanged folders, or bearings of the other sense?"
-        far += [(words, 0.0)] * bool(left > right)
+    sides = {camera: _seat(solution, camera)[0] for camera in solution.transforms if not far}
+    for left, right in permutations(sides, 2):
+        if "left" in left.lower() and "right" in right.lower() and sides[left] > sides[right]:
+            off = 1000 * (sides[left] - sides[right])
+            far.append((f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': exchanged folders?", 0.0))
     return far
+
+
+def _seat(solution, camera):
+    """Where a camera sits in the frame of the range finder, metres."""
+    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
 
 
 def _apart(angle, distance):
     return f"{np.degrees(angle):.1f} deg and {1000 * distance:.0f} mm"
 
 
-def _place(solution, camera):
-    """Where a camera stands in the LRF frame when the platform's pitch is zero, metres."""
-    return (solution.camera_at(camera, 0.0) * solution.T_head_lrf).inv().translation
-
-
 def places_of_cameras(solution):
     """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it here."""
     words = []
     for camera in solution.transforms:
-        x, y, z = 1000 * _place(solution, camera)
+        x, y, z = 1000 * _seat(solution, camera)
         sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
         places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
         words.append(f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder.")

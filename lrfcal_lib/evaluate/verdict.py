@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import largest_range
+from lrfcal_lib.evaluate import alternatives
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
 from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
@@ -72,7 +73,7 @@ class Reason:
     ----------
     answer : {'with care', 'no'}
     kind : str
-        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', of
+        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', 'sense', of
         :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
         'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
         'model error', 'noise', 'warning', 'error'.
@@ -310,6 +311,9 @@ def contradicts_stated(joint):
     What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
     """
     solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
+    hopeless = not joint.solution.converged or joint.solution.noise["face_scale"] > ABSURD
+    if hopeless and (words := alternatives.other_sense(joint)):  # what else is found wrong comes from that
+        return [Reason(NO, "sense", words)], doubt
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
