@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-QUICK = ROOT / "data" / "sim_quick"
+DATA = ROOT / "data"
+QUICK = DATA / "sim_quick"
 FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
 STRINGS = int(os.environ.get("LRFCAL_FUZZ", 20_000))  # random byte strings for each parser; a million in make fuzz
 

@@ -1,7 +1,6 @@
 """Boards that bend: synthetic scans of sheets whose shape is known, then recordings."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import binom
+from shared import DATA
 
 from lrfcal_lib.evaluate.diagnosis import bend_words, bends_table, board_maps
 from lrfcal_lib.model.board import Board, Chessboard
@@ -25,7 +25,6 @@ SIZE = 0.8
 BOARD = Board("square", ("a", "b", "c", "d"), SIZE * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),
               Chessboard(5, 5, 0.08, (0.24, 0.24)))  # fmt: skip
 MODEL = CameraModel(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def a_face(rng, n=4000, bend=(0.0, 0.0, 0.0), noise=0.004, level=0.0, waves=0.0):

@@ -371,7 +371,7 @@ def noisy_edges(pose, seed, sigma=0.1):
 
 def test_corners_and_edges_together_are_better_and_know_how_much():
     chi2, alone, both = [], [], []
-    for seed in range(30):
+    for seed in range(60):
         view = far_view(0.1, seed, noisy_edges(FAR, 100 + seed))
         pose, covariance = pose_with_edges(view, SHEET, MODEL)
         chi2.append(score(pose, covariance, FAR))

@@ -16,7 +16,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     transform_difference,
 )
-from lrfcal_lib.solvers.joint import solve_joint, total_cost
+from lrfcal_lib.solvers.joint import solve_joint
 
 SAME = 3e-4  # rad and m: a hundredth of the standard deviations, what steps of the solver leave
 PLAIN = ("range_offset", "edge_log_odds", "edge_log_softness")
@@ -113,8 +113,7 @@ def test_the_stated_platform_only_sets_the_gauge(mount):
     for name, T in found.transforms.items():
         expected = T if mount == "head" else T * change.inv()
         assert apart(other.transforms[name], expected) < SAME
-    assert np.isclose(total_cost(found.state, found.data, found.unknowns),
-                      total_cost(other.state, other.data, other.unknowns), rtol=1e-6)  # fmt: skip
+    assert np.isclose(found.solution.cost_history[-1], other.solution.cost_history[-1], rtol=1e-6)
 
 
 def test_order_of_placements_and_rows_does_not_matter():
@@ -172,7 +171,7 @@ def test_pitch_errors_of_sweeps_are_recovered():
     assert np.std(sweeps[:, 0] - off - common) < 0.3 * np.std(off)
     assert np.corrcoef(sweeps[:, 1], stretch)[0, 1] > 0.9
     assert np.abs(scores(found, truth)[:4]).max() < 4.5
-    costs = [total_cost(s.state, s.data, s.unknowns) for s in (found, plain)]
+    costs = [s.solution.cost_history[-1] for s in (found, plain)]
     assert costs[1] > 1.2 * costs[0]
 
 

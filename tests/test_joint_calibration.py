@@ -1,12 +1,12 @@
 """The joint calibration of a session: which unknowns it takes, what it hands over, and boards in the coloured cloud."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from joint_draws import draw, square_per_number
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import QUICK
 
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
@@ -17,8 +17,6 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
-
-QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 
 
 @pytest.fixture(scope="module")

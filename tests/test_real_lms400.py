@@ -1,6 +1,7 @@
 """The whole chain on other people's recordings (an LMS400 on a pitching stage, a ZED camera on the base)."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,29 @@ def test_the_cloud_is_coloured(lms400):
     cloud = pipeline.color_cloud(lms400)
     assert cloud.seen.mean() > 0.9
     assert cloud.colors[cloud.seen].std() > 30  # the pattern shows
+
+
+def test_borders_of_the_chessboard_in_the_cloud_lie_on_the_known_grid(lms400):
+    """Half within 1.5 mm of the grid as the estimate has the board, nine of ten within 3 mm.
+
+    A border is where the grey of the points within 15 mm of a side of a square is split best.
+    """
+    ready, pattern, off = lms400.prepared, lms400.prepared.board.pattern, []
+    scans = {p: ready.scans[p] for p in (1, 6, 11, 16)}
+    cloud = pipeline.color_cloud(replace(lms400, prepared=replace(ready, scans=scans)), "joint")
+    for placement in scans:
+        part = cloud.rows((cloud.placement == placement) & cloud.seen)
+        x = lms400.joint.solution.boards[placement].inv().apply(part.points)[:, :2] - pattern.origin
+        at, grey, moves = x / pattern.square, part.colors.mean(axis=1), np.linspace(-0.012, 0.012, 49)
+        grey = np.clip(grey, *np.quantile(grey, [0.1, 0.9]))
+        for axis, count in enumerate((pattern.columns, pattern.rows)):
+            for line, square in np.ndindex(count, (pattern.rows, pattern.columns)[axis] - 1):
+                away = x[:, axis] - line * pattern.square
+                near = (np.abs(away) < 0.015) & (np.abs(at[:, 1 - axis] - square - 0.5) < 0.4)
+                sides = np.sign(away[near] - moves[:, None])
+                off.append(moves[np.argmax(np.abs(sides @ (grey[near] - np.median(grey[near]))))])
+    off = 1000 * np.abs(off)
+    assert len(off) > 300 and np.median(off) < 1.5 and np.mean(off < 3) > 0.9
 
 
 def test_calibration_file_holds_what_a_user_needs(lms400, tmp_path):

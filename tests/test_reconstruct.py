@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import DATA
 
 from lrfcal_lib.calibrate import reconstruct as rec
 from lrfcal_lib.calibrate.outline import as_recorded, measure_board
@@ -14,8 +15,12 @@ from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.session.read import Sweep
+from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
+from lrfcal_lib.simulate import beam
+from lrfcal_lib.simulate.record import placements_of, stops_of, world_of
+from lrfcal_lib.simulate.rig import SETUPS
+from lrfcal_lib.simulate.scene import World
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
 WIDE = CameraModel(64, 48, 22.0, 22.0, 31.5, 23.5, np.array([-0.25, 0.02, 0.0, 0.0, 0.0]))  # 110 deg, folds
@@ -173,6 +178,46 @@ def test_mixed_pixels_go_and_sound_points_stay():
     assert np.abs((noisy.ranges - gone)[flagged] - 1.8).mean() < 0.1  # they hide from about where the nearer one is
     cloud = whole(noisy)
     assert cloud.removed == (gone > 0).sum() and len(cloud.points) + cloud.removed == noisy.ranges.size
+
+
+def spots_alone(setup, placement, lines):
+    """How far ideal readings (l, b) of a room are from any place their spot meets, and from one thing's reading alone.
+
+    The second is how far the other things in the spot pull the reading, at least. Metres, NaN where nothing came back.
+    """
+    spots, hits, world, plain = [], [], world_of(setup, placement.T_platform_board), beam.echo
+    pitch = stops_of(setup, placement)[1].true[lines]
+    bearings, pitch = np.broadcast_arrays(setup.rig.beam.bearings(), pitch[:, None])
+    world.cast = lambda *rays: hits.append(World.cast(world, *rays)) or hits[-1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(beam, "echo", lambda *spot: spots.append(spot[1:]) or plain(*spot))
+        ideal = beam.ideal_readings(setup.rig.beam, world, bearings.ravel(), pitch.ravel(), setup.rig.T_head_lrf)[0]
+    (distance, energy), thing = spots[0], hits[0].thing.reshape(spots[0][0].shape)
+    energy, distance = np.where(np.isfinite(distance), energy, 0.0), np.where(np.isfinite(distance), distance, np.inf)
+    off, pull, things = np.abs(distance - ideal[:, None]).min(axis=1), np.full(len(ideal), np.inf), np.unique(thing)
+    for each in things[things >= 0]:
+        weight = energy * (thing == each)
+        some = np.flatnonzero(weight.any(axis=1))
+        alone = np.average(np.where(weight[some] > 0, distance[some], 0.0), axis=1, weights=weight[some])
+        pull[some] = np.fmin(pull[some], np.abs(alone - ideal[some]))
+    return off.reshape(bearings.shape), pull.reshape(bearings.shape)
+
+
+def test_mixed_pixels_of_a_furnished_room():
+    """A reading is mixed if it hangs more than 5 sigma off every place its spot meets: a point where nothing is.
+
+    It is good if it is within one sigma of such a place and of what one of the things would have read alone: neither
+    noise nor a second surface made it. In between, nobody minds whether a reading goes.
+    """
+    setup, lines = SETUPS["sim_lms221"](), slice(None, None, 3)
+    placement, session = placements_of(setup)[-1], open_session(DATA / "sim_lms221")
+    sweep, sigma = session.sweep(placement.number), setup.rig.beam.sigma_range
+    off, pull = spots_alone(setup, placement, lines)
+    gone = rec.mixed(sweep.ranges, (STEP, STEP), session.lrf)[lines] > 0
+    there = np.isfinite(sweep.ranges[lines])
+    bad, good = there & (off > 5 * sigma), there & (off < sigma) & (pull < sigma)
+    assert bad.sum() > 800 and good.sum() > 25_000
+    assert gone[bad].mean() > 0.92 and gone[good].mean() < 0.012
 
 
 def test_a_plain_wall_loses_next_to_nothing_and_a_pinpoint_sensor_nothing():

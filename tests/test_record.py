@@ -10,12 +10,12 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, picture, rig_data, telegram
+from shared import QUICK
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.acquire import record
@@ -29,8 +29,6 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder, finish
-
-QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
 
 
 def write(rig, path, **options):

@@ -5,9 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
-QUICK = Path(__file__).resolve().parents[1] / "data" / "sim_quick"
+from shared import QUICK
+
 CALIBRATE = """
 import sys
 if sys.argv[2] == "before":  # libraries that are there already have counted the threads that they are to use

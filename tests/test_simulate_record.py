@@ -5,11 +5,11 @@ import hashlib
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from shared import DATA, QUICK
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.emulators.world import scaled
@@ -24,8 +24,6 @@ from lrfcal_lib.simulate.beam import LMS221
 from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
 from lrfcal_lib.simulate.scene import Exposure, Imager, World
 
-DATA = Path(__file__).resolve().parents[1] / "data"
-QUICK = DATA / "sim_quick"
 FULL = sim_quick()
 
 

@@ -4,13 +4,11 @@ import json
 from types import SimpleNamespace
 
 import pytest
+from shared import QUICK, ROOT
 
 from lrfcal_lib.evaluate import tables
-from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
-
-QUICK = ROOT / "data" / "sim_quick"
 
 
 def test_a_recording_has_no_truth(tmp_path):

@@ -2,11 +2,11 @@
 
 import json
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shared import DATA
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib import __main__
@@ -15,8 +15,6 @@ from lrfcal_lib.evaluate import verdict
 from lrfcal_lib.evaluate.export import UNTRUSTED, calibrate_session
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import LrfInfo, from_json, lrf_to_json
-
-DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def lrf(model="SICK LMS400", **options):
@@ -44,8 +42,9 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
     monkeypatch.setattr(verdict, "not_an_offset", lambda *arguments: None)
     inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
     seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
+    level = {"converged": True, "noise": {"face_scale": 1.0}}
     solution = SimpleNamespace(
-        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0
+        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0, **level
     )
     prepared = SimpleNamespace(
         session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None, cameras={}),

@@ -6,6 +6,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ class Cloud:
     pitch, bearing, range, intensity : ndarray, shape (n,)
         As measured (radians, radians, metres; NaN where no intensity was recorded).
     sigma : ndarray, shape (n,)
-        Predicted standard deviation, metres.
+        Standard deviation across the surface, metres: scatter of the readings about it; see `scenes.with_sigma`.
     removed : int
         Mixed pixels that were left out.
     """
@@ -262,11 +263,11 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
     blocks = list(blocks) if sweep.ranges.size <= 4 * BLOCK else blocks  # they are gone through twice
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
-    for points, normals, hiding, good, _ in blocks:
+    for points, normals, _, hiding, good, _ in blocks:
         painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
         some.append([part[good][::every] for part in (points, normals)])
     painter.compare_exposures(*(np.concatenate(part) for part in zip(*some, strict=True)))
-    for points, normals, _, good, rows in blocks:
+    for points, normals, scatter, _, good, rows in blocks:
         wanted = np.isfinite(sweep.ranges[rows]) if mask is None else mask[rows]
         take = good & wanted
         line, beam = np.nonzero(take)
@@ -275,14 +276,15 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
         ranges, echo = sweep.ranges[rows][take], np.full(len(line), np.nan)
         if sweep.intensities is not None:
             echo = sweep.intensities[rows][take].astype(float)
-        number, sigma = np.full(len(line), sweep.placement), np.full(len(line), lrf.sigma_range)
+        number, sigma = np.full(len(line), sweep.placement), scatter[take]
+        sigma = np.where(np.isfinite(sigma), sigma, lrf.sigma_range)
         measured = sweep.pitch[rows][line], sweep.bearings[beam], ranges, echo
         at = points[take], normals[take], colors, seen, number, source, *measured, sigma
         yield Cloud(*at, removed=int((wanted & ~good).sum()))
 
 
 class _Blocks:
-    """Points, normals, what hides others, which are no mixed pixels, and the scan lines, block by block."""
+    """Points, normals, scatter, what hides others, which are no mixed pixels, and the scan lines, block by block."""
 
     def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
         self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
@@ -304,8 +306,8 @@ class _Blocks:
             good, toward = np.isfinite(ranges) & (nearer == 0), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
             hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
             origin = geometry.lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
-            normals = grid_normals(np.where(good[..., None], points, np.nan), origin)
-            yield points[inner], normals[inner], hiding[inner], good[inner], rows
+            normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
+            yield points[inner], normals[inner], scatter[inner], hiding[inner], good[inner], rows
 
     def _pitch(self, rows):
         """Recorded pitch of every beam, shape (l, B): between scan lines the mirror turns while the head moves."""
@@ -323,10 +325,11 @@ class _Blocks:
 def mixed(ranges, steps, lrf):
     """How far behind the nearer of two surfaces readings hang that mix them; 0 for sound ones.
 
-    A spot that meets two surfaces within one pulse reads between them: a ramp as wide as the spot joins them. A reading
-    is asked about where, half a spot away on either side, one is nearer and one farther, or both are farther (something
-    narrower than the spot). It is sound if it lies on a plane (straight in inverse range) about as wide as the spot
-    both ways, in the middle, on a side or in a corner of it; or on a narrow long one that does not rise like a ramp.
+    A spot that meets two surfaces within one pulse reads between them. A reading is asked about where, half a spot or
+    a spot away, both sides are at other ranges, one of them within a pulse. It is sound if it lies on a plane (straight
+    in inverse range) about as wide as the spot both ways, in the middle, on a side or in a corner of it; or on a narrow
+    long one that does not rise like a ramp. Readings a little before the one plane on both sides of them are not: what
+    is narrower than the spot. Then planes are fitted without all these: readings that lie on one are sound after all.
 
     Parameters
     ----------
@@ -337,29 +340,27 @@ def mixed(ranges, steps, lrf):
     lrf : LrfInfo
         With `spot_exit` and `spot_divergence`.
     """
-    r, far_off = np.where(np.isfinite(ranges), ranges, 1.0), 3 * lrf.sigma_range
+    r, off = np.where(np.isfinite(ranges), ranges, 1.0), 3 * lrf.sigma_range
     spots = [(lrf.spot_exit / r + lrf.spot_divergence) / s if s > 0 else 1e-9 * r for s in steps]  # in samples
-    ways, place, size = _samples(spots, 0.5, 1), np.indices(r.shape), np.array(r.shape)[:, None, None]
-    asked, nearer = np.zeros(r.shape, bool), np.zeros(r.shape)
-    for a, b in DIRECTIONS:
-        sides = [place + side * np.stack([a * ways[0], b * ways[1]]) for side in (1, -1)]
+    place, size = np.indices(r.shape), np.array(r.shape)[:, None, None]
+    asked, dent, nearer = np.zeros(r.shape, bool), np.zeros(r.shape, bool), np.zeros(r.shape)
+    for share, (a, b) in product((0.5, 1.0), DIRECTIONS):
+        way = np.stack([sign * samples for sign, samples in zip((a, b), _samples(spots, share, 1), strict=True)])
+        sides = [place + way, place - way]
+        there = [ranges[tuple(np.clip(at, 0, size - 1))] - ranges for at in sides]
         out = [((at < 0) | (at >= size)).any(axis=0) for at in sides]
-        there = [ranges[tuple(np.clip(at, 0, size - 1))] for at in sides]
-        away = [np.where(o, np.nan, value) - ranges for o, value in zip(out, there, strict=True)]
-        low, high = np.fmin(*away), np.fmax(*away)  # NaN only where both sides show nothing
-        between = (low < -far_off) & (high > far_off) & (high - low < PULSE + 4 * far_off)
-        asked |= between | ((low > far_off) & (low < PULSE))
-        nearer = np.where(between, np.maximum(nearer, -low), nearer)
-    at, wide, long = np.nonzero(asked), _samples(spots, 0.375, 1), _samples(spots, 1.0, 2)
-    least = np.full(len(at[0]), np.inf)
-    for half, narrow in ((wide, None), ((long[0], wide[1].clip(max=1)), 1), ((wide[0].clip(max=1), long[1]), 0)):
-        for h in sorted(set(zip(half[0][at].tolist(), half[1][at].tolist(), strict=True))):
-            mine = (half[0][at] == h[0]) & (half[1][at] == h[1])
-            own = tuple(index[mine] for index in at)
-            rise = None if narrow is None else (narrow, 4 * lrf.sigma_range / spots[narrow][own])
-            least[mine] = np.minimum(least[mine], _off_planes(ranges, own, h, 1.3 * lrf.sigma_range, rise))
-    found = np.zeros(r.shape)
-    found[at] = np.where(least > SIGMAS * lrf.sigma_range, np.maximum(nearer[at], 1e-6), 0.0)
+        away = np.where(np.array(out) | np.isnan(there), np.inf, there)
+        least, most = np.abs(away).min(axis=0), np.min(np.where(away > -PULSE, away, 0.0), axis=0)
+        asked |= (least > off) & (least < PULSE)
+        dent |= (share == 1.0) & (away.min(axis=0) > 2 * lrf.sigma_range) & (least < PULSE)
+        nearer = np.maximum(nearer, -most)
+    odd, at = np.zeros(r.shape, bool), np.nonzero(asked)
+    odd[at] = ~_on_surface(ranges, at, spots, lrf)
+    at = np.nonzero(dent)
+    odd[at] |= _thin(ranges, at, spots, lrf)
+    at, found = np.nonzero(odd), np.zeros(r.shape)
+    sound = _on_surface(np.where(odd, np.nan, ranges), at, spots, lrf, ranges, 0.5)
+    found[at] = np.where(sound, 0.0, np.maximum(nearer[at], 1e-6))
     return found
 
 
@@ -368,37 +369,95 @@ def _samples(spots, share, fewest):
     return [np.where(s > 1e-6, np.ceil(share * s).clip(fewest, 2 * WINDOW), 0).astype(int) for s in spots]
 
 
-def _off_planes(ranges, at, half, rough, rise):
-    """Least distance (metres) of readings at (line, beam) from planes through windows that hold them, inf if none fits.
+def _groups(at, *numbers):
+    """Each combination of numbers (l, b) that occurs at places, and which of the places have it."""
+    values = np.stack([number[at] for number in numbers], axis=-1)
+    for each in np.unique(values, axis=0):
+        yield each.tolist(), (values == each).all(axis=1)
 
-    Windows reach `half` samples about nine places. A plane fits where its residuals are not `rough`, and where it does
-    not rise by more than ``rise[1]`` metres a sample in direction ``rise[0]``.
+
+def _on_surface(ranges, at, spots, lrf, readings=None, share=0.6):
+    """Which `readings` (those of `ranges` unless given) at (line, beam) lie on a plane of `ranges` about them."""
+    wide, long = _samples(spots, 0.375, 1), _samples(spots, 1.0, 2)
+    sound, readings = np.zeros(len(at[0]), bool), ranges if readings is None else readings
+    for half, narrow in ((wide, None), ((long[0], wide[1].clip(max=1)), 1), ((wide[0].clip(max=1), long[1]), 0)):
+        rest = np.flatnonzero(~sound)
+        for h, mine in _groups(tuple(index[rest] for index in at), *half):
+            own = tuple(index[rest[mine]] for index in at)
+            rise = None if narrow is None else (narrow, 4 * lrf.sigma_range / spots[narrow][own])
+            sound[rest[mine]] = _on_planes(ranges, own, h, lrf.sigma_range, rise, readings[own], share)
+    return sound
+
+
+def _sums(ranges, half):
+    """Sums over windows that reach `half` samples about every place, and the number of samples of one.
+
+    Of the products of one, line, beam and inverse range: ndarray, shape (4, 4, l, b).
     """
-    valid, size = np.isfinite(ranges), (2 * half[0] + 1, 2 * half[1] + 1)
-    inverse, best = np.where(valid, 1 / np.where(valid, ranges, 1.0), 0.0), np.full(len(at[0]), np.inf)
-    x, y = np.indices(ranges.shape, dtype=float) - np.array(ranges.shape)[:, None, None] / 2
-    basis = [valid * value for value in (1.0, x, y, inverse)]
-    number = np.prod(size)
-    sums = {(i, j): number * uniform_filter(basis[i] * basis[j], size, mode="constant")
-            for i in range(4) for j in range(i, 4)}  # fmt: skip
-    for a, b in np.ndindex(3, 3):
-        centre = tuple(np.clip(at[i] + (k - 1) * half[i], 0, ranges.shape[i] - 1) for i, k in enumerate((a, b)))
-        G = np.array([[sums[min(i, j), max(i, j)][centre] for j in range(4)] for i in range(4)]).transpose(2, 0, 1)
-        fit = np.linalg.solve(G[:, :3, :3] + 1e-9 * np.eye(3), G[:, :3, 3:])[..., 0]
-        square = np.maximum(G[:, 3, 3] - np.sum(fit * G[:, :3, 3], axis=1), 0.0) / np.maximum(G[:, 0, 0] - 3, 1)
-        here = fit[:, 0] + fit[:, 1] * x[at] + fit[:, 2] * y[at]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            good = (G[:, 0, 0] >= max(4, 0.6 * number)) & (here > 0) & (np.sqrt(square) < rough * here**2)
-            good &= rise is None or np.abs(fit[:, 1 + rise[0]]) < rise[1] * here**2
-            best = np.minimum(best, np.where(good, np.abs(ranges[at] - 1 / here), np.inf))
-    return best
+    valid, size = np.isfinite(ranges), [2 * h + 1 for h in half]
+    x, y = np.indices(ranges.shape) - np.array(ranges.shape)[:, None, None] / 2
+    basis = [valid * value for value in (1.0, x, y, np.where(valid, 1 / np.where(valid, ranges, 1.0), 0.0))]
+    out = np.empty((4, 4, *ranges.shape))
+    for i, j in zip(*np.triu_indices(4), strict=True):
+        out[i, j] = out[j, i] = np.prod(size) * uniform_filter(basis[i] * basis[j], size, mode="constant")
+    return out, np.prod(size)
+
+
+def _planes(G, at, shape, rough):
+    """Planes (n, 3) in inverse range from sums G (4, 4, n), their range at places, and whether they fit.
+
+    They do where their residuals are not `rough` (metres) and the place is not far from what they were fitted to.
+    """
+    G, (x, y) = np.moveaxis(G, -1, 0), (i - n / 2 for i, n in zip(at, shape, strict=True))
+    here = np.stack([np.ones(len(x)), x, y], axis=1)
+    both = np.linalg.solve(G[:, :3, :3] + 1e-9 * np.eye(3), np.stack([G[:, :3, 3], here], axis=-1))
+    square = np.maximum(G[:, 3, 3] - np.sum(both[..., 0] * G[:, :3, 3], axis=1), 0.0) / np.maximum(G[:, 0, 0] - 3, 1)
+    inverse, lever = np.einsum("ni,nij->jn", here, both)
+    good = (G[:, 0, 0] >= 4) & (inverse > 0) & (np.sqrt(square) < rough * inverse**2) & (lever < 1.5)
+    return both[..., 0], 1 / np.where(inverse > 0, inverse, np.nan), good
+
+
+def _on_planes(ranges, at, half, sigma, rise, readings, share):
+    """Which readings at (line, beam) lie on a plane through one of nine windows that hold them.
+
+    Windows reach `half` samples about their middles, and a `share` of their samples is there. No plane rises by more
+    than ``rise[1]`` metres a sample in direction ``rise[0]``.
+    """
+    (sums, number), sound = _sums(ranges, half), np.zeros(len(readings), bool)
+    for place in sorted(np.ndindex(3, 3), key=lambda each: each != (1, 1)):  # most lie on the one about them
+        rest = np.flatnonzero(~sound)
+        own = [index[rest] for index in at]
+        steps = zip(own, place, half, ranges.shape, strict=True)
+        centre = tuple(np.clip(i + (k - 1) * h, 0, n - 1) for i, k, h, n in steps)
+        plane, there, good = _planes(sums[(..., *centre)], own, ranges.shape, 1.3 * sigma)
+        good &= sums[0, 0][centre] >= share * number
+        good &= rise is None or np.abs(plane[:, 1 + rise[0]]) * there**2 < rise[1][rest]
+        sound[rest] = good & (np.abs(readings[rest] - there) <= SIGMAS * sigma)
+    return sound
+
+
+def _thin(ranges, at, spots, lrf):
+    """Readings at (line, beam) a little before one plane on both sides of a strip as narrow as the spot."""
+    valid, found = np.isfinite(ranges), np.zeros(len(at[0]), bool)
+    count = np.maximum(uniform_filter(valid.astype(float), 3, mode="constant"), 1e-9)
+    mean = (uniform_filter(np.where(valid, ranges, 0.0), 3, mode="constant") / count)[at]
+    long, inner, outer = _samples(spots, 0.375, 1), _samples(spots, 1.0, 1), _samples(spots, 2.0, 2)
+    for d in (0, 1):  # strips along beams, along lines
+        for (along, *across), mine in _groups(at, long[1 - d], outer[d], inner[d]):
+            own = tuple(index[mine] for index in at)
+            (far, number), (near, fewer) = (_sums(ranges, np.roll([n, along], d)) for n in across)
+            _, there, good = _planes((far - near)[(..., *own)], own, ranges.shape, 1.3 * lrf.sigma_range)
+            good &= (far - near)[0, 0][own] >= 0.8 * (number - fewer)
+            depth = (there - ranges[own]) / lrf.sigma_range
+            found[mine] |= good & (depth > SIGMAS) & (depth < 10) & (there - mean[mine] > SIGMAS * lrf.sigma_range)
+    return found
 
 
 def grid_normals(points, origins):
-    """Unit normals (l, b, 3) towards `origins` of points on a grid (l, b, 3): of the flattest window that holds them.
+    """Unit normals (l, b, 3) towards `origins` of points on a grid (l, b, 3), and the scatter (l, b) along them.
 
-    Nine windows, the point in the middle, on a side or in a corner of them, so that an edge spoils none of its sides.
-    NaN where less than a third of every window is there.
+    Of the flattest window that holds the point: nine windows, the point in the middle, on a side or in a corner of
+    them, so that an edge spoils none of its sides. NaN where less than a third of every window is there.
     """
     valid, n = np.isfinite(points).all(axis=-1), 2 * WINDOW + 1
     centre = np.nanmean(points[valid], axis=0) if valid.any() else np.zeros(3)
@@ -419,7 +478,7 @@ def grid_normals(points, origins):
         best = np.where(flatter, rough[at], best)
         normals = np.where(flatter[..., None], vectors[at][..., :, 0], normals)
     away = np.sum(normals * (points - origins), axis=-1, keepdims=True) > 0
-    return np.where(away, -normals, normals)
+    return np.where(away, -normals, normals), np.sqrt(np.where(np.isfinite(best), best, np.nan))
 
 
 COLUMNS = {  # of a PLY file, of attributes that are no single float by the attribute's own name

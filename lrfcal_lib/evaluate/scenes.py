@@ -23,7 +23,8 @@ def with_sigma(cloud, solution):
     """A Cloud with the standard deviations (metres) of its points that a JointSolution predicts.
 
     Of the distance of a point from its surface: calibration, errors of the sweep's pitch and range noise along the
-    normal (along the beam where there is none). A turn of the whole cloud about the tilt axis does not count.
+    normal (along the beam where there is none), or the scatter of readings about the surface where that is more: a spot
+    averages over what is finer than itself. A turn of the whole cloud about the tilt axis does not count.
     """
     chain, noise, sigma = chain_of(solution), range_noise(solution), np.zeros(len(cloud.points))
     for part in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
@@ -32,6 +33,7 @@ def with_sigma(cloud, solution):
         normals = np.where(np.isfinite(normals), normals, beams)
         sweep = np.hypot(chain.sweep_sigma[0], chain.sweep_sigma[1] * cloud.pitch[part])
         sweep, own = (v * np.sum(normals * by, axis=1) for v, by in ((sweep, by_pitch), (noise, beams)))
+        own = np.maximum(np.abs(own), cloud.sigma[part])
         sigma[part] = np.sqrt(spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None]) ** 2 + sweep**2 + own**2)
     return replace(cloud, sigma=sigma)
 

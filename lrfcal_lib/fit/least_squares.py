@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri
@@ -167,9 +166,9 @@ def reduced_hessian(hessian, shared):
 
 def _step(hessian, gradient, damping, shared):
     """A damped step, its squared length in standard deviations, and the fall of the cost it promises."""
-    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
-    extra = np.asarray(damping)[..., None] * diagonal
-    extra = extra + 1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300  # what nobody sees stays where it is
+    diagonal = hessian.diagonal(axis1=-2, axis2=-1)
+    extra = damping[..., None] * diagonal
+    extra = extra + (1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-300)  # what nobody sees stays where it is
     damped = hessian + extra[..., None] * np.eye(hessian.shape[-1])
     if shared is None:
         step = whole = -np.linalg.solve(damped, gradient[..., None])[..., 0]
@@ -178,8 +177,8 @@ def _step(hessian, gradient, damping, shared):
         common = -np.linalg.solve(np.sum(reduced, axis=0), np.sum(right, axis=0))
         step = common, -(back[..., shared] + back[..., :shared] @ common)
         whole = np.concatenate([np.broadcast_to(common, (len(back), shared)), step[1]], axis=-1)
-    length = (whole * (hessian @ whole[..., None])[..., 0]).sum(axis=-1)
-    promised = -(whole * gradient).sum(axis=-1) - 0.5 * length
+    length = np.vecdot(whole, (hessian @ whole[..., None])[..., 0])
+    promised = -np.vecdot(whole, gradient) - 0.5 * length
     return (step, length, promised) if shared is None else (step, np.sum(length), np.sum(promised))
 
 
@@ -226,13 +225,13 @@ def minimise(evaluate, state, retract, *, shared=None, loss=None, scale=1.0, max
         elif accepted.any():
             state = np.where(accepted.reshape(accepted.shape + (1,) * (state.ndim - accepted.ndim)), trial, state)
             blocks = _blocks(evaluate, state)
+        hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
+        history.append(cost)
         # less damping where the linear model keeps its promise, more where it overshoots (large residuals)
         gain = np.where(promised > 3e-15 * before, (before - after) / np.maximum(promised, 1e-300), 1.0)
         kept = np.where(gain > 0.8, 0.1, 1.0) * damping
         worse = np.maximum(np.where(accepted, 4.0, 10.0) * damping, 1e-4)
         damping = np.minimum(np.maximum(np.where(accepted & (gain > 0.5), kept, worse), 1e-12), 1e14)
-        hessian, gradient, cost, roots = linearise(blocks, loss, scale, axes)
-        history.append(cost)
     return state, (bool(converged) if converged.ndim == 0 else converged), iteration, np.array(history)
 
 
@@ -308,18 +307,19 @@ def solve(
 
 def _by_placement(r, J, weights, groups, shared):
     """Normal equations of the reported unknowns by placement (one group where they are not told apart)."""
-    weighted = np.swapaxes(weights[..., None] * J, -1, -2)
+    weighted = weights[..., None] * J
+    if groups is not None:  # rows of a placement together, padded with what counts nothing
+        groups = np.repeat(groups, r.shape[-1] // len(groups))
+        number = np.bincount(groups)
+        used = np.arange(number.max()) < number[number > 0, None]
+        index = np.zeros(used.shape, int)
+        index[used] = np.argsort(groups, kind="stable")
+        r, J, weighted = r[..., index], J[..., index, :], weighted[..., index, :] * used[..., None]
+    weighted = weighted.swapaxes(-1, -2)
+    hessians, scores = weighted @ J, (weighted @ r[..., None])[..., 0]
     if shared is not None:
-        return reduced_hessian(weighted @ J, shared), (weighted @ r[..., None])[:, :shared, 0]
-    groups = np.zeros(1, int) if groups is None else np.asarray(groups)
-    groups = np.repeat(groups, r.shape[-1] // len(groups))
-    ends, names = np.r_[0, np.flatnonzero(np.diff(groups)) + 1, len(groups)].tolist(), np.unique(groups)
-    rows = [slice(*pair) for pair in pairwise(ends)]  # a group in one piece, mostly
-    if len(rows) > len(names):
-        rows = [groups == group for group in names]
-    hessians = [weighted[..., here] @ J[..., here, :] for here in rows]
-    scores = [(weighted[..., here] @ r[..., here, None])[..., 0] for here in rows]
-    return np.stack(hessians, axis=-3), np.stack(scores, axis=-2)
+        return reduced_hessian(hessians, shared), scores[:, :shared]
+    return (hessians, scores) if groups is not None else (hessians[..., None, :, :], scores[..., None, :])
 
 
 def null_space(hessian, scales, limit=1.0):
@@ -381,7 +381,11 @@ def placement_covariance(hessians, scores):
     total = np.sum(hessians, axis=-3, keepdims=True)
     diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
     scaled = (total - hessians) / (diagonal[..., :, None] * diagonal[..., None, :])
-    if groups < 3 or np.min(np.linalg.eigvalsh(scaled)[..., 0]) < 1e-12:
+    try:  # squared pivots: what the others say about one unknown more
+        pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
+    except np.linalg.LinAlgError:
+        return None, None
+    if groups < 3 or pivots.min() < 1e-6:
         return None, None
     shifts = np.linalg.solve(scaled, (scores / diagonal)[..., None])[..., 0] / diagonal
     return (groups - 1) / groups * np.swapaxes(shifts, -1, -2) @ shifts, shifts

@@ -7,7 +7,6 @@ from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
@@ -33,7 +32,7 @@ def line_block(pose, obs):
 
     def flat(v, own):
         """With one leading axis, of all trials or of one that stands for all."""
-        return v.reshape((math.prod(v.shape[: v.ndim - own]), *v.shape[v.ndim - own :]))
+        return v[None] if v.ndim == own else v.reshape((math.prod(v.shape[: v.ndim - own]), *v.shape[v.ndim - own :]))
 
     line_rows(
         *(flat(np.ascontiguousarray(v, float), own) for v, own in zip(given, (2, 2, 3, 2, 1), strict=True)),
@@ -45,9 +44,7 @@ def line_block(pose, obs):
 
 def read_pose(pose):
     """Transform and parameters of a pose state."""
-    rotation = Rotation.from_matrix(pose[..., :3])
-    parameters = np.concatenate([rotation.as_rotvec(), pose[..., 3]], axis=-1)
-    return RigidTransform.from_components(pose[..., 3], rotation), parameters
+    return geometry.pose_transform(pose, proper=True), geometry.pose_parameters(pose)
 
 
 def edge_residuals_px(obs, transform, model=None):

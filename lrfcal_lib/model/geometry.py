@@ -235,20 +235,28 @@ def pose_array(transform):
     return transform.as_matrix()[..., :3, :].copy()
 
 
-def pose_transform(pose):
-    """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4)."""
-    return RigidTransform.from_components(pose[..., 3], Rotation.from_matrix(pose[..., :3]))
+def pose_transform(pose, proper=False):
+    """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4); `proper` ones hold exact rotations."""
+    whole = np.zeros((*pose.shape[:-2], 4, 4))
+    whole[..., :3, :], whole[..., 3, 3] = pose, 1.0
+    return RigidTransform(whole, normalize=not proper, copy=False)  # much faster than from components
 
 
 def exp_rotation(w):
-    """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3)."""
-    w = np.asarray(w, float)  # flat: SciPy is several times slower on more than one leading axis
-    return Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(w.shape[:-1] + (3, 3))
+    """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3); Rodrigues' formula."""
+    x, y, z = np.asarray(w, float).T  # by component: numbers are many times faster than small arrays
+    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)
+    sine = np.sin(half) / half
+    a, b = sine * np.cos(half), 0.5 * sine * sine  # sin(angle) / angle, (1 - cos(angle)) / angle^2
+    xx, yy, zz, xy, xz, yz = b * x * x, b * y * y, b * z * z, b * x * y, b * x * z, b * y * z
+    x, y, z = a * x, a * y, a * z
+    columns = [1 - yy - zz, xy + z, xz - y], [xy - z, 1 - xx - zz, yz + x], [xz + y, yz - x, 1 - xx - yy]
+    return np.array(columns).T
 
 
 def log_rotation(R):
-    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3)."""
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be exact."""
+    return Rotation.from_matrix(R.reshape(-1, 3, 3), assume_valid=True).as_rotvec().reshape(R.shape[:-1])
 
 
 def pose_parameters(pose):

@@ -184,13 +184,15 @@ class CameraObservations(_Groups):
 
     def require(self, kind, least):
         """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for what they leave open."""
-        faces = np.intersect1d(self.placements, self.plane_placement)
-        found, what = {
-            "crossing": (self.crossing_placement, "crossings of scan lines with edges"),
-            "plane": (faces, "placements with a board pose and points on the board"),
-            "scene": (self.scene_placement, "scene points"),
-        }[kind]
+        found = self.scene_placement if kind == "scene" else self.crossing_placement
+        if kind == "plane":
+            found = np.intersect1d(self.placements, self.plane_placement)
         if len(found) < least:
+            what = {
+                "crossing": "crossings of scan lines with edges",
+                "plane": "placements with a board pose and points on the board",
+                "scene": "scene points",
+            }[kind]
             raise DegenerateGeometry(
                 f"camera '{self.camera}': {len(found)} {what}, at least {least} needed: "
                 "the rest of the pose stays unobservable"

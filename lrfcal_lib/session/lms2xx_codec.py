@@ -72,11 +72,11 @@ def crc16(data):
         return int(crc16(np.frombuffer(data, np.uint8)[None])[0])
     if data.shape[1] == 0:
         return np.zeros(len(data), np.uint16)
-    words = np.zeros((len(data), data.shape[1] + data.shape[1] % 2), np.uint16)  # zeros in front change nothing
-    words[:, words.shape[1] - data.shape[1] :] = data
-    words[:, 1:] |= words[:, :-1] << 8
-    high = words[:, ::2]
-    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ words[:, 1::2]  # neighbours, by shifts: twice as fast
+    raw = np.zeros((len(data), 1 + data.shape[1] + data.shape[1] % 2), np.uint8)  # zeros in front change nothing
+    raw[:, raw.shape[1] - data.shape[1] :] = data
+    pairs = (np.ascontiguousarray(part).view(">u2").astype(np.uint16) for part in (raw[:, :-1], raw[:, 1:]))
+    high, low = pairs  # every other word
+    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ low  # neighbours, by shifts: twice as fast
     while (n := words.shape[1]) > 1:
         last = 1 << ((n - 1).bit_length() - 1)
         rest = words[:, n - last :].copy()
@@ -290,7 +290,7 @@ def special_values(words, mode):
     """Where values are no ranges, and why; they are few."""
     mode = MODES[mode]
     counts = words & np.uint16(mode.top)
-    special = np.nonzero(counts > mode.largest)
+    special = np.unravel_index(np.flatnonzero(counts > mode.largest), counts.shape)  # ten times as fast as nonzero
     return special, REASON_BELOW_TOP[mode.top - counts[special]]
 
 
@@ -416,7 +416,7 @@ def decode_scans(data, offset, length, mode=0):
         for first in range(0, len(at), CHUNK):
             some = slice(first, first + CHUNK)
             words[some] = cut(data, at[some] + 7, 2 * values).view("<u2")
-            ranges[some] = (words[some] & np.uint16(MODES[mode].top)) * METRES[unit]
+            np.multiply(words[some] & np.uint16(MODES[mode].top), METRES[unit], out=ranges[some])
             special, reasons = special_values(words[some], mode)
             ranges[some][special] = np.where(reasons == BEYOND, np.inf, np.nan)
         last = at + 7 + 2 * values + 2 * indexed

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import minimise, solve, whiten
+from lrfcal_lib.fit.least_squares import minimise, solve
 from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
@@ -219,15 +219,16 @@ def solve_joint(
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
-    rivals = ()
+    rivals, settled = (), False
     if start is None:
         obs, lost = without_lost_placements(obs)
-        obs, start, bad, rivals = best_start(obs, unknowns, sweep_sigma, T0)
+        obs, start, bad, rivals, settled = best_start(obs, unknowns, sweep_sigma, T0)
         excluded = excluded | lost | bad
     data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
-    state = converged(start, data, coarse(unknowns), steps=FIRST_STEPS)
-    state = converged(state, data, unknowns, LAST_STEP, FIRST_STEPS)
+    if prior is not None or not settled:
+        start = converged(start, data, coarse(unknowns), steps=FIRST_STEPS)
+    state = converged(start, data, unknowns, LAST_STEP, FIRST_STEPS)
     data = replace(data, lapse=lapse)
     if noise == "estimate":
         state, data = settle(state, data, unknowns)
@@ -293,12 +294,17 @@ def without_lost_placements(obs):
     return obs.select(obs.placements[~lost]), words
 
 
-def converged(state, data, unknowns, tolerance=ROUGH_STEP, steps=MOST_STEPS):
-    """The state that explains the data best, from one nearby."""
+def fit(state, data, unknowns, tolerance=ROUGH_STEP, steps=MOST_STEPS):
+    """What :func:`lrfcal_lib.fit.least_squares.minimise` makes of a state nearby."""
     return minimise(
         lambda s: joint_blocks(s, data, unknowns), state, lambda s, step: move_state(s, step, unknowns),
         shared=unknowns.shared, max_iterations=steps, tolerance=tolerance,
-    )[0]  # fmt: skip
+    )  # fmt: skip
+
+
+def converged(*problem, **options):
+    """The state that explains the data best, from one nearby: the first that :func:`fit` returns."""
+    return fit(*problem, **options)[0]
 
 
 def coarse(unknowns):
@@ -324,8 +330,9 @@ def image_name(obs, row):
 
 
 def best_start(obs, unknowns, sweep_sigma, T0=None):
-    """The most promising start value: the observations left with it, itself, what is not left, and its rivals (words).
+    """The most promising start value: the observations left with it, itself, what is not left, its rivals (words).
 
+    Last comes whether more steps with the coarse unknowns would change nothing.
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
@@ -338,13 +345,12 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
             found = agreeing_start(obs, state, data, unknowns)
             badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2
-            tried.append((badness, *found[:3], np.median(misses)))
+            tried.append((badness, *found[:4], np.median(misses)))
         if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
             break
     tried.sort(key=lambda one: one[0])
-    kept, start, bad, rough = tried[0][1:]
-    miss = np.median(joint_noise.view_misses(start, gather(kept)))
-    if min(rough, miss) > ROUGH_MISS:
+    kept, start, bad, settled, rough = tried[0][1:]
+    if rough > ROUGH_MISS and (miss := np.median(joint_noise.view_misses(start, gather(kept)))) > ROUGH_MISS:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm "
             "or more off where the images put it; check that images and scans carry the right numbers"
@@ -355,7 +361,7 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, start, bad, second_minima(obs, tried)
+    return kept, start, bad, second_minima(obs, tried), settled
 
 
 def second_minima(obs, tried):
@@ -376,17 +382,17 @@ def left_out_shares(obs, bad):
 def agreeing_start(obs, state, data, unknowns):
     """A few steps without what contradicts a start value; what a rough one leaves out is judged again by the rest.
 
-    Returns the observations kept, the state, what is left out in words, and the mean cost.
+    Returns the observations kept, the state, what is left out in words, whether it converged, and the mean cost.
     """
     few = coarse(unknowns)
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = gather(kept, **data.levels) if bad else data
-        found = converged(fitting, cut, few, steps=START_STEPS)
+        found, settled, _, costs = fit(fitting, cut, few, steps=START_STEPS)
         if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
             break
         state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
-    return kept, found, bad, total_cost(found, cut, few) / count_rows(kept)
+    return kept, found, bad, settled, np.nan_to_num(costs[-1], nan=np.inf) / count_rows(kept)
 
 
 def without_contradictions(obs, state, data):
@@ -480,13 +486,6 @@ def wrong_image(obs, state, data, unknowns, i, limits):
 def count_rows(obs):
     """Number of observations."""
     return len(obs.face_range) + len(obs.beam_hit) + len(obs.view_pitch)
-
-
-def total_cost(state, data, unknowns):
-    """Half the squared residuals and the negative log likelihood of all observations."""
-    blocks = joint_blocks(state, data, unknowns)
-    total = sum(np.sum(0.5 * whiten(b, False)[0] ** 2 if b.cost is None else b.cost) for b in blocks)
-    return float(total) if np.isfinite(total) else np.inf
 
 
 def in_stated_gauge(state, obs):

@@ -114,7 +114,7 @@ def plane_terms(pose, triangles, boards, offset=0.0):
     residuals = (triangles @ np.concatenate([top, last], axis=-1)[..., None])[..., 0] + offset
     spin = turned @ geometry.hat(normal)
     normal = np.broadcast_to(normal, top.shape)[..., None, :]
-    moment = np.cross(normal[..., 0, :], between)[..., None, :]
+    moment = geometry.cross(normal[..., 0, :], between)[..., None, :]
     upper = np.concatenate([spin, np.zeros_like(spin)], axis=-1)
     by_pose = np.concatenate([upper, np.concatenate([np.zeros_like(normal), normal], axis=-1)], axis=-2)
     by_board = np.concatenate([-upper, np.concatenate([moment, -normal], axis=-1)], axis=-2)
@@ -184,7 +184,8 @@ def start_from_planes(obs):
 
     order = np.argsort(trimmed(candidates))
     best = candidates[[*order[:4], *_apart(candidates, order[:100])]]
-    refined, *_ = minimise(evaluate, best, move_pose, loss="cauchy", scale="auto", max_iterations=25)
+    options = {"loss": "cauchy", "scale": "auto", "max_iterations": 12, "tolerance": 0.01}
+    refined, *_ = minimise(evaluate, best, move_pose, **options)
     every = np.concatenate([refined, best])
     apart = every[_apart(every, np.argsort(trimmed(every)))]
     most = trimmed(apart, max(least, round(SEEN * p)))
