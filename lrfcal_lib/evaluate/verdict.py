@@ -367,7 +367,7 @@ def falsified(joint):
         for kind, value in sizes.items():
             obs = ALTERNATIVES[kind].change(obs, value)
         try:
-            solution = solve_joint(obs, required=False, **joint.settings)
+            solution = solve_joint(obs, required=False, **joint.settings) if sizes else joint.solution
             offset, reasons = solution.sensor["range_offset"], contradicts_stated(replace(joint, solution=solution))[0]
             words = reasons[0].words if reasons else "nothing"
         except DegenerateGeometry as error:
