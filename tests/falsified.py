@@ -118,6 +118,9 @@ FALSIFIED = {
     "camera knocked aside half-way": (knocked, ("excluded", "misfit", "model error", "noise")),
     "pitch of scan lines 0.3 deg late": (late, ("lag",)),
     "pitch of scan lines 0.15 deg early": (lambda obs: late(obs, -0.0025), ("lag",)),
+    # before a single background the edge bias takes it up
+    "spot stated 2.5 times too wide": (changed(beam_radius=lambda r: 2.5 * r), ()),
+    "spot stated 0.4 times too narrow": (changed(beam_radius=lambda r: 0.4 * r), ()),
     "three placements": (lambda obs: obs.select(obs.placements[:3]), ("placements",)),
     "one pitch only": (
         pitched(lambda p: 0.02 * p), ("pitch", "unobservable", "pitch scale", "far from stated")

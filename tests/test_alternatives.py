@@ -127,3 +127,13 @@ def test_what_only_the_statement_of_the_rig_can_tell(change, far, angle):
         assert name in words and "bearings or pitch of the other sense" in words
         assert np.degrees(turn) == pytest.approx(angle, abs=5)
     assert "camera 'left' sits" in places_of_cameras(solution)[0]
+
+
+@MOUNTS
+def test_names_of_cameras_state_their_sides(mount):
+    obs, _, rig = draw(rng(2), 12, mount=mount)
+    session = SimpleNamespace(T_head_lrf=None, cameras={})
+    for camera, said in ((obs.view_camera, 0), (1 - obs.view_camera, 1)):
+        solution = solve_joint(replace(obs, view_camera=camera), rig.T_head_lrf, sensor=SENSOR, required=False)
+        found = far_from_stated(SimpleNamespace(prepared=SimpleNamespace(session=session), solution=solution))
+        assert ["exchanged folders" in words for words, _ in found] == [True] * said

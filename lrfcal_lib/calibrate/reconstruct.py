@@ -265,7 +265,7 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
     for points, normals, _, hiding, good, _ in blocks:
         painter.hide(hiding[np.isfinite(hiding).all(axis=-1)])
-        some.append([part[good][::every] for part in (points, normals)])
+        some.append([part[good][::every].copy() for part in (points, normals)])  # a view would keep the whole block
     painter.compare_exposures(*(np.concatenate(part) for part in zip(*some, strict=True)))
     for points, normals, scatter, _, good, rows in blocks:
         wanted = np.isfinite(sweep.ranges[rows]) if mask is None else mask[rows]

@@ -18,7 +18,8 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement
-HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset
+HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset,
+LEAST_INSTEAD = 0.015  # and how wrong they have to be: less is hardly told from an offset, and makers are better
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
@@ -172,7 +173,8 @@ def not_an_offset(solution):
     if "range_offset" in names:
         square = (offset / solution.solution.trusted_sigma[names.index("range_offset")]) ** 2
         best = weigh(solution, HELD)[0] if square > ASKED**2 else None
-        if best and best.kind == "bearings" and best.ratio > max(square / AS_GOOD, INSTEAD**2):
+        asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and abs(best.value) > LEAST_INSTEAD
+        if asked and best.kind == "bearings":
             return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
     return None
 
