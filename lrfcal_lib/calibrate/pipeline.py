@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -20,7 +19,6 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import stereo_check
 from lrfcal_lib.session.cache import cached
-from lrfcal_lib.session.read import side_by_side
 from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
@@ -416,19 +414,15 @@ def cloud_blocks(calibration, method="line", scene=False):
         "correct": calibration.joint.solution.correct if axis == "joint" else as_recorded,
         "continuous": str(session.reference.get("recording", "")).startswith("continuous"),
     }  # fmt: skip
-
-    def of(placement):
-        sweep, views, mask = session.sweep(placement), views_of(calibration, method, placement), masks[placement]
+    for placement, mask in masks.items():
+        sweep, views = session.sweep(placement), views_of(calibration, method, placement)
         if mask is not None:  # the board and what is around it
             lines, beams = (slice(max(0, at.min() - 20), at.max() + 21) for at in np.nonzero(mask))
             part = {"pitch": sweep.pitch[lines], "time_s": sweep.time_s[lines], "bearings": sweep.bearings[beams]}
             echoes = None if sweep.intensities is None else sweep.intensities[lines, beams]
             sweep = replace(sweep, ranges=sweep.ranges[lines, beams], intensities=echoes, **part)
             mask = mask[lines, beams]
-        return reconstruct.reconstruct(sweep, views, **settings, mask=mask)
-
-    sweeps = map(of, masks) if scene else side_by_side(lambda placement: list(of(placement)), masks)
-    yield from chain.from_iterable(sweeps)  # scenes may be larger than the memory
+        yield from reconstruct.reconstruct(sweep, views, **settings, mask=mask)
 
 
 def views_of(calibration, method, placement):

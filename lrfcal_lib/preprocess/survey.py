@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import PurePath
 
 import numpy as np
@@ -17,7 +18,6 @@ from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_b
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders, spread_views
-from lrfcal_lib.session.read import side_by_side
 
 UPRIGHT = 0.05  # weight of the turn between two cameras where few placements tell: most look the same way, head up
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
@@ -123,7 +123,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
 
     usable = [r for r in records if not plain or r.purpose != "intrinsics"]
     groups = [group for c in models for group in _choices(usable, c, one_per_placement)]
-    images = side_by_side(lambda group: _first(group, begin), groups)
+    with ThreadPoolExecutor() as pool:  # OpenCV frees the interpreter while it looks for corners
+        images = list(pool.map(lambda group: _first(group, begin), groups))
     if plain:
         return Survey(_by_camera(models, _turned_alike([view for _, view in images])), dict(models), None, board)
     flat = {c: m or _intrinsics(c, images, board, read) for c, m in models.items()}
@@ -132,8 +133,7 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     images = [(r, view) for r, view in images if r.purpose != "intrinsics"]
     known, outline = board.corners is not None or unseen, None
     for _ in range(1 if known else 2):
-        again = partial(look, models=models, lines=lines, relief=relief)
-        views = side_by_side(lambda image, again=again: image[1] if image[1].reason else again(*image), images)
+        views = [v if v.reason else look(r, v, models, lines=lines, relief=relief) for r, v in images]
         if not known:
             outline = measure_outline(views, board, models)
             lines = outline.lines
@@ -153,12 +153,11 @@ def all_views(prepared):
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
     marks, finder, orders = _marks(session.picks, board), PatternFinder(board.pattern), pattern_orders(board.pattern)
     options = {"lines": None if board.corners is None else board.lines(), "relief": prepared.relief}
-
-    def see(r):
-        """The board in one image, turned as in that of its placement."""
+    for r in records:
         view, seen = _view(r), prepared.views[r.camera][r.placement]
         if seen.file == view.file or seen.pixels is None:  # the same, or none of the placement's images shows it
-            return replace(seen, file=view.file, pitch=view.pitch)
+            views[r.camera].append(replace(seen, file=view.file, pitch=view.pitch))
+            continue
         image = session.read_image(r)
         view = _corners(view, image, finder)
         if not view.reason:
@@ -166,9 +165,6 @@ def all_views(prepared):
             view = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]])
             picked = marks.get((r.camera, r.file))
             view = view_board(image, board, prepared.models[r.camera], view, picked, **options)
-        return view
-
-    for r, view in zip(records, side_by_side(see, records), strict=True):
         views[r.camera].append(view)
     return views
 
@@ -281,8 +277,10 @@ def _ordered(images, read, board, models):
     placements = [-1 if r.purpose == "intrinsics" else v.placement for r, v, _ in seen]
     first, partner = alike([pose.rotation for pose in poses], placements, [v.camera for _, v, _ in seen])
     if known:
-        cases = [(*one, orders[own], pose[own]) for one, own, pose in zip(seen, partner, poses, strict=True)]
-        scores = side_by_side(lambda c: order_scores(read(c[0]), board, c[2], c[1].pixels[c[3]], c[4]), cases)
+        scores = [
+            order_scores(read(r), board, model, v.pixels[orders[own]], pose[own])
+            for (r, v, model), own, pose in zip(seen, partner, poses, strict=True)
+        ]
         chosen, lines, unseen = decide(scores, first), board.lines(), ""
     else:
         votes, up = [], []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from zipfile import ZipFile
@@ -26,14 +25,7 @@ PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
 PART = re.compile(r"part_\d+\.npz")  # a sweep, until the session is finished
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
-WORKERS = min(os.cpu_count() or 1, 8)
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
-
-
-def side_by_side(work, items):
-    """What a function makes of each item, in order; several at a time, since OpenCV and compiled loops free Python."""
-    with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(work, items))
 
 
 @dataclass(frozen=True)
