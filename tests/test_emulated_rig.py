@@ -248,8 +248,10 @@ def test_own_placements_and_unknown_setups(tmp_path):
     assert list((tmp_path / "rig").iterdir()) == []
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         EmulatedRig("x")
+    before = signal.getsignal(signal.SIGHUP)
     with pytest.raises(ValueError, match="time_scale is 16.0"):
         main(["sim_quick", "--no-cameras", "--time-scale", "16"])
+    assert signal.getsignal(signal.SIGHUP) is before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -298,20 +298,18 @@ def main(argv=None):
     ValueError for options that no rig has.
     """
     options, quit_ = vars(parser().parse_args(argv)), threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
-            signal.signal(number, lambda *_: quit_.set())
     file, head = options.pop("rig_file"), {key: options.pop(key) for key in ("feedback", "reply", "echo", "baudrate")}
-    with EmulatedRig(**options, head_options=head) as rig:
-        try:
-            if file is not None:
-                file.write_text(json.dumps(rig.rig_file(), indent=1) + "\n")
-            print(summary(rig, file), flush=True)
-            while not quit_.wait(LOOK_S) and rig.error() is None:
-                pass
-        finally:
-            if file is not None:
-                file.unlink(missing_ok=True)
+    with contextlib.ExitStack() as stack:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
+                stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
+        rig = stack.enter_context(EmulatedRig(**options, head_options=head))
+        if file is not None:
+            stack.callback(file.unlink, missing_ok=True)
+            file.write_text(json.dumps(rig.rig_file(), indent=1) + "\n")
+        print(summary(rig, file), flush=True)
+        while not quit_.wait(LOOK_S) and rig.error() is None:
+            pass
         error = rig.error()
     print(f"a device ended: {error!r}" if error else "the emulated rig is gone", flush=True)
     return 1 if error else 0
