@@ -77,7 +77,7 @@ def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_many_mislabelled_placements_are_refused(mount, share, seed):
     obs, *_ = draw(rng(seed), 20, mount=mount)
-    with pytest.raises(DegenerateGeometry, match="contradict .*right numbers|do not determine the edge bias"):
+    with pytest.raises(DegenerateGeometry, match="contradict .*right numbers"):
         solve_joint(mislabelled(obs, share, rng(seed)))
 
 

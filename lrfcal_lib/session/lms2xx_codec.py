@@ -74,8 +74,7 @@ def crc16(data):
         return np.zeros(len(data), np.uint16)
     raw = np.zeros((len(data), 1 + data.shape[1] + data.shape[1] % 2), np.uint8)  # zeros in front change nothing
     raw[:, raw.shape[1] - data.shape[1] :] = data
-    pairs = (np.ascontiguousarray(part).view(">u2").astype(np.uint16) for part in (raw[:, :-1], raw[:, 1:]))
-    high, low = pairs  # every other word
+    high, low = (np.ascontiguousarray(part).view(">u2").astype(np.uint16) for part in (raw[:, :-1], raw[:, 1:]))
     words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ low  # neighbours, by shifts: twice as fast
     while (n := words.shape[1]) > 1:
         last = 1 << ((n - 1).bit_length() - 1)

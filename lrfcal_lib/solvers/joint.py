@@ -29,7 +29,7 @@ UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is ca
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
 LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
-ROUGH_MISS = 0.08  # metres, of a board's face from where the first image of it puts it
+ROUGH_MISS, LAST_MISS = 0.08, 0.025  # metres, of a board from where images of it put it: of a start value, of the end
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "range_offset": "the range offset",
     "edge_log_odds": "the edge bias",
@@ -238,6 +238,8 @@ def solve_joint(
             state, data = settle(state, data, unknowns)
     if noise == "estimate" or lapse:
         state = converged(state, data, unknowns, LAST_STEP)
+    if required:  # a cause before what follows from it: edges that fit nowhere, say
+        refuse_contradiction(state, data, LAST_MISS)
     found = finished(obs, state, data, unknowns, excluded, required)
     return replace(found, warnings=rivals + found.warnings)
 
@@ -350,11 +352,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             break
     tried.sort(key=lambda one: one[0])
     kept, start, bad, settled, rough = tried[0][1:]
-    if rough > ROUGH_MISS and (miss := np.median(joint_noise.view_misses(start, gather(kept)))) > ROUGH_MISS:
-        raise DegenerateGeometry(
-            f"images and scans contradict each other: for half of the placements the board lies {1000 * miss:.0f} mm "
-            "or more off where the images put it; check that images and scans carry the right numbers"
-        )
+    if rough > ROUGH_MISS:
+        refuse_contradiction(start, gather(kept), ROUGH_MISS)
     if max(left_out_shares(obs, bad)) > LARGEST_SHARE:
         raise DegenerateGeometry(
             f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
@@ -362,6 +361,15 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
             "the right numbers"
         )
     return kept, start, bad, second_minima(obs, tried), settled
+
+
+def refuse_contradiction(state, data, most):
+    """Raise DegenerateGeometry where images put a third of the boards more than `most` metres off where they are."""
+    if data.view["used"].any() and (miss := np.quantile(joint_noise.view_misses(state, data), 2 / 3)) > most:
+        raise DegenerateGeometry(
+            f"images and scans contradict each other: for a third of the placements the board lies {1000 * miss:.0f} "
+            "mm or more off where the images put it; check that images and scans carry the right numbers"
+        )
 
 
 def second_minima(obs, tried):
