@@ -365,7 +365,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
 
 def refuse_contradiction(state, data, most):
     """Raise DegenerateGeometry where images put a third of the boards more than `most` metres off where they are."""
-    if data.view["used"].any() and (miss := np.quantile(joint_noise.view_misses(state, data), 2 / 3)) > most:
+    seen = data.view["used"].any(axis=1)
+    if seen.any() and (miss := np.quantile(joint_noise.view_misses(state, data)[seen], 2 / 3)) > most:
         raise DegenerateGeometry(
             f"images and scans contradict each other: for a third of the placements the board lies {1000 * miss:.0f} "
             "mm or more off where the images put it; check that images and scans carry the right numbers"
