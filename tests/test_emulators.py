@@ -7,9 +7,8 @@ import time
 import numpy as np
 import pytest
 import serial
-from virtual import INDEXED, Bench, Source, head, lms, telegrams
+from virtual import INDEXED, Bench, Source, VirtualHost, head, lms, telegrams
 
-from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.emulators.head import REACT_S, EmulatedHead, Head
 from lrfcal_lib.emulators.line import FAULTS, RATES, Clock, Faults, SerialDevice, resample
 from lrfcal_lib.emulators.lms2xx import AHEAD_S, BAUD_COMMAND, VARIANTS, EmulatedLms

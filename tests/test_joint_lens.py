@@ -65,3 +65,7 @@ def test_a_known_error_moves_the_estimate_as_the_covariance_says(mount):
     large = predicted > 0.03 * known.solution.sigma[columns]
     assert large.any()
     np.testing.assert_allclose(np.abs(change[large]), predicted[large], rtol=0.15)
+    change = (moved.residuals("view") - known.residuals("view"))[..., None]  # what no unknown takes up
+    square = np.sum(np.swapaxes(change, 1, 2) @ np.linalg.inv(obs.view_covariance) @ change)
+    left = 6 * (len(change) - len(obs.placements))
+    assert told.lens_scale == pytest.approx(np.sqrt(square / left), rel=0.1) and told.lens_scale > 0.05

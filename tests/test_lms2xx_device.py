@@ -10,11 +10,10 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import serial
-from virtual import INDEXED, Bench, Source
+from virtual import INDEXED, Bench, Source, VirtualHost
 from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import port
-from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, interval_s, transfer_s
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate

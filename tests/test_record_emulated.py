@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from virtual import VirtualHost
 
 from lrfcal_lib.acquire.checks import check_placement
 from lrfcal_lib.acquire.record import record_session
 from lrfcal_lib.calibrate.observe import observe_all
 from lrfcal_lib.calibrate.pipeline import calibrate_cameras, calibrate_jointly, calibrate_platform, prepare
-from lrfcal_lib.drivers.host import VirtualHost
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame

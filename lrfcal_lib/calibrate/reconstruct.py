@@ -284,11 +284,12 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
 
 
 class _Blocks:
-    """Points, normals, scatter, what hides others, which are no mixed pixels, and the scan lines, block by block."""
+    """Points, normals, scatter, what hides others (at first), sound points, and the scan lines, block by block."""
 
     def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
         self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
         self.rate = np.gradient(sweep.pitch, sweep.time_s) if continuous and len(sweep.pitch) > 1 else None
+        self.sound = {}  # by first line: looked for once, where blocks are gone through twice
 
     def __iter__(self):
         sweep, (lines, beams) = self.sweep, self.sweep.ranges.shape
@@ -300,11 +301,11 @@ class _Blocks:
             ranges, pitch = sweep.ranges[low:high].astype(float), self._pitch(slice(low, high))
             p_lrf, pitch = self.correct(sweep.placement, geometry.polar_to_points(ranges, sweep.bearings), pitch)
             points = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
-            nearer = np.zeros(ranges.shape)
-            if self.lrf.spot_divergence is not None:
-                nearer = mixed(ranges, self.steps, self.lrf)
-            good, toward = np.isfinite(ranges) & (nearer == 0), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
-            hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
+            hiding, good = points, self.sound.get(start, np.isfinite(ranges))
+            if self.lrf.spot_divergence is not None and start not in self.sound:
+                nearer, toward = mixed(ranges, self.steps, self.lrf), np.linalg.norm(p_lrf, axis=-1, keepdims=True)
+                good = self.sound[start] = good & (nearer == 0)
+                hiding = geometry.lrf_to_platform(p_lrf * (1 - nearer[..., None] / toward), pitch, self.T_head_lrf)
             origin = geometry.lrf_to_platform(np.zeros(3), pitch, self.T_head_lrf)
             normals, scatter = grid_normals(np.where(good[..., None], points, np.nan), origin)
             yield points[inner], normals[inner], scatter[inner], hiding[inner], good[inner], rows
@@ -354,12 +355,12 @@ def mixed(ranges, steps, lrf):
         asked |= (least > off) & (least < PULSE)
         dent |= (share == 1.0) & (away.min(axis=0) > 2 * lrf.sigma_range) & (least < PULSE)
         nearer = np.maximum(nearer, -most)
-    odd, at = np.zeros(r.shape, bool), np.nonzero(asked)
-    odd[at] = ~_on_surface(ranges, at, spots, lrf)
+    table, odd, at = _table(ranges), np.zeros(r.shape, bool), np.nonzero(asked)
+    odd[at] = ~_on_surface(table, ranges[at], at, spots, lrf, 0.6)
     at = np.nonzero(dent)
-    odd[at] |= _thin(ranges, at, spots, lrf)
+    odd[at] |= _thin(table, ranges, at, spots, lrf)
     at, found = np.nonzero(odd), np.zeros(r.shape)
-    sound = _on_surface(np.where(odd, np.nan, ranges), at, spots, lrf, ranges, 0.5)
+    sound = _on_surface(_table(np.where(odd, np.nan, ranges)), ranges[at], at, spots, lrf, 0.5)
     found[at] = np.where(sound, 0.0, np.maximum(nearer[at], 1e-6))
     return found
 
@@ -369,87 +370,72 @@ def _samples(spots, share, fewest):
     return [np.where(s > 1e-6, np.ceil(share * s).clip(fewest, 2 * WINDOW), 0).astype(int) for s in spots]
 
 
-def _groups(at, *numbers):
-    """Each combination of numbers (l, b) that occurs at places, and which of the places have it."""
-    values = np.stack([number[at] for number in numbers], axis=-1)
-    for each in np.unique(values, axis=0):
-        yield each.tolist(), (values == each).all(axis=1)
-
-
-def _on_surface(ranges, at, spots, lrf, readings=None, share=0.6):
-    """Which `readings` (those of `ranges` unless given) at (line, beam) lie on a plane of `ranges` about them."""
-    wide, long = _samples(spots, 0.375, 1), _samples(spots, 1.0, 2)
-    sound, readings = np.zeros(len(at[0]), bool), ranges if readings is None else readings
+def _on_surface(table, readings, at, spots, lrf, share):
+    """Which readings at (line, beam) lie on a plane of a window about them, of which that `share` is there."""
+    wide, long, sound = _samples(spots, 0.375, 1), _samples(spots, 1.0, 2), np.zeros(len(readings), bool)
     for half, narrow in ((wide, None), ((long[0], wide[1].clip(max=1)), 1), ((wide[0].clip(max=1), long[1]), 0)):
-        rest = np.flatnonzero(~sound)
-        for h, mine in _groups(tuple(index[rest] for index in at), *half):
-            own = tuple(index[rest[mine]] for index in at)
-            rise = None if narrow is None else (narrow, 4 * lrf.sigma_range / spots[narrow][own])
-            sound[rest[mine]] = _on_planes(ranges, own, h, lrf.sigma_range, rise, readings[own], share)
+        for place in sorted(np.ndindex(3, 3), key=lambda each: each != (1, 1)):  # most lie on the one about them
+            rest = np.flatnonzero(~sound)
+            own = tuple(index[rest] for index in at)
+            reach = [h[own] for h in half]
+            sums, number = _sums(table, [i + (k - 1) * h for i, k, h in zip(own, place, reach, strict=True)], reach)
+            slope, there, good = _planes(sums, own, 1.3 * lrf.sigma_range)
+            good &= sums[:, 0, 0] >= share * number
+            if narrow is not None:  # no ramp
+                rise = np.abs(slope[narrow]) * there**2
+                good &= rise < 4 * lrf.sigma_range / spots[narrow][own]
+            sound[rest] = good & (np.abs(readings[rest] - there) <= SIGMAS * lrf.sigma_range)
     return sound
 
 
-def _sums(ranges, half):
-    """Sums over windows that reach `half` samples about every place, and the number of samples of one.
-
-    Of the products of one, line, beam and inverse range: ndarray, shape (4, 4, l, b).
-    """
-    valid, size = np.isfinite(ranges), [2 * h + 1 for h in half]
-    x, y = np.indices(ranges.shape) - np.array(ranges.shape)[:, None, None] / 2
-    basis = [valid * value for value in (1.0, x, y, np.where(valid, 1 / np.where(valid, ranges, 1.0), 0.0))]
-    out = np.empty((4, 4, *ranges.shape))
-    for i, j in zip(*np.triu_indices(4), strict=True):
-        out[i, j] = out[j, i] = np.prod(size) * uniform_filter(basis[i] * basis[j], size, mode="constant")
-    return out, np.prod(size)
+def _table(ranges):
+    """Sums (l + 1, b + 1, 4, 4) over all before a place of products of one, line, beam and inverse range."""
+    valid = np.isfinite(ranges)
+    basis = np.stack([valid, *np.indices(ranges.shape), 1 / np.where(valid, ranges, 1.0)], axis=-1) * valid[..., None]
+    products = basis[..., :, None] * basis[..., None, :]
+    return np.pad(products.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0), (0, 0), (0, 0)))
 
 
-def _planes(G, at, shape, rough):
-    """Planes (n, 3) in inverse range from sums G (4, 4, n), their range at places, and whether they fit.
+def _sums(table, centre, half):
+    """Sums (n, 4, 4) over windows that reach `half` samples about `centre`, and the number of samples of whole ones."""
+    last = [n - 1 for n in table.shape[:2]]  # windows end at the border, and none has its middle beyond
+    centre = [np.clip(i, 0, n - 1) for i, n in zip(centre, last, strict=True)]
+    a, b = (np.maximum(i - h, 0) for i, h in zip(centre, half, strict=True))
+    c, d = (np.minimum(i + h + 1, n) for i, h, n in zip(centre, half, last, strict=True))
+    return table[c, d] - table[a, d] - table[c, b] + table[a, b], np.prod([2 * h + 1 for h in half], axis=0)
+
+
+def _planes(G, at, rough):
+    """Slopes (2, n) of planes in inverse range from sums G (n, 4, 4), their range at places, and whether they fit.
 
     They do where their residuals are not `rough` (metres) and the place is not far from what they were fitted to.
     """
-    G, (x, y) = np.moveaxis(G, -1, 0), (i - n / 2 for i, n in zip(at, shape, strict=True))
-    here = np.stack([np.ones(len(x)), x, y], axis=1)
-    both = np.linalg.solve(G[:, :3, :3] + 1e-9 * np.eye(3), np.stack([G[:, :3, 3], here], axis=-1))
-    square = np.maximum(G[:, 3, 3] - np.sum(both[..., 0] * G[:, :3, 3], axis=1), 0.0) / np.maximum(G[:, 0, 0] - 3, 1)
-    inverse, lever = np.einsum("ni,nij->jn", here, both)
-    good = (G[:, 0, 0] >= 4) & (inverse > 0) & (np.sqrt(square) < rough * inverse**2) & (lever < 1.5)
-    return both[..., 0], 1 / np.where(inverse > 0, inverse, np.nan), good
+    number = np.maximum(G[:, 0, 0], 1e-9)
+    mean = G[:, 0, 1:] / number[:, None]
+    C = np.moveaxis(G[:, 1:, 1:], 0, -1) - number * mean.T[:, None] * mean.T
+    (xx, xy, xr), (_, yy, yr), (*_, rr) = C + np.diag([1e-6, 1e-6, 0.0])[..., None]  # a single line has no slope across
+    slope = np.stack([yy * xr - xy * yr, xx * yr - xy * xr]) / (xx * yy - xy**2)
+    x, y = np.array(at) - mean.T[:2]
+    inverse, square = mean[:, 2] + slope[0] * x + slope[1] * y, rr - slope[0] * xr - slope[1] * yr
+    lever = 1 / number + (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
+    rms = np.sqrt(np.maximum(square, 0.0) / np.maximum(number - 3, 1))
+    good = (number >= 4) & (inverse > 0) & (rms < rough * inverse**2) & (lever < 1.5)
+    return slope, 1 / np.where(inverse > 0, inverse, np.nan), good
 
 
-def _on_planes(ranges, at, half, sigma, rise, readings, share):
-    """Which readings at (line, beam) lie on a plane through one of nine windows that hold them.
-
-    Windows reach `half` samples about their middles, and a `share` of their samples is there. No plane rises by more
-    than ``rise[1]`` metres a sample in direction ``rise[0]``.
-    """
-    (sums, number), sound = _sums(ranges, half), np.zeros(len(readings), bool)
-    for place in sorted(np.ndindex(3, 3), key=lambda each: each != (1, 1)):  # most lie on the one about them
-        rest = np.flatnonzero(~sound)
-        own = [index[rest] for index in at]
-        steps = zip(own, place, half, ranges.shape, strict=True)
-        centre = tuple(np.clip(i + (k - 1) * h, 0, n - 1) for i, k, h, n in steps)
-        plane, there, good = _planes(sums[(..., *centre)], own, ranges.shape, 1.3 * sigma)
-        good &= sums[0, 0][centre] >= share * number
-        good &= rise is None or np.abs(plane[:, 1 + rise[0]]) * there**2 < rise[1][rest]
-        sound[rest] = good & (np.abs(readings[rest] - there) <= SIGMAS * sigma)
-    return sound
-
-
-def _thin(ranges, at, spots, lrf):
+def _thin(table, ranges, at, spots, lrf):
     """Readings at (line, beam) a little before one plane on both sides of a strip as narrow as the spot."""
     valid, found = np.isfinite(ranges), np.zeros(len(at[0]), bool)
     count = np.maximum(uniform_filter(valid.astype(float), 3, mode="constant"), 1e-9)
     mean = (uniform_filter(np.where(valid, ranges, 0.0), 3, mode="constant") / count)[at]
-    long, inner, outer = _samples(spots, 0.375, 1), _samples(spots, 1.0, 1), _samples(spots, 2.0, 2)
+    long, inner, outer = ([n[at] for n in _samples(spots, *how)] for how in ((0.375, 1), (1.0, 1), (2.0, 2)))
     for d in (0, 1):  # strips along beams, along lines
-        for (along, *across), mine in _groups(at, long[1 - d], outer[d], inner[d]):
-            own = tuple(index[mine] for index in at)
-            (far, number), (near, fewer) = (_sums(ranges, np.roll([n, along], d)) for n in across)
-            _, there, good = _planes((far - near)[(..., *own)], own, ranges.shape, 1.3 * lrf.sigma_range)
-            good &= (far - near)[0, 0][own] >= 0.8 * (number - fewer)
-            depth = (there - ranges[own]) / lrf.sigma_range
-            found[mine] |= good & (depth > SIGMAS) & (depth < 10) & (there - mean[mine] > SIGMAS * lrf.sigma_range)
+        whole, strip = ((n[0], long[1]) if d == 0 else (long[0], n[1]) for n in (outer, inner))
+        (far, number), (near, fewer) = _sums(table, at, whole), _sums(table, at, strip)
+        _, there, good = _planes(far - near, at, 1.3 * lrf.sigma_range)
+        good &= (far - near)[:, 0, 0] >= 0.8 * (number - fewer)
+        depth = (there - ranges[at]) / lrf.sigma_range
+        found |= good & (depth > SIGMAS) & (depth < 10) & (there - mean > SIGMAS * lrf.sigma_range)
     return found
 
 
@@ -466,19 +452,41 @@ def grid_normals(points, origins):
     share = uniform_filter(valid.astype(float)[..., None], size, mode="constant")
     whole = np.maximum(share, 0.5 / n**2)
     mean = uniform_filter(p, size, mode="constant") / whole
-    square = uniform_filter((p[..., :, None] * p[..., None, :]).reshape(p.shape[:2] + (9,)), size, mode="constant")
-    spread = (square / whole).reshape(p.shape + (3,)) - mean[..., :, None] * mean[..., None, :]
-    values, vectors = np.linalg.eigh(spread)
-    rough = np.where((share[..., 0] > 1 / 3) & (values[..., 1] > 0), np.maximum(values[..., 0], 0.0), np.inf)
-    best, normals = np.full(valid.shape, np.inf), np.full(p.shape, np.nan)
-    i, j = np.indices(valid.shape)
-    for a, b in np.ndindex(3, 3):
-        at = np.clip(i + (a - 1) * WINDOW, 0, len(i) - 1), np.clip(j + (b - 1) * WINDOW, 0, j.shape[1] - 1)
-        flatter = valid & (rough[at] < best)
-        best = np.where(flatter, rough[at], best)
-        normals = np.where(flatter[..., None], vectors[at][..., :, 0], normals)
-    away = np.sum(normals * (points - origins), axis=-1, keepdims=True) > 0
-    return np.where(away, -normals, normals), np.sqrt(np.where(np.isfinite(best), best, np.nan))
+    i, j = np.triu_indices(3)
+    square = uniform_filter(p[..., i] * p[..., j], size, mode="constant")
+    least, middle, across = flattest(*np.moveaxis(square / whole - mean[..., i] * mean[..., j], -1, 0))
+    rough = np.where((share[..., 0] > 1 / 3) & (middle > 0), np.maximum(least, 0.0), np.inf)
+    places = np.indices(valid.shape)[:, None] + WINDOW * (np.indices((3, 3)).reshape(2, 9, 1, 1) - 1)
+    places = np.clip(places, 0, np.array(valid.shape)[:, None, None, None] - 1)
+    flat = np.where(valid, rough[tuple(places)], np.inf)
+    chosen = np.argmin(flat, axis=0)[None]
+    best = np.take_along_axis(flat, chosen, axis=0)[0]
+    normals = across[tuple(np.take_along_axis(places, chosen[None], axis=1)[:, 0])]
+    scatter = np.sqrt(np.where(np.isfinite(best), best, np.nan))
+    away = np.sum(normals * (points - origins), axis=-1) > 0
+    return np.where(away, -1.0, np.where(np.isfinite(best), 1.0, np.nan))[..., None] * normals, scatter
+
+
+def flattest(xx, xy, xz, yy, yz, zz):
+    """The least and the middle eigenvalue (...) of covariances of points, and the direction (..., 3) of the least.
+
+    In closed form, many times as fast as LAPACK on as many small matrices (Smith 1961).
+    """
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    p = np.maximum(np.sqrt((a * a + b * b + c * c) / 6 + (xy * xy + xz * xz + yz * yz) / 3), 1e-100)
+    half = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / (2 * p**3)
+    turn = np.arccos(np.clip(half, -1, 1)) / 3
+    most, least = (2 * p * np.cos(turn + shift) for shift in (0.0, 2 * np.pi / 3))
+    a, b, c = a - least, b - least, c - least
+    # columns of the adjugate of the matrix without it all point across; the longest is the most precise
+    u, v, w = xy * yz - xz * b, xz * xy - a * yz, xz * yz - xy * c
+    columns = np.stack([[b * c - yz * yz, w, u], [w, a * c - xz * xz, v], [u, v, a * b - xy * xy]])
+    longest = np.argmax(columns[[0, 1, 2], [0, 1, 2]], axis=0)[None, None]
+    across = np.take_along_axis(columns, longest, axis=0)[0]
+    x, y, z = across / np.maximum(np.sqrt(np.sum(across**2, axis=0)), 1e-300)
+    least = x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + zz * z * z  # to all digits
+    return least, 2 * mean - most - least, np.stack([x, y, z], axis=-1)
 
 
 COLUMNS = {  # of a PLY file, of attributes that are no single float by the attribute's own name

@@ -6,9 +6,8 @@ import math
 import threading
 
 from lrfcal_lib.drivers import pelco_d, port
-from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, SET_TILT, UP, HeadLine, encode_extended, encode_frame
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
+from lrfcal_lib.drivers.port import REAL, DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
 
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s

@@ -4,9 +4,8 @@ import logging
 import math
 
 from lrfcal_lib.drivers import lms2xx_link as wire
-from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx_link import POINTS, RATES, Assembler, Link, ScanClock, ScanReader
-from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
 
@@ -41,7 +40,7 @@ class LMS2xx(Closed):
     clock : callable, optional
         Seconds, for the instants of scans; time.time() of the host by default.
     host : Host
-        Machine that the driver runs on; tests have a VirtualHost.
+        Machine that the driver runs on; tests have one of their own.
     **configuration
         Of :meth:`configure`.
 

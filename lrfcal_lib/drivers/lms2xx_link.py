@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
+from lrfcal_lib.drivers.port import REAL, DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session import lms2xx_codec as codec
 
 ACK, NAK = 0x06, 0x15

@@ -4,8 +4,7 @@ import contextlib
 import math
 from dataclasses import dataclass
 
-from lrfcal_lib.drivers.host import REAL
-from lrfcal_lib.drivers.port import LineLost, PortError, line_lost
+from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
 
 SYNC = 0xFF
 FRAME, GENERAL, SHORT = 7, 4, 5  # bytes of a frame and of the kinds of reply

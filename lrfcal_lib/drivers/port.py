@@ -8,6 +8,7 @@ import signal
 import socket
 import termios
 import threading
+import time
 import weakref
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -181,3 +182,31 @@ def ask(path, line, timeout=10.0):
     if not answer.pop("ok"):
         raise ValueError(f"the emulated rig refuses '{line}': {answer['error']}")
     return answer
+
+
+MOMENT_S = 1e-3
+
+
+class Host:
+    """What drivers have of this machine, named as in `time` and `threading`; tests have another one."""
+
+    now, time = staticmethod(time.monotonic), staticmethod(time.time)
+    event, lock = threading.Event, staticmethod(threading.RLock)
+    port, set_rate = staticmethod(open_port), staticmethod(set_rate)
+
+    @staticmethod
+    def sleep(seconds):
+        """Wait; moments are spent awake, since a busy machine gives the processor back late to those who sleep."""
+        end = time.monotonic() + seconds
+        if seconds > MOMENT_S:
+            time.sleep(seconds)
+        while time.monotonic() < end:
+            pass
+
+    @staticmethod
+    def thread(target, name):
+        """A daemon thread that is not started yet."""
+        return threading.Thread(target=target, name=name, daemon=True)
+
+
+REAL = Host()

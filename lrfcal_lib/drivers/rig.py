@@ -11,9 +11,8 @@ from itertools import compress
 import numpy as np
 
 from lrfcal_lib.drivers.head import PanTilt
-from lrfcal_lib.drivers.host import REAL
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, ask
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, ask
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.drivers.video import Camera
 from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of

@@ -1,4 +1,4 @@
 """Devices that are not there: LMS2xx and Pelco-D heads on pseudo-terminals, cameras over HTTP, one simulated world.
 
-With ``Clock(machine=VirtualHost())`` a device lives in virtual time instead, for tests of drivers (`drivers.host`).
+``Clock(machine=...)`` of a machine with a time of its own lets a device live in that: tests of drivers are instant.
 """

@@ -1,7 +1,7 @@
 """A device at the end of a serial line: its clock, the times of its bytes, what can go wrong, and the port it is at.
 
 The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong one garbles bytes as
-on a real line; or, on a VirtualHost, a buffer in memory, and the device goes on while the driver waits.
+on a real line.
 """
 
 import contextlib
@@ -19,15 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.host import REAL, VirtualHost
-from lrfcal_lib.drivers.port import PortError
+from lrfcal_lib.drivers.port import REAL
 
 RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port, or switched a fault on
 FASTEST = 8.0  # at 16 times, threads of a program get the processor too seldom to read a line at 500000 Bd
 DELAY_S, PAUSE_S, AWAY_S = 0.7, 0.08, 0.5  # of the faults 'delay', 'pause' and 'unplug'
-ROOM = 4095  # bytes that a port keeps until they are read
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
 SENDING = "sending"  # tag of what is planned for the bytes on their way out
 
@@ -223,7 +221,7 @@ class SerialDevice:
 
     def __init__(self, kind, path, clock, seed=0):
         self.path, self.clock, self.error = str(path), clock, None
-        self.port = (_Memory if isinstance(clock.machine, VirtualHost) else _Terminal)(self)
+        self.port = getattr(clock.machine, "terminal", Terminal)(self)  # a test's is in memory
         self.faults = Faults(kind, seed, clock.machine, self.port.wake)
         self.counts = dict.fromkeys(("received", "sent", "lost", "unheard", "garbled"), 0)
         self._agenda, self._order, self._last, self.busy_until, self._heard = [], itertools.count(), {}, 0.0, 0.0
@@ -327,75 +325,7 @@ class SerialDevice:
         self.counts["lost"] += len(data) - done
 
 
-class _Memory:
-    """A port in memory, of a device on a VirtualHost: both ends, the program's as far as a serial.Serial is used.
-
-    What was unplugged stays lost for the program that holds it; the device gets a new one.
-    """
-
-    def __init__(self, device):
-        self.port, self.device, self.machine, self.wake = device.path, device, device.clock.machine, device.advance
-        self.open, self.lost, self.data = False, False, b""
-
-    there = property(lambda self: self.port in self.machine.ports)
-    rate = property(lambda self: self.baudrate if self.open else 0)
-
-    def start(self):
-        self.machine.devices.append(self.device)
-
-    def end(self):
-        with contextlib.suppress(ValueError):
-            self.machine.devices.remove(self.device)
-        self.unplug()
-
-    def plug(self):
-        self.machine.ports[self.port] = self._opened
-
-    def unplug(self):
-        self.machine.ports.pop(self.port, None)
-        self.lost, self.open, self.device.port = True, False, _Memory(self.device)
-
-    def put(self, data):
-        data = data[: ROOM - len(self.data)]
-        self.data += data
-        return len(data)
-
-    # the end of the program
-
-    def _opened(self, baudrate, timeout):
-        if self.open:
-            raise PortError(f"the port {self.port} is busy, held by another program: close that program")
-        self.baudrate, self.timeout, self.open, self.data = baudrate, timeout, True, b""
-        return self
-
-    def _here(self):
-        if self.lost:
-            raise OSError(f"{self.port} was unplugged")
-
-    @property
-    def in_waiting(self):
-        self._here()
-        return len(self.data)
-
-    def read(self, size=1):
-        self.machine.wait(lambda: self.lost or len(self.data) >= size, self.timeout)
-        self._here()
-        found, self.data = self.data[:size], self.data[size:]
-        return found
-
-    def write(self, data):
-        self._here()
-        self.device.hear(bytes(data))
-
-    def reset_input_buffer(self):
-        self._here()
-        self.data = b""
-
-    def close(self):
-        self.open = False
-
-
-class _Terminal(threading.Thread):
+class Terminal(threading.Thread):
     """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come, something is due, or LOOK_S."""
 
     def __init__(self, device):

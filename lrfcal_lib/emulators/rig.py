@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lrfcal_lib.drivers.host import REAL
+from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.drivers.rig import host_clock
 from lrfcal_lib.emulators.head import FEEDBACK, REPLIES, EmulatedHead
 from lrfcal_lib.emulators.line import FAULTS, Clock
@@ -64,7 +64,7 @@ class EmulatedRig:
     rest_s
         Of :class:`CameraServer`.
     machine : Host
-        On a VirtualHost the ports are in memory.
+        Whose time the devices live in, and whose ``terminal(device)`` their ports are.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.scenes import with_sigma
-from lrfcal_lib.evaluate.tables import edge_misses_px, handed_over, joint_fit, plane_residuals_of, rms
+from lrfcal_lib.evaluate.tables import handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.session.read import open_session
@@ -66,8 +66,7 @@ def _camera(calibration, camera, method, solution):
     edge, model = edge_residuals_px(obs, solution.transform, solution.model), calibration.prepared.models[camera]
     misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution))}
     if method == "joint":
-        edge_px = rms(edge_misses_px(calibration.joint, camera))
-        misfit = {"edge_rms_px": edge_px, "plane_rms_mm": joint_fit(calibration.joint)["plane_rms_mm"]}
+        misfit = joint_fit(calibration.joint, [camera])
     model = solution.model or model
     lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), model.parameters.tolist(), strict=True))
     return {

@@ -552,15 +552,15 @@ def edge_bias_mm(joint):
     return beams.groupby(["placement", "edge", "distance_m"], sort=False).mean().reset_index()
 
 
-def joint_fit(joint):
+def joint_fit(joint, cameras=None):
     """How well ranges and edges fit the joint estimate: ``plane_rms_mm`` and ``edge_rms_px``.
 
     Of face points from their boards, and of all half-step crossings of scan lines from the image edges, the estimated
-    edge bias taken off, over all cameras.
+    edge bias taken off, over all cameras or those named.
     """
     solution = joint.solution
     plane = on_board(solution.state, solution.data)[..., 2][solution.data.face["used"]]
-    edges = [edge_misses_px(joint, camera) for camera in joint.observations.cameras]
+    edges = [edge_misses_px(joint, camera) for camera in cameras or joint.observations.cameras]
     return {"plane_rms_mm": 1000 * rms(plane), "edge_rms_px": rms(np.concatenate(edges))}
 
 

@@ -464,7 +464,8 @@ def _of_residuals(solution):
         ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
         worst = max(ratio, key=ratio.get)
     what = "the axis" if worst == "axis" else f"camera '{worst}'"
-    noise = {"ranges": solution.noise["face_scale"], "images": solution.noise.get("view_scale", 1.0)}
+    images = solution.noise.get("view_scale", 1.0) / np.hypot(1.0, solution.lens_scale)  # with intrinsics as stated
+    noise = {"ranges": solution.noise["face_scale"], "images": images}
     large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
     share = solution.noise["face_share"]  # beams about an edge always repeat errors: they share a background
     return [

@@ -69,6 +69,8 @@ class JointSolution:
         Placements (and, under names of their own, cameras and single images) left out, with the reason.
     lens : ndarray, shape (c, c)
         The part of the covariances that comes from the intrinsics, which all placements share.
+    lens_scale : float
+        By how much errors of the intrinsics let board poses in images scatter, in stated standard deviations.
     warnings : tuple of str
         What is suspicious: no convergence, noise that contradicts what is stated, a weak axis, errors of the pitch that
         the data ask for.
@@ -87,6 +89,7 @@ class JointSolution:
     misfit: dict
     excluded: dict
     lens: np.ndarray
+    lens_scale: float
     warnings: tuple
 
     @property
@@ -536,7 +539,7 @@ def finished(obs, state, data, unknowns, excluded, required):
         shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=MOST_STEPS,
         tolerance=LAST_STEP, n_observations=count_rows(obs),
     )  # fmt: skip
-    lens = joint_noise.lens_covariance(obs, found, data, unknowns)
+    lens, lens_scale = joint_noise.lens_covariance(obs, found, data, unknowns)
     spread = None if found.covariance_placements is None else found.covariance_placements + lens
     found = replace(found, covariance=found.covariance + lens, covariance_placements=spread)
     state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, unknowns), obs.placements.tolist()
@@ -551,5 +554,6 @@ def finished(obs, state, data, unknowns, excluded, required):
         noise={name: float(getattr(data, name)) for name in levels}
         | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
         misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),
-        excluded=excluded, lens=lens, warnings=joint_noise.joint_warnings(blocks, data, unknowns, found, obs.cameras),
+        excluded=excluded, lens=lens, lens_scale=lens_scale,
+        warnings=joint_noise.joint_warnings(blocks, data, unknowns, found, obs.cameras),
     )  # fmt: skip

@@ -43,25 +43,35 @@ def pose_by_intrinsics(T_camera_board, corners, model):
 
 
 def lens_covariance(obs, found, data, unknowns):
-    """Covariance (c, c) of the shared unknowns from those of the intrinsics; zeros where they are taken to be exact."""
+    """Covariance (c, c) of the shared unknowns from those of the intrinsics, and the scatter of views that these cause.
+
+    The latter in stated standard deviations, like the scale of views: what no unknown can take up of the error that all
+    views of a camera share. Zeros where intrinsics are taken to be exact.
+    """
     c = unknowns.shared
-    total = np.zeros((c, c))
+    total, square = np.zeros((c, c)), 0.0
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
-        return total
+        return total, square
     block = view_block(found.state, data, unknowns)
     J, used = whiten(block)[1], data.view["used"]
     lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
     weighted = np.sqrt(found.weights[..., None]) * found.jacobian
     hessian = np.swapaxes(weighted, -1, -2) @ weighted
-    back = eliminate(hessian, np.zeros(hessian.shape[:2]), c)[2]
-    reduced = J[..., :c] - J[..., c:] @ back[..., :c]
+    own = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
+    reduced = J[..., :c] - J[..., c:] @ own @ hessian[:, c:, :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
     for camera, spread in enumerate(obs.lens_covariance):
         mine = (used & (data.view["camera"] == camera))[..., None, None]
         shift = (block.whitener @ (lens * mine)).reshape(J.shape[:2] + (LENS,))
         gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
-        total = total + gain @ spread @ gain.T
-    return total
+        left = shift - reduced @ gain - J[..., c:] @ (own @ (np.swapaxes(J[..., c:], -1, -2) @ shift))
+        total, square = total + gain @ spread @ gain.T, square + np.sum(left @ spread * left)
+    return total, float(data.view_scale[0] * np.sqrt(square / (6 * used.sum() * _freedom(used))))
+
+
+def _freedom(used):
+    """Share of the residuals of views that is left to them: the boards' own poses take up the rest."""
+    return max(1 - used.any(axis=1).sum() / max(used.sum(), 1), LEAST_FREEDOM)
 
 
 def estimate_noise(state, data, unknowns):
@@ -148,7 +158,7 @@ def view_levels(data, block, state):
     lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
     turned = replace(data, direction=np.ones(len(data.direction)))
     by_pitch = view_block(state, turned, lone).jacobian[..., 0].reshape(used.shape + (6,))
-    free = max(1 - used.any(axis=1).sum() / max(used.sum(), 1), LEAST_FREEDOM)  # the boards' own poses take up the rest
+    free = _freedom(used)
 
     def level(sigma):
         """Negative log likelihood at an error of the pitch of images, and the data with the scale that fits it."""
