@@ -94,8 +94,9 @@ def calibrated(path):
 
 
 LONGEST = (
-    "test_notebooks", "test_notebooks_recording", "test_golden", "test_record_emulated", "test_notebooks_scant",
-    "test_image", "test_report", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
+    "test_notebooks", "test_notebooks_recording", "test_golden", "test_notebooks_scant", "test_falsified",
+    "test_panel_browser", "test_image", "test_report", "test_joint_bad_input", "test_record_emulated",
+    "test_alternatives", "test_camera_solver", "test_joint", "test_record_bad_input", "test_real_lms400",
 )  # fmt: skip
 ALONE = ("test_stored_outputs_and_golden_tables", "test_tables_of")  # a notebook each
 

@@ -257,7 +257,7 @@ def emulated(name):
         rig = EmulatedRig(name)
         return rig, rig.rig_file, clock
     begun, (setup, placements) = clock(), practice_setup()
-    rig = EmulatedRig(setup, placements=placements, time_scale=FAST, platform={"settle": 0.0}, rest_s=1.0,
+    rig = EmulatedRig(setup, placements=placements, time_scale=FAST, platform={"settle": 0.0},
                       head_options={"baudrate": 38400, "go_speed": 60.0})  # fmt: skip
     return rig, lambda: quick_file(rig), lambda: begun + FAST * (clock() - begun)
 
