@@ -12,7 +12,7 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter, segments
-from lrfcal_lib.preprocess.edges_in_scan import ScanSide, edge_points, straight_runs, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import ScanSide, crossings, edge_points, straight_runs, sweep_edges
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
@@ -323,11 +323,9 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_varia
     assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {x.side for x in columns.sides}
     names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
     assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
-    for e, function in ((lines, edge_points), (columns, sweep_edges)):
-        last = function(b, "last_beam")
+    along, sides = crossings(b)
+    for e, last in ((lines, along["last_beam"]), (columns, crossings(b, True, sides)[0]["last_beam"])):
         np.testing.assert_array_equal([e.side, e.line], [last.side, last.line])
-        with pytest.raises(ValueError, match="variant is one of last_beam, half_step, got 'middle'"):
-            function(b, "middle")
 
 
 def directions(s, e):
