@@ -15,6 +15,7 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_stored_as_run_from_top_to_bottom(path):
     notebook = read(path)
     nbformat.validate(notebook)
+    assert len({cell.id for cell in notebook.cells}) == len(notebook.cells)
     run = [cell for cell in code_cells(notebook) if "nbval-skip" not in cell.metadata.get("tags", [])]
     assert [cell.execution_count for cell in run] == list(range(1, len(run) + 1))
     assert notebook.metadata.kernelspec.name == "python3"
