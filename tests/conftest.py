@@ -10,7 +10,7 @@ from tempfile import mkdtemp
 
 import matplotlib
 import pytest
-from shared import FOLDER, ROOT, chromium, shared_folder, stages
+from shared import FOLDER, QUICK, ROOT, chromium, shared_folder, stages
 
 matplotlib.use("Agg")
 sys.modules["rfc3987_syntax"] = None  # a grammar of internet addresses, which nbformat would load: 3 s a process
@@ -72,19 +72,31 @@ def lms400_session(real_data):
 
 @pytest.fixture(scope="session")
 def lms400(lms400_session):
-    """The calibrated recording; what the notebooks of this test run have worked out of it is not done again."""
+    """The calibrated recording."""
+    return calibrated(lms400_session)
+
+
+@pytest.fixture(scope="session")
+def quick():
+    """The calibrated small session."""
+    return calibrated(QUICK)
+
+
+def calibrated(path):
+    """A Calibration; what the notebooks of this test run have worked out of a session is not done again."""
     from lrfcal_lib.calibrate import pipeline
     from lrfcal_lib.session import cache
     from lrfcal_lib.session.read import open_session
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(cache.VARIABLE, str(stages()))
-        return pipeline.calibrate(open_session(lms400_session))
+        return pipeline.calibrate(open_session(path))
 
 
 LONGEST = (
-    "test_notebooks", "test_notebooks_recording", "test_golden", "test_record_emulated", "test_notebooks_scant",
-    "test_image", "test_report", "test_panel_browser", "test_record_bad_input", "test_real_lms400", "test_fuzz",
+    "test_notebooks", "test_notebooks_recording", "test_golden", "test_notebooks_scant", "test_falsified",
+    "test_panel_browser", "test_image", "test_report", "test_joint_bad_input", "test_record_emulated",
+    "test_alternatives", "test_camera_solver", "test_joint", "test_record_bad_input", "test_real_lms400",
 )  # fmt: skip
 ALONE = ("test_stored_outputs_and_golden_tables", "test_tables_of")  # a notebook each
 

@@ -84,7 +84,7 @@ class Head:
             self.note()
         return self.sweep is not None and abs(self.true(self.clock()) - self.sweep[2]) > 1e-9
 
-    def finish_sweep(self, timeout=None):
+    def finish_sweep(self):
         self.clock.now += 0.05
         self.note()
         self.at, self.sweep_done, self.sweep = self.sweep[2], self.sweep, None

@@ -62,7 +62,7 @@ def moved(pose, by=(0.0, 0.0, 0.15)):
     return out
 
 
-def longer_lens(obs, camera=0, factor=1.03):
+def longer_lens(obs, camera=1, factor=1.03):
     """A focal length stated too long puts one camera's boards farther away."""
     pose = obs.view_pose.copy()
     pose[obs.view_camera == camera, 2, 3] *= factor

@@ -5,15 +5,20 @@ Hooked into ``notebook.save`` wherever tests run notebooks: a figure is looked a
 
 import itertools
 import re
+from unittest.mock import patch
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.text import Text
 from mpl_toolkits.mplot3d.art3d import Text3D
+
+from lrfcal_lib.report import notebook
 
 REPORT_WIDTH, SMALLEST = 10.8, 8.0  # inches at which a report shows a wide figure: 68 rem less the margins; points
 COUNTS = {"iteration", "placement", "placements", "scan line"}
 COUNTS |= {"chi-square per degree of freedom", "probability density"}  # have no unit
 SLACK = 1.0  # pixels
+LAYOUT = "figure.constrained_layout.use"  # drawing gives a figure without engine this one
 
 
 def complaints(fig, renderer):
@@ -89,13 +94,18 @@ def about_texts(fig, boxes):
 
 
 def checked(save, told=None):
-    """A ``notebook.save`` that looks at what it draws: complaints are added to the list `told`, or raised."""
+    """A ``notebook.save`` that looks at what it drew: complaints are added to the list `told`, or raised.
+
+    It writes no files. The figure is laid out a second time, which settles it as in a report.
+    """
 
     def save_and_look(fig, name, caption, *, main=True):
         found = []
-        fig.canvas.mpl_connect("draw_event", lambda drawn: found.append(complaints(fig, drawn.renderer)))
-        save(fig, name, caption, main=main)
-        words = [f"{name}: {complaint}" for complaint in found[-1]] if found else []
+        with patch.object(notebook, "report_file", lambda name: None), plt.rc_context({LAYOUT: False}):
+            save(fig, name, caption, main=main)
+            fig.canvas.mpl_connect("draw_event", lambda drawn: found.extend(complaints(fig, drawn.renderer)))
+            fig.draw_without_rendering()
+        words = [f"{name}: {complaint}" for complaint in found]
         assert told is not None or not words, "\n".join(words)
         told is None or told.extend(words)
 

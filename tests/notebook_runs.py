@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from shared import ROOT, stages
 
-from lrfcal_lib.report.notebook import asked, save
+from lrfcal_lib.report.notebook import asked, report_file, save
 from lrfcal_lib.session import cache
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -61,13 +61,16 @@ def run_plainly(path, session, folder, report):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
     After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures must be
-    legible, with titles and units.
+    legible, with titles and units. Of its files only the tables are written.
     """
     ended, complaints = [], []
 
     def heard(possible, why, *, rest=False):
         ended.extend([why] * bool(rest and not possible))
         return asked(possible, why)
+
+    def tables_only(name):
+        return report_file(name) if name.startswith("tables/") else None
 
     told, names = io.StringIO(), {"display": lambda shown: None}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told), matplotlib.rc_context():
@@ -76,6 +79,7 @@ def run_plainly(path, session, folder, report):
             patch.setenv(name, str(value))
         patch.setattr("lrfcal_lib.report.notebook.save", figure_checks.checked(save, complaints))
         patch.setattr("lrfcal_lib.report.notebook.asked", heard)
+        patch.setattr("lrfcal_lib.report.notebook.report_file", tables_only)
         for number, cell in enumerate(code_cells(read(path))):
             if ended:
                 break

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import numeric
 
 from lrfcal_lib.model import camera as c
@@ -51,13 +50,3 @@ def test_line_distance_is_signed_and_in_pixels():
 def test_a_line_through_one_point_is_refused():
     with pytest.raises(ValueError, match="two different points"):
         c.line_through([1, 2], [1, 2])
-
-
-def test_board_lines_project_with_their_side():
-    pose = RigidTransform.from_components([0.1, -0.2, 1.7], Rotation.from_rotvec([0.3, -0.4, 0.9]))
-    board_line = np.array([0.6, 0.8, -0.35])
-    on_line, outside = np.array([[0.35 * 0.6 + 0.8 * s, 0.35 * 0.8 - 0.6 * s, 0] for s in (-0.3, 0.2)]), [0.9, 0.9, 0]
-    line = c.board_line_in_image(board_line, pose, MODEL)
-    np.testing.assert_allclose(c.line_distance(c.pinhole(pose.apply(on_line), MODEL), line), 0, atol=1e-9)
-    assert c.line_distance(c.pinhole(pose.apply(outside), MODEL), line) > 0
-    assert np.hypot(*line[:2]) == pytest.approx(1)

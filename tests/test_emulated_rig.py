@@ -254,7 +254,7 @@ def test_own_placements_and_unknown_setups(tmp_path):
     assert signal.getsignal(signal.SIGHUP) is before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_line_cleans_up(tmp_path, number):
     file, folder = tmp_path / "rig.json", tmp_path / "ports"
     code = "import sys; from lrfcal_lib.emulators.rig import main; sys.exit(main(sys.argv[1:]))"

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
-from lrfcal_lib.model.camera import CameraModel, board_line_in_image, line_distance, pinhole, project, undistort
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
 from lrfcal_lib.preprocess.edges_in_image import correlation_factor, picked_edge, refine_edge
@@ -109,7 +109,8 @@ def on_board(pose, xy, camera=pinhole):
 
 
 def true_line(name, pose, board=SHEET):
-    return board_line_in_image(board.lines()[board.edges.index(name)], pose, MODEL)
+    line = np.linalg.solve((MODEL.matrix @ pose.as_matrix()[:3, [0, 1, 3]]).T, board.lines()[board.edges.index(name)])
+    return line / np.hypot(line[0], line[1])
 
 
 def worst_edge(view, pose, board=SHEET):

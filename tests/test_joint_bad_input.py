@@ -1,6 +1,7 @@
 """The joint estimate on recordings that cannot work: a name for what is wrong, never a plausible wrong number."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -72,11 +73,11 @@ def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
     assert worst(found, truth) < 4.5
 
 
-@MOUNTS
-@pytest.mark.parametrize("share", [0.5, 1.0])
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize(
+    ("mount", "share", "seed"), [("head", 0.5, 5), ("head", 1.0, 3), ("platform", 0.5, 4), ("platform", 1.0, 5)]
+)
 def test_many_mislabelled_placements_are_refused(mount, share, seed):
-    obs, *_ = draw(rng(seed), 20, mount=mount)
+    obs, *_ = draw(rng(seed), 16, mount=mount)
     with pytest.raises(DegenerateGeometry, match="contradict .*right numbers"):
         solve_joint(mislabelled(obs, share, rng(seed)))
 
@@ -88,22 +89,32 @@ def test_a_camera_that_sees_nothing_is_named(mount):
         solve_joint(obs.keep(view=obs.view_camera == 0))
 
 
-@MOUNTS
-@pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 10.0, 1e3])
-@pytest.mark.parametrize("kind", ["face", "view"])
-def test_contradictory_noise_is_repaired_from_the_data(mount, factor, kind):
+@lru_cache
+def honest(mount):
+    """Sigmas of the axis where the noise is stated as it is."""
+    return solve_joint(draw(rng(), mount=mount)[0], noise="estimate").solution.sigma[:4]
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor", "mount"),
+    [("face", 1e-3, "head"), ("face", 0.1, "platform"), ("face", 1e3, "platform"), ("view", 1e-3, "platform"),
+     ("view", 10.0, "head"), ("view", 1e3, "head")],
+)  # fmt: skip
+def test_contradictory_noise_is_repaired_from_the_data(kind, factor, mount):
     obs, truth, _ = draw(rng(), mount=mount)
     found = solve_joint(mis_stated(obs, kind, factor), noise="estimate")
     level = found.noise["face_scale" if kind == "face" else "view_scale"]
     assert 0.7 < level * factor < 1.4
     assert worst(found, truth) < 4.5
-    sigma = solve_joint(obs, noise="estimate").solution.sigma[:4]
-    assert np.allclose(found.solution.sigma[:4], sigma, rtol=0.15)
+    assert np.allclose(found.solution.sigma[:4], honest(mount), rtol=0.15)
 
 
-@pytest.mark.parametrize("factor", [1e-3, 0.1, 10.0, 1e3])
-@pytest.mark.parametrize(("kind", "words"), [("face", "ranges scatter"), ("view", "camera 'left' scatter")])
-def test_contradictory_noise_is_said_when_it_is_kept(factor, kind, words):
+@pytest.mark.parametrize(
+    ("kind", "factor", "words"),
+    [("face", 0.1, "ranges scatter"), ("face", 1e3, "ranges scatter"), ("view", 1e-3, "camera 'left' scatter"),
+     ("view", 10.0, "camera 'left' scatter")],
+)  # fmt: skip
+def test_contradictory_noise_is_said_when_it_is_kept(kind, factor, words):
     obs, *_ = draw(rng())
     found = solve_joint(mis_stated(obs, kind, factor), required=False)
     assert any(words in warning and "noise='estimate'" in warning for warning in found.warnings)

@@ -20,13 +20,8 @@ from lrfcal_lib.solvers.joint import solve_again, solve_joint
 
 
 @pytest.fixture(scope="module")
-def found():
-    return pipeline.calibrate(open_session(QUICK), methods=("line", "zhang_pless"))
-
-
-@pytest.fixture(scope="module")
-def joint(found):
-    return pipeline.leave_out(found.joint, groups=4)
+def joint(quick):
+    return pipeline.leave_out(quick.joint, groups=4)
 
 
 @pytest.fixture(scope="module")
@@ -105,21 +100,21 @@ def test_corrections_undo_what_the_estimate_found(joint):
     np.testing.assert_allclose(pitch, np.array([0.1, -0.2]) * (1 + solution.sensor["pitch_scale"]))
 
 
-def test_it_is_handed_over_with_its_platform_and_sensor(found):
-    assert tables.handed_over(found) == "joint"
-    record = calibration_record(found, "joint")
-    np.testing.assert_allclose(record["platform"]["matrix"], found.joint.solution.T_head_lrf.as_matrix())
-    assert set(record["cameras"]) == set(found.joint.observations.cameras)
+def test_it_is_handed_over_with_its_platform_and_sensor(quick):
+    assert tables.handed_over(quick) == "joint"
+    record = calibration_record(quick, "joint")
+    np.testing.assert_allclose(record["platform"]["matrix"], quick.joint.solution.T_head_lrf.as_matrix())
+    assert set(record["cameras"]) == set(quick.joint.observations.cameras)
     assert record["sensor"]["range_offset"]["sigma"] > 0 and record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
-    assert min(edges) <= tables.joint_fit(found.joint)["edge_rms_px"] <= max(edges)
-    assert "sensor" not in calibration_record(found, "line")
+    assert min(edges) <= tables.joint_fit(quick.joint)["edge_rms_px"] <= max(edges)
+    assert "sensor" not in calibration_record(quick, "line")
 
 
-def test_what_did_not_converge_is_not_handed_over(found):
-    bad = replace(found.joint.solution, solution=replace(found.joint.solution.solution, converged=False))
-    assert tables.handed_over(replace(found, joint=replace(found.joint, solution=bad))) in ("line", "zhang_pless")
+def test_what_did_not_converge_is_not_handed_over(quick):
+    bad = replace(quick.joint.solution, solution=replace(quick.joint.solution.solution, converged=False))
+    assert tables.handed_over(replace(quick, joint=replace(quick.joint, solution=bad))) in ("line", "zhang_pless")
 
 
 def test_boards_of_unknown_size_in_the_coloured_cloud(joint):
@@ -148,11 +143,11 @@ def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_bo
             assert other[placement][0].lengths[name] == pytest.approx(length, abs=1e-5)
 
 
-def other_session(found, **changes):
+def other_session(quick, **changes):
     """The calibration of a session whose images are not as they were."""
-    session = found.prepared.session
+    session = quick.prepared.session
     records = tuple(replace(record, **changes) for record in session.image_records)
-    return replace(found, prepared=replace(found.prepared, session=replace(session, image_records=records)))
+    return replace(quick, prepared=replace(quick.prepared, session=replace(session, image_records=records)))
 
 
 BAD = {
@@ -171,15 +166,15 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_colour_a_cloud_is_refused(found, case):
+def test_what_cannot_colour_a_cloud_is_refused(quick, case):
     change, method, words = BAD[case]
     with pytest.raises(ValueError, match=words):
-        pipeline.color_cloud(change(found), method)
+        pipeline.color_cloud(change(quick), method)
 
 
-def test_lengths_between_features_know_how_good_they_are(found):
+def test_lengths_between_features_know_how_good_they_are(quick):
     """Two halves of one face are no distance apart across it, and half a board along it."""
-    cloud, solution, offs = pipeline.color_cloud(found, "joint"), found.joint.solution, []
+    cloud, solution, offs = pipeline.color_cloud(quick, "joint"), quick.joint.solution, []
     for placement in np.unique(cloud.placement):
         rows = np.flatnonzero(cloud.placement == placement)
         x = cloud.points[rows, 0]
@@ -213,10 +208,10 @@ def test_what_is_known_of_a_board_is_differentiated_exactly(joint):
     assert own > 6 and J.any() and np.abs(numeric - J).max() < 2e-2 * np.abs(J).max()
 
 
-def test_an_image_edge_on_a_plane_projects_onto_itself(found):
-    camera, views = next(iter(found.prepared.views.items()))
+def test_an_image_edge_on_a_plane_projects_onto_itself(quick):
+    camera, views = next(iter(quick.prepared.views.items()))
     edge = next(iter(views.values())).edges[0]
-    model = found.prepared.models[camera]
+    model = quick.prepared.models[camera]
     T = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.3]))
     centre, normal = T.inv().apply([0.1, 0.0, 1.7]), T.inv().rotation.apply([0.2, 0.1, -0.97])
     points = edge_on_plane(edge, model, T.inv(), centre, normal)
@@ -226,9 +221,9 @@ def test_an_image_edge_on_a_plane_projects_onto_itself(found):
     np.testing.assert_allclose(uv @ edge.line[:2] + edge.line[2], 0, atol=1e-9)
 
 
-def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(found):
+def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
-    problems = {placement: "a dog ran through" for placement in found.prepared.scans}
-    again = pipeline.with_joint(replace(found, prepared=replace(found.prepared, problems=problems), joint=None))
+    problems = {placement: "a dog ran through" for placement in quick.prepared.scans}
+    again = pipeline.with_joint(replace(quick, prepared=replace(quick.prepared, problems=problems), joint=None))
     assert again.joint is None and "no placement" in again.problems["rig", "joint"]
-    assert again.solutions is found.solutions
+    assert again.solutions is quick.solutions

@@ -9,8 +9,8 @@ from notebook_runs import WITH_SESSION, run_plainly
 from tiny_sessions import record, rectangle
 
 from lrfcal_lib.calibrate.pipeline import calibrate
+from lrfcal_lib.evaluate import verdict
 from lrfcal_lib.evaluate.export import calibrate_session
-from lrfcal_lib.evaluate.verdict import judge
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 
@@ -21,6 +21,7 @@ SCANT = {  # besides, none has images at several pitches
     "blind": {"cameras": [], "placements": 4},  # no camera
     "parallel": {"still": ("turn",), "placements": 3},  # nothing to answer from
 }
+FEW = ("as recorded", "all sizes 5 % too large")  # the whole table is made of three other sessions
 SAYS = {
     ("lines", "01"): "a single scan line",
     ("lines", "03"): "no sweeps with a straight side",
@@ -53,8 +54,9 @@ def scant(request, tmp_path_factory):
      if kind != "parallel" or path.stem > "04"],  # nothing new to ask of its scans
     indirect=["scant"],
 )  # fmt: skip
-def test_runs_to_the_end_and_says_what_is_not_asked(path, scant):
+def test_runs_to_the_end_and_says_what_is_not_asked(path, scant, monkeypatch):
     kind, session, stages = scant
+    monkeypatch.setattr(verdict, "LIES", {name: verdict.LIES[name] for name in FEW})
     told = run_plainly(path, session, stages, stages / "report")
     assert SAYS.get((kind, path.stem[:2]), "") in told
     assert " nan " not in told
@@ -78,7 +80,7 @@ def test_half_of_the_scans_without_ranges_is_a_verdict(tmp_path):
     scans = dict(np.load(path / "lrf/scans.npz"))
     scans["ranges"] = np.where((scans["placement"] > 2)[:, None], np.nan, scans["ranges"])
     np.savez(path / "lrf/scans.npz", **scans)
-    judged = judge(calibrate(open_session(path), ["zhang_pless"]))
+    judged = verdict.judge(calibrate(open_session(path), ["zhang_pless"]))
     told = " ".join(judged.sentences())
     assert judged.answer == "no" and "placements with a board pose and points on the board, at least 3 needed" in told
     assert "placement 3 has" in told and "Record next: 6 or more placements" in told

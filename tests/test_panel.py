@@ -20,6 +20,7 @@ from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.emulators import rig as practice
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.simulate.rig import SETUPS
 
 WAIT_S = 20  # guards against hanging
 VIEW = np.radians([40.0, 140.0])
@@ -412,6 +413,6 @@ def test_shown_with_words_for_those_who_do_not_run_it(panel, monkeypatch):
 
 
 def test_the_emulated_rigs_are_those_that_there_are():
-    assert sorted(collector.PRACTICE_RIGS) == sorted(practice.NAMES)
+    assert sorted(collector.PRACTICE_RIGS) == sorted([practice.PRACTICE, *SETUPS])
     with pytest.raises(ValueError, match="no set-up 'nowhere'"):
         practice.emulated("nowhere")

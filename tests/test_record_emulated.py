@@ -32,7 +32,8 @@ STEP = np.radians(1.25)
 def small_setup():
     """Six placements, coarse sweeps, one camera with known intrinsics and one small image a placement."""
     rig = scaled(sim_quick().rig, 480)
-    setup = replace(sim_quick(), rig=replace(rig, cameras=rig.cameras[:1]), pairs=3, distances=(1.3, 1.7), step=STEP,
+    camera = replace(rig.cameras[0], exposure=replace(rig.cameras[0].exposure, samples=2))
+    setup = replace(sim_quick(), rig=replace(rig, cameras=(camera,)), pairs=3, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0))
     return setup, [replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found]

@@ -12,7 +12,7 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter, segments
-from lrfcal_lib.preprocess.edges_in_scan import ScanSide, edge_points, straight_runs, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import ScanSide, crossings, edge_points, straight_runs, sweep_edges
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
@@ -286,18 +286,18 @@ def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
 # ---------------------------------------------------------------------------------------------- edges
 
 
-@pytest.mark.parametrize("function", [edge_points, sweep_edges])
-def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(function):
+@pytest.mark.parametrize("across", [False, True])
+def test_half_step_is_unbiased_and_last_beam_lies_half_a_step_inside(across):
     errors, spacing = {"last_beam": [], "half_step": []}, 1.65 * np.radians(0.25)
-    rolls = np.linspace(5, 14, 7) if function is edge_points else [3.0]
+    rolls = [3.0] if across else np.linspace(5, 14, 7)
     for s in (scene(pose=facing(roll=roll)) for roll in rolls):
         for variant, own in errors.items():
-            e = function(found(s), variant)
+            e = crossings(found(s), across)[0][variant]
             own.append(s.outwards(e) / spacing)
     last, half = (np.concatenate(own) for own in errors.values())
     assert abs(half.mean()) < 0.1 and -0.65 < last.mean() < -0.35
     assert np.abs(half).max() < 0.75 and last.max() < 0.25
-    if function is sweep_edges:  # columns see the edges that lie along the scan lines
+    if across:  # columns see the edges that lie along the scan lines
         assert {x.end for x in e.sides} == {-1, 1} and np.mean(np.isin(s.edge_errors(e)[1][e.side >= 0], [0, 2])) > 0.97
         assert 0.6 < np.mean((s.edge_errors(e)[0] ** 2 / s.variance(e))[e.side >= 0]) < 1.5
 
@@ -323,11 +323,9 @@ def test_four_sides_are_found_and_named_alike_by_lines_and_columns_in_both_varia
     assert len(lines.sides) == 4 and {x.side for x in lines.sides} == {x.side for x in columns.sides}
     names = [[np.bincount(s.edge_errors(e)[1][e.side == k]).argmax() for k in range(4)] for e in (lines, columns)]
     assert names[0] == names[1] and sorted(names[0]) == [0, 1, 2, 3] and s.worst(lines) < 0.008
-    for e, function in ((lines, edge_points), (columns, sweep_edges)):
-        last = function(b, "last_beam")
+    along, sides = crossings(b)
+    for e, last in ((lines, along["last_beam"]), (columns, crossings(b, True, sides)[0]["last_beam"])):
         np.testing.assert_array_equal([e.side, e.line], [last.side, last.line])
-        with pytest.raises(ValueError, match="variant is one of last_beam, half_step, got 'middle'"):
-            function(b, "middle")
 
 
 def directions(s, e):

@@ -81,7 +81,7 @@ def test_placements_come_in_near_perpendicular_pairs_in_view():
     assert [p.number for p in found] == list(range(1, 25)) and (room.number, room.T_platform_board) == (25, None)
     assert [len(p.image_pitch) for p in found] == [3, 1] * 12
     assert [p.direction for p in found] == [1, -1] * 12
-    distance = [np.linalg.norm(setup.rig.outline(p.T_platform_board).mean(axis=0)) for p in found]
+    distance = [np.linalg.norm(p.T_platform_board.apply(setup.rig.board.points()).mean(axis=0)) for p in found]
     assert 1.1 < min(distance) < 1.5 and 2.7 < max(distance) < 3.2
     for first, second in zip(found[::2], found[1::2], strict=True):
         a, b = (p.T_platform_board.rotation.as_matrix()[:, :2] for p in (first, second))

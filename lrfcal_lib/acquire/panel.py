@@ -26,22 +26,7 @@ LIGHTS = {"ok": (GOOD, "✓", "good"), "warn": (WARN, "!", "check"), "bad": (BAD
 ANSWERS = {"yes": (GOOD, "✓", "can be trusted"), "with care": (WARN, "!", "use with care"),
            "no": (BAD, "✕", "cannot be trusted")}  # fmt: skip
 STATES = {"off": (IDLE, "○", "not connected"), "ready": (GOOD, "●", "ready"), "busy": (WARN, "◐", "busy")}
-STYLE = """<style>
-.lrfcal-panel {font-size: 13px; border: 1px solid var(--jp-border-color2, #d0d7de); border-radius: 8px;
-  padding: 12px 14px; max-width: 1240px; background: var(--jp-layout-color1, #fff)}
-.lrfcal-panel .lrfcal-card {border: 1px solid var(--jp-border-color2, #d0d7de); border-radius: 6px; padding: 8px 12px}
-.lrfcal-panel .widget-html-content, .lrfcal-panel .jupyter-widgets {line-height: 1.4}
-.lrfcal-panel img {border-radius: 3px}
-.lrfcal-panel h4 {margin: 0 0 4px; font-size: 13px; font-weight: 600}
-.lrfcal-panel p {margin: 2px 0}
-.lrfcal-panel table {border-collapse: collapse; margin: 6px 0; font-size: 12px}
-.lrfcal-panel td, .lrfcal-panel th {padding: 2px 14px 2px 0; text-align: left; white-space: nowrap}
-.lrfcal-panel .mark {display: inline-block; min-width: 62px; margin-right: 8px; padding: 0 7px; border-radius: 9px;
-  color: #fff; font-size: 11px; font-weight: 600; text-align: center}
-.lrfcal-panel .soft {color: var(--jp-ui-font-color2, #57606a)}
-.lrfcal-panel .light {display: flex; align-items: baseline; margin: 3px 0}
-.lrfcal-panel .lrfcal-stop {font-weight: 700; letter-spacing: 0.5px}
-</style>"""
+STYLE = f"<style>\n{Path(__file__).with_name('panel.css').read_text()}</style>"
 
 
 def mark_html(colour, sign, word):
@@ -354,7 +339,7 @@ class Panel(Closed):
             DRIVERS.addHandler(self.notes)
             parts, collector = self.parts, self.collector
             collector.connect(parts.rig.value.strip(), Path(parts.session.value.strip()).expanduser())
-            low, high = collector.limits_deg
+            low, high = collector.rig.stated.devices.head.pitch_limits_deg
             with parts.slider.hold_trait_notifications():
                 parts.slider.min, parts.slider.max = low, high
             parts.show_pictures(collector.rig.cameras)

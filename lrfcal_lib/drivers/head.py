@@ -510,17 +510,11 @@ class PanTilt(port.Closed):
         self._thread = self._line.host.thread(run, "sweep")
         self._thread.start()
 
-    def finish_sweep(self, timeout=None):
-        """Wait for the end of the sweep; its :attr:`track`.
-
-        NoReply if it goes on after `timeout` s (the head is stopped), DeviceError if it ended too early.
-        """
+    def finish_sweep(self):
+        """Wait for the end of the sweep; its :attr:`track`. DeviceError if it ended too early."""
         if self._thread is None:
             raise DeviceError("there was no sweep: start one")
-        self._thread.join(timeout)
-        if self._thread.is_alive():
-            self.stop()
-            raise NoReply(f"the sweep was not over after {timeout:g} s: the head was stopped")
+        self._thread.join()
         if self._error is not None:
             raise self._error
         return self.track

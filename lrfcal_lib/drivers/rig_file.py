@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, from_json, parse_session, refused
+from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionStated, parse_session, refused
 
 PURPOSES = ("board", "scene")
 MOST_STOPS, FINEST_DEG, MOST_BYTES, MOST_PLACEMENTS = 5000, 1e-3, 10_000_000, 1000
@@ -294,8 +294,8 @@ def read_rig_file(path):
     return rig_of(data, path)
 
 
-class Asked(Stated):
-    """What a rig file states besides what session.json does."""
+class RigFileStated(SessionStated):
+    """All of a rig file: what session.json states, and more."""
 
     devices: Devices
     plan: Plan = Plan()
@@ -306,10 +306,9 @@ def rig_of(data, path=Path("rig.json")):
     try:
         if not isinstance(data, dict):
             raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
-        given = {"name": "rig", "licence": "", "source": "", "simulated": False} | data
-        stated = parse_session(given | {"placements": ()})
-        asked = from_json(Asked, {key: data.get(key) for key in Asked.model_fields})
-        devices, cameras = asked.devices.cameras, stated["cameras"]
+        given = {"name": "rig", "licence": "", "source": "", "simulated": False} | data | {"placements": ()}
+        stated = parse_session({k: v for k, v in given.items() if v is not None}, RigFileStated)
+        devices, cameras = stated["devices"].cameras, stated["cameras"]
         if set(devices) != set(cameras):
             raise ValueError(f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
                              f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip
@@ -320,5 +319,5 @@ def rig_of(data, path=Path("rig.json")):
     except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}
-    shared = {key: stated[key] for key in ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras")}
-    return RigFile(Path(path), about, **shared, devices=asked.devices, plan=asked.plan)
+    rest = ("board", "lrf", "T_head_lrf", "platform_sigma", "cameras", "devices", "plan")
+    return RigFile(Path(path), about, **{key: stated[key] for key in rest})

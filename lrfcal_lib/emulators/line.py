@@ -7,6 +7,7 @@ on a real line.
 import contextlib
 import heapq
 import itertools
+import json
 import math
 import os
 import select
@@ -52,63 +53,25 @@ class Clock:
 
 
 class Fault(NamedTuple):
-    """What can go wrong: with 'lrf', 'head' or both, what happens, and to bytes: (data, place, rng) -> data."""
+    """What can go wrong: with which devices ('lrf', 'head'), and what happens."""
 
-    devices: tuple
+    devices: list
     text: str
-    change: object = None
 
 
-BOTH, LMS, HEAD = ("lrf", "head"), ("lrf",), ("head",)
-FAULTS = {
-    # on the bytes of a reply
-    "drop": Fault(BOTH, "a byte of a reply is lost", lambda d, i, _: d[:i] + d[i + 1 :]),
-    "flip": Fault(BOTH, "a bit of a reply is inverted",
-                  lambda d, i, rng: d[:i] + bytes([d[i] ^ 1 << int(rng.integers(8))]) + d[i + 1 :]),
-    "duplicate": Fault(BOTH, "a byte of a reply comes twice", lambda d, i, _: d[: i + 1] + d[i:]),
-    "insert": Fault(BOTH, "a byte appears within a reply", lambda d, i, rng: d[: i + 1] + rng.bytes(1) + d[i + 1 :]),
-    "swap": Fault(BOTH, "two neighbouring, different bytes of a reply change places",
-                  lambda d, i, _: d[:i] + d[i : i + 2][::-1] + d[i + 2 :]),
-    "blank": Fault(BOTH, "up to four bytes of a reply arrive as zero",
-                   lambda d, i, _: d[:i] + bytes(len(d[i : i + 4])) + d[i + 4 :]),
-    "cut": Fault(BOTH, "a reply ends early", lambda d, i, _: d[:i]),
-    "headless": Fault(BOTH, "a reply lacks its beginning", lambda d, i, _: d[i + 1 :]),
-    "noise": Fault(BOTH, "1 to 20 bytes of noise come before a reply",
-                   lambda d, _, rng: rng.bytes(int(rng.integers(1, 21))) + d),
-    "checksum": Fault(BOTH, "a reply has the wrong checksum",
-                      lambda d, _, rng: d[:-1] + bytes([d[-1] ^ int(rng.integers(1, 256))])),
-    "address": Fault(BOTH, "a reply with a sound checksum comes from another address"),
-    "foreign": Fault(BOTH, "a sound reply that nobody asked for comes first"),
-    "length": Fault(LMS, "a telegram states another length; its checksum fits the bytes"),
-    # on when and whether a reply comes
-    "silence": Fault(BOTH, "a reply is not sent"),
-    "delay": Fault(BOTH, "a reply comes 0.7 s late"),
-    "pause": Fault(BOTH, "a reply stops for 80 ms in the middle"),
-    "twice": Fault(BOTH, "a reply is sent twice"),
-    "stale": Fault(BOTH, "the previous reply of the same kind is sent in place of the present one"),
-    # on the line
-    "request_drop": Fault(BOTH, "a byte that the host sends is lost"),
-    "request_flip": Fault(BOTH, "a bit that the host sends is inverted"),
-    "deaf": Fault(BOTH, "what the host sends does not arrive"),
-    "echo": Fault(BOTH, "what the host sends comes back to it first, as on two-wire RS-485"),
-    "unplug": Fault(BOTH, "the port vanishes and comes back at the same path (after 0.5 s unless told otherwise)"),
-    # in the laser range finder
-    "nak": Fault(LMS, "a sound request is answered NAK"),
-    "no_ack": Fault(LMS, "the reply comes without ACK"),
-    "refused": Fault(LMS, "a request is answered ACK and 0x92"),
-    "reboot": Fault(LMS, "the device restarts: silence, 9600 Bd, the power-on string, settings of the factory"),
-    "rate": Fault(LMS, "the device falls to another baud rate without a word"),
-    "stuck": Fault(LMS, "the command to stop streaming is confirmed, and streaming goes on"),
-    "slow_mode": Fault(LMS, "a change of the operating mode takes 2.8 s, as long as the manual allows"),
-    "skip": Fault(LMS, "a scan of the stream is not sent; the indices go on"),
-    "status": Fault(LMS, "the status byte says error, dirty window, implausible values"),
-    # in the head
-    "mute": Fault(HEAD, "a query is not answered, though the head obeys"),
-    "stall": Fault(HEAD, "a motion command does not move the head"),
-    "slip": Fault(HEAD, "the head runs on for 0.3 s after a stop"),
-    "jump": Fault(HEAD, "a position reply with a sound checksum is wrong by 10 deg"),
-}  # fmt: skip
-REPLY = {name: fault.change for name, fault in FAULTS.items() if fault.change}
+FAULTS = {name: Fault(**row) for name, row in json.loads(Path(__file__).with_name("faults.json").read_text()).items()}
+REPLY = {  # what some do to the bytes of a reply, about a place in it
+    "drop": lambda data, i, _: data[:i] + data[i + 1 :],
+    "flip": lambda data, i, rng: data[:i] + bytes([data[i] ^ 1 << int(rng.integers(8))]) + data[i + 1 :],
+    "duplicate": lambda data, i, _: data[: i + 1] + data[i:],
+    "insert": lambda data, i, rng: data[: i + 1] + rng.bytes(1) + data[i + 1 :],
+    "swap": lambda data, i, _: data[:i] + data[i : i + 2][::-1] + data[i + 2 :],
+    "blank": lambda data, i, _: data[:i] + bytes(len(data[i : i + 4])) + data[i + 4 :],
+    "cut": lambda data, i, _: data[:i],
+    "headless": lambda data, i, _: data[i + 1 :],
+    "noise": lambda data, _, rng: rng.bytes(int(rng.integers(1, 21))) + data,
+    "checksum": lambda data, _, rng: data[:-1] + bytes([data[-1] ^ int(rng.integers(1, 256))]),
+}
 REQUEST = {"request_drop": REPLY["drop"], "request_flip": REPLY["flip"], "deaf": lambda *_: b""}
 
 

@@ -30,7 +30,6 @@ SILENCE_S = 600.0  # that says nothing about an emulated camera: it sends no ima
 LONGEST_LINE = 4096
 LOOK_S = 0.5
 PRACTICE = "practice"
-NAMES = (PRACTICE, *SETUPS)
 SMALL = 400  # pixels of an image's width of the practice rig: its chessboard is still found at 2 m
 FAST = 2.0  # times as fast as real devices
 MARGIN = np.radians(1.0)  # of a sweep beyond the board
@@ -247,7 +246,7 @@ def practice_setup():
 
 
 def emulated(name):
-    """An emulated rig of :data:`NAMES` that is not started yet, its rig file, and the host clock of its devices.
+    """An emulated rig ('practice', or a set-up), not started yet, its rig file, and the host clock of its devices.
 
     'practice' runs twice as fast as real devices, the others as slow. The file (parsed) is given by a callable once the
     rig is started; the clock is for :meth:`lrfcal_lib.drivers.rig.Rig.open`. ValueError for another name.

@@ -64,6 +64,10 @@ class Board:
         corners = self.known_corners()
         return dict(zip(self.edges, np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), strict=True))
 
+    def points(self):
+        """Corners of the outline in space, board frame, metres, shape (n, 3)."""
+        return np.pad(self.known_corners(), ((0, 0), (0, 1)))
+
     def known_corners(self):
         """Corners of the outline, metres, shape (n, 2); ValueError where nobody has measured them."""
         if self.corners is None:

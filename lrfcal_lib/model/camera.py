@@ -146,10 +146,3 @@ def line_distance(uv, line):
     """Signed distance of pixels from lines, equation (20) with its sign kept; pixels."""
     uv, line = np.asarray(uv, float), np.asarray(line, float)
     return np.sum(uv * line[..., :2], axis=-1) + line[..., 2]
-
-
-def board_line_in_image(line, T_camera_board, model):
-    """Undistorted pixel line of a line ``a x + b y + c = 0`` drawn on the board, the unit normal on the same side."""
-    homography = model.matrix @ T_camera_board.as_matrix()[:3, [0, 1, 3]]
-    out = np.linalg.solve(homography.T, np.asarray(line, float))
-    return out / np.hypot(out[0], out[1])

@@ -249,7 +249,7 @@ def line_residuals(edges, board, model, pose):
     """Whitened distances (E, 2) of every edge's two corners from its image line, derivatives by [w, v] (E, 2, 6)."""
     line, centre, covariance = (np.stack([getattr(e, k) for e in edges]) for k in ("line", "centre", "covariance"))
     i = np.array([board.edges.index(e.name) for e in edges])
-    flat = np.column_stack([board.known_corners(), np.zeros(len(board.edges))])
+    flat = board.points()
     ends = flat[np.stack([i, (i + 1) % len(flat)], axis=1)]
     turned = rotate_points(pose, ends)
     p_camera = turned + pose[:, 3]
@@ -337,7 +337,7 @@ def board_poses(edges, board, model):
     """
     # seen from the printed side x to y turns left, in the image (v down) that is the other way round
     sides, found = list(edges)[::-1], []
-    flat = np.column_stack([board.known_corners(), np.zeros(len(board.edges))])
+    flat = board.points()
     for shift in range(len(sides)):
         turned = sides[shift:] + sides[:shift]
         named = tuple(replace(edge, name=name) for edge, name in zip(turned, board.edges, strict=True))

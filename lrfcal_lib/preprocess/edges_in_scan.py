@@ -195,15 +195,12 @@ class ScanEdges:
     background: np.ndarray
 
 
-def edge_points(scan, variant="half_step"):
-    """Where scan lines cross the board's edges; step (iii) of the paper's preprocessing.
+def edge_points(scan):
+    """Where scan lines cross the board's edges, by the half step; step (iii) of the paper's preprocessing.
 
     Parameters
     ----------
     scan : BoardScan
-    variant : {'half_step', 'last_beam'}
-        'half_step': halfway between the last beam on the board and the first off it, unbiased for an edge anywhere
-        between them. 'last_beam': the paper's rule, half a step inside on average.
 
     Returns
     -------
@@ -214,10 +211,10 @@ def edge_points(scan, variant="half_step"):
         beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at
         less than 20 deg to the scan lines are left out (side -1): there the pitch decides where a line ends.
     """
-    return _of(variant, crossings(scan)[0])
+    return crossings(scan)[0]["half_step"]
 
 
-def sweep_edges(scan, variant="half_step"):
+def sweep_edges(scan):
     """Where columns of the range image (one beam over the pitch) cross the board's edges: as :func:`edge_points`.
 
     Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here. Nothing ends at the
@@ -225,20 +222,15 @@ def sweep_edges(scan, variant="half_step"):
     them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points` sees too has the same number. The
     covariance is that of the pitch step (as a displacement on the board) and of the line fit.
     """
-    return _of(variant, crossings(scan, True, crossings(scan)[1])[0])
-
-
-def _of(variant, found):
-    if variant not in found:
-        raise ValueError(f"variant is one of {', '.join(found)}, got '{variant}'")
-    return found[variant]
+    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
 
 
 def crossings(scan, across=False, known=()):
     """Crossings of scan lines or, with `across`, of columns: one rule, in which bearing and pitch change places.
 
     Returns ScanEdges by variant, and all sides with those that are seen at too small an angle; sides that are among the
-    `known` ones keep their number.
+    `known` ones keep their number. 'half_step': halfway between the last beam on the board and the first off it,
+    unbiased for an edge anywhere between them; 'last_beam': the paper's rule, half a step inside on average.
     """
     line, beam, step, end = _ends(scan, across)
     angles, cell = (scan.sweep.pitch, line) if across else (scan.sweep.bearings, beam)

@@ -25,14 +25,7 @@ from lrfcal_lib.solvers import METHODS
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
 SCRATCH = ROOT / "reports" / ".sessions" / "lms400_zed"
-STYLE = {
-    "figure.figsize": (7.0, 3.8), "figure.dpi": 100, "figure.constrained_layout.use": True, "savefig.dpi": 150,
-    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 10, "axes.titleweight": "bold",
-    "axes.titlelocation": "left", "axes.labelsize": 9, "axes.spines.top": False, "axes.spines.right": False,
-    "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "lines.linewidth": 1.4,
-    "lines.markersize": 4, "legend.frameon": False, "legend.fontsize": 8.5, "image.interpolation": "nearest",
-    "image.cmap": "viridis",
-}  # fmt: skip
+STYLE = Path(__file__).with_name("figures.mplstyle")
 UNITS = {"deg": "deg", "mm": "mm", "px": "px", "m": "m", "m3": "m³", "percent": "%", "radii": "spot radii"}
 WORDS = {name: method.label for name, method in METHODS.items()} | {
     "joint": "joint estimate", "line_3d": "lines in space", "projected_last_beam": "projected lines, last beam",
@@ -45,7 +38,7 @@ def set_up():
     """Style figures and tables and keep libraries quiet; for a notebook that needs no session."""
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # read by Open3D when it is imported
     os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # without it Mesa complains on stderr, in some runs only
-    plt.rcParams.update(STYLE)
+    plt.style.use(STYLE)
     pd.set_option("display.precision", 4, "display.max_rows", 40, "display.width", 120)
     if get_ipython() is not None:  # the same pixels must give the same bytes: no version of matplotlib in the PNG
         kwargs = {"bbox_inches": None, "metadata": {"Software": None}}

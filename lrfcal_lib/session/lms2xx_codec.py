@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
@@ -444,7 +443,6 @@ def scan_quarters(values, partial=-1):
 
 
 STATUS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xBA, 0xBB, 0xF4, 0xF7
-BAUD = {0x8067: 9600, 0x8033: 19200, 0x8019: 38400, 0x8001: 500000}
 CONFIGURATION_BYTES = 34
 
 
@@ -476,17 +474,12 @@ class DeviceStatus:
 
     firmware: str = at(1, 7, text)
     serial: str = at(10, 8, text)
-    operating_mode: int = at(8, 1, whole)  # as of command 0x20; 0x24 streams, 0x25 waits for requests
     fault: int = at(9, 1, whole)  # 0 for a sound device
     measuring_mode: int = at(102, 1, whole)
     scan_angle_deg: float = at(107, 2, lambda raw: float(whole(raw)))
     resolution_deg: float = at(109, 2, lambda raw: whole(raw) / 100)
-    baud: int | None = at(116, 2, lambda raw: BAUD.get(whole(raw)))  # None for a rate that no manual lists
     address: int = at(120, 1, whole)
     unit: str = at(122, 1, unit_of)
-    laser_on: bool = at(123, 1, any)
-    # turns a second; NaN where the motor does not turn
-    mirror_hz: float = at(67, 2, lambda raw: 1e6 / (90 * whole(raw)) if any(raw) else math.nan)
 
 
 @dataclass(frozen=True)

@@ -551,9 +551,9 @@ class SessionStated(BaseModel):
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
 
 
-def parse_session(data):
-    """The statements of session.json as fields of a Session; ValueError for a wrong one."""
-    found = dict(from_json(SessionStated, data))
+def parse_session(data, kind=SessionStated):
+    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for a wrong one."""
+    found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")
     sigma = platform.sigma_direction, platform.sigma_offset

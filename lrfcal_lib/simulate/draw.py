@@ -134,7 +134,7 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
 
 def _grid(bench, pose, span):
     """Recorded pitch of the scan lines over a board, and bearings of the beams that pass it or come near."""
-    p = pose.apply(np.column_stack([bench.board.corners, np.zeros(len(bench.board.corners))]))
+    p = pose.apply(bench.board.points())
     up, middle = np.arctan2(p[:, 2], p[:, 1]), np.arctan2(*p.mean(axis=0)[[2, 1]])
     half = span / 2 if span is not None else max(up.max() - middle, middle - up.min()) + 6 * bench.pitch_step
     steps = int(half / bench.pitch_step)

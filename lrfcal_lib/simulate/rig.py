@@ -112,11 +112,6 @@ class Rig:
         head, board = transform_to_json(self.T_head_lrf), board_to_json(self.board)
         return {"T_head_lrf": head, "cameras": cameras, "board": board}
 
-    def outline(self, T_platform_board):
-        """Corners of the board in the platform frame (or a camera's, by its pose there), shape (n, 3)."""
-        corners = self.board.known_corners()
-        return T_platform_board.apply(np.column_stack([corners, np.zeros(len(corners))]))
-
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
 
@@ -139,8 +134,7 @@ class Rig:
 
         For a pose, or each of a stack of poses.
         """
-        flat = np.column_stack([self.board.known_corners(), np.zeros(len(self.board.edges))])
-        p = apply_pose(pose_array(T_camera_board), flat if points is None else points)
+        p = apply_pose(pose_array(T_camera_board), self.board.points() if points is None else points)
         uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
         ahead = (p[..., 2] >= 0.1) & (np.abs(p[..., :2]) <= p[..., 2:]).all(axis=-1)
         return np.all(ahead & ((uv > margin) & (uv < size - 1 - margin)).all(axis=-1), axis=-1)
@@ -283,7 +277,7 @@ def _pair(rig, distance, turn, rng):
     """Two poses about one middle; boards face the rig up to 35 deg."""
     azimuth, height = np.radians(rng.uniform(-24, 24)), rng.uniform(-0.22, 0.28) * distance / 1.6
     middle = np.array([distance * np.sin(azimuth), distance * np.cos(azimuth), height])
-    centre = np.r_[np.mean(rig.board.known_corners(), axis=0), 0.0]
+    centre = rig.board.points().mean(axis=0)
     out = []
     for more in (0.0, 90.0):
         angles = [rng.uniform(-35, 35), rng.uniform(-28, 28), turn + more + rng.uniform(-12, 12)]
@@ -295,7 +289,7 @@ def _pair(rig, distance, turn, rng):
 def _spans(rig, pose, margin):
     """First and last pitch of a sweep, and at which all cameras see the whole board; None where that is too little."""
     shown = np.all([rig.shows(c, rig.camera_pose(c, PITCH_GRID) * pose) for c in rig.cameras], axis=0)
-    seen, (pitch, bearing) = PITCH_GRID[shown], rig.sweep_pitch(rig.outline(pose))
+    seen, (pitch, bearing) = PITCH_GRID[shown], rig.sweep_pitch(pose.apply(rig.board.points()))
     beside = np.abs(bearing - np.pi / 2).max() >= np.radians(rig.beam.field_of_view / 2) - 2 * margin
     if beside or not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
