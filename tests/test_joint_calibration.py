@@ -55,6 +55,17 @@ def test_a_wrong_scale_of_the_pitch_does_not_go_into_the_axis(joint):
     assert square < 1.75
 
 
+def test_edges_sharper_than_beams_can_show_are_known_as_well_as_their_scores_say():
+    """The floor of the softness understates what sharp edges between beams say; their share of information makes up."""
+    square = 0.0
+    for seed in range(100, 104):
+        obs, truth, _ = draw(np.random.default_rng(seed), 10, softness=0.005)
+        found = solve_joint(obs, noise="estimate")
+        assert 1.5 < found.noise["beam_share"] <= 2.5
+        square += square_per_number(found, truth) / 4
+    assert 0.5 < square < 1.6
+
+
 def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
     for noise, sweep in (((0.005, 0.0), "offset"), ((0.005, 0.04), "offset_stretch")):
         loose = replace(joint.prepared, pitch_noise=pipeline.PitchNoise(*noise))

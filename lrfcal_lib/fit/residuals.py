@@ -274,10 +274,11 @@ class JointData:
     views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and `direction` (p,) the sweeps'. Then
     come factors on the stated standard deviations of ranges and of each camera's views, the standard deviation of the
     recorded pitch of a single image (what a head at rest is off by, radians), shares of independent errors per
-    observation (below one where neighbours repeat each other's errors), `lapse` (see :func:`beam_terms`), what is
-    expected of the sweeps' own offset (radians) and stretch, the scale of the sides' deviations of the log odds
-    (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are dark), and the stated
-    platform, which yields where the data contradict it.
+    observation (below one where neighbours repeat each other's errors; above where edges are sharper than the floor of
+    :func:`flip_sigma`, so that beams say more), `lapse` (see :func:`beam_terms`), what is expected of the sweeps' own
+    offset (radians) and stretch, the scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM`
+    degrees of freedom: most backgrounds are alike, some are dark), and the stated platform, which yields where the data
+    contradict it.
     """
 
     face: dict

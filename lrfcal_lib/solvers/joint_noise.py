@@ -14,6 +14,7 @@ from lrfcal_lib.model.camera import project_jacobians
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 LEAST_CORNERS = 6
 PARTS = 3  # of a board in x and y, and of an edge
+SHARP = 0.4  # scatter of scores over their information where edges are sharp, for the floor of `flip_sigma`
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
 LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
@@ -129,7 +130,10 @@ def _part(values, used):
 
 
 def beam_share(state, data, block, unknowns):
-    """Share of independent errors among neighbouring beams, from the scores of parts of every edge."""
+    """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
+
+    Above one where readings flip more sharply than the floor of the softness: scores then scatter less than expected.
+    """
     ray = rays(state, data, data.beam)
     a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
     o, d = ray[:2]
@@ -144,7 +148,7 @@ def beam_share(state, data, block, unknowns):
         information, score = (np.sum(np.where(here, v, 0.0), axis=-1) for v in (root**2, block.residuals * root))
         ratios.append(np.divide(score**2, information, out=np.full(score.shape, np.nan), where=information > 0))
     ratio = np.nanmean(ratios) * PARTS / (PARTS - 1) if np.isfinite(ratios).any() else 1.0
-    return float(1 / max(ratio, 1.0))
+    return float(1 / max(ratio, SHARP))
 
 
 def view_levels(data, block, state):
