@@ -20,7 +20,7 @@ SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 def judged(change, seed, mount="head", stated=True):
     """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
-    obs, truth, rig = draw(rng(seed), 16 if stated else 10, mount=mount, pitch_step=np.radians(2.0))
+    obs, truth, rig = draw(rng(seed), 16, mount=mount, pitch_step=np.radians(2.0))
     prior = PlatformPrior(rig.T_head_lrf, *STATED)
     settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
     T_head_lrf, settings["prior"] = (rig.T_head_lrf, prior) if stated else (None, None)

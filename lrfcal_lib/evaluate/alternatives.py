@@ -190,7 +190,8 @@ def other_sense(joint):
     with suppress(DegenerateGeometry):
         again = solve_joint(turned, required=False, **joint.settings)
         better = level / again.noise["face_scale"]
-        if again.converged and not again.unobservable and better > (BETTER if joint.solution.converged else 1.0):
+        sound = joint.solution.converged and joint.solution.sensor["pitch_scale"] > -1
+        if again.converged and not again.unobservable and better > (BETTER if sound else 1.0):
             return f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} times as well then"
     return ""
 
