@@ -153,6 +153,8 @@ class Collector(Closed):
     connected = property(lambda self: self.rig is not None, doc="Whether a rig is open.")
     emulated = property(lambda self: self.connected and self.rig.stated.devices.control is not None,
                         doc="Whether the board moves by itself.")  # fmt: skip
+    limits_deg = property(lambda self: self._needed().stated.devices.head.pitch_limits_deg,
+                          doc="Lowest and highest pitch of the head.")  # fmt: skip
     finished = property(lambda self: () if self.recording is None else self.recording.finished,
                         doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
 

@@ -339,7 +339,7 @@ class Panel(Closed):
             DRIVERS.addHandler(self.notes)
             parts, collector = self.parts, self.collector
             collector.connect(parts.rig.value.strip(), Path(parts.session.value.strip()).expanduser())
-            low, high = collector.rig.stated.devices.head.pitch_limits_deg
+            low, high = collector.limits_deg
             with parts.slider.hold_trait_notifications():
                 parts.slider.min, parts.slider.max = low, high
             parts.show_pictures(collector.rig.cameras)
