@@ -500,7 +500,9 @@ ENDS = [  # at which scan of three placements of three stops what happens; exit 
 
 
 @pytest.mark.parametrize(("scan", "end", "code", "said"), ENDS)
-def test_what_ends_a_recording_is_one_line_and_another_goes_on(run, rig, path, scan, end, code, said):
+def test_what_ends_a_recording_is_one_line_and_another_goes_on(run, rig, path, scan, end, code, said, request):
+    as_found = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup, which may run these tests, ignores it
+    request.addfinalizer(lambda: signal.signal(signal.SIGHUP, as_found))
     port.guard(rig.head)  # signals become an exit
     rig.head.emergency_stop = rig.head.stop
     at_scan(rig, scan, end)
