@@ -74,10 +74,12 @@ def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
 
 
 @pytest.mark.parametrize(
-    ("mount", "share", "seed"), [("head", 0.5, 5), ("head", 1.0, 3), ("platform", 0.5, 4), ("platform", 1.0, 5)]
-)
+    ("mount", "share", "seed"),
+    [("head", 0.5, 5), ("head", 0.5, 9), ("head", 1.0, 3), ("platform", 0.5, 4), ("platform", 0.5, 9),
+     ("platform", 1.0, 5)],
+)  # fmt: skip
 def test_many_mislabelled_placements_are_refused(mount, share, seed):
-    obs, *_ = draw(rng(seed), 16, mount=mount)
+    obs, *_ = draw(rng(seed), 20, mount=mount)
     with pytest.raises(DegenerateGeometry, match="contradict .*right numbers"):
         solve_joint(mislabelled(obs, share, rng(seed)))
 
@@ -97,7 +99,7 @@ def honest(mount):
 
 @pytest.mark.parametrize(
     ("kind", "factor", "mount"),
-    [("face", 1e-3, "head"), ("face", 0.1, "platform"), ("face", 1e3, "platform"), ("view", 1e-3, "platform"),
+    [("face", 1e-3, "head"), ("face", 1e-2, "platform"), ("face", 1e3, "platform"), ("view", 1e-3, "platform"),
      ("view", 10.0, "head"), ("view", 1e3, "head")],
 )  # fmt: skip
 def test_contradictory_noise_is_repaired_from_the_data(kind, factor, mount):

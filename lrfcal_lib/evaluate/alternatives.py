@@ -179,6 +179,11 @@ def not_an_offset(solution):
     return None
 
 
+def plausible(solution):
+    """Whether a JointSolution converged, with a pitch that counts in the sense that is stated."""
+    return solution.converged and solution.sensor["pitch_scale"] > -1
+
+
 def other_sense(joint):
     """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way round; else ''.
 
@@ -190,8 +195,7 @@ def other_sense(joint):
     with suppress(DegenerateGeometry):
         again = solve_joint(turned, required=False, **joint.settings)
         better = level / again.noise["face_scale"]
-        sound = joint.solution.converged and joint.solution.sensor["pitch_scale"] > -1
-        if again.converged and not again.unobservable and better > (BETTER if sound else 1.0):
+        if again.converged and not again.unobservable and better > (BETTER if plausible(joint.solution) else 1.0):
             return f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} times as well then"
     return ""
 

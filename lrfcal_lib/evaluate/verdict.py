@@ -311,8 +311,7 @@ def contradicts_stated(joint):
     What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
     """
     solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
-    backwards = joint.solution.sensor["pitch_scale"] < -1
-    hopeless = not joint.solution.converged or joint.solution.noise["face_scale"] > ABSURD or backwards
+    hopeless = not alternatives.plausible(joint.solution) or joint.solution.noise["face_scale"] > ABSURD
     if hopeless and (words := alternatives.other_sense(joint)):  # what else is found wrong comes from that
         return [Reason(NO, "sense", words)], doubt
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
