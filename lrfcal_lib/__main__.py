@@ -33,11 +33,9 @@ def run(args):
             return calibrate_session(args.session)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
-            from lrfcal_lib.simulate.rig import SETUPS
+            from lrfcal_lib.simulate.rig import load_setup
 
-            if args.setup not in SETUPS:
-                raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")
-            simulate(args.dst, SETUPS[args.setup](), workers=args.workers)
+            simulate(args.dst, load_setup(args.setup), workers=args.workers)
             print(f"{args.dst}: simulated")
         case "record":
             from lrfcal_lib.acquire.record import main
@@ -50,7 +48,7 @@ def run(args):
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.rest)
+            return main(args.setup, args.rig_file)
     return 0
 
 
@@ -87,7 +85,9 @@ def parser():
     record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
     record.add_argument("--placements", type=how_many, metavar="N", help="record N placements of the plan")
     record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
-    verbs.add_parser("emulate", help="emulate the devices of a rig (emulate -h for more)", add_help=False)
+    emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
+    emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
+    emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
     verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
     return top
 

@@ -19,7 +19,7 @@ from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
 from lrfcal_lib.simulate.record import placements_of, stops_of, world_of
-from lrfcal_lib.simulate.rig import SETUPS
+from lrfcal_lib.simulate.rig import load_setup
 from lrfcal_lib.simulate.scene import World
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -209,7 +209,7 @@ def test_mixed_pixels_of_a_furnished_room():
     It is good if it is within one sigma of such a place and of what one of the things would have read alone: neither
     noise nor a second surface made it. In between, nobody minds whether a reading goes.
     """
-    setup, lines = SETUPS["sim_lms221"](), slice(None, None, 3)
+    setup, lines = load_setup("sim_lms221"), slice(None, None, 3)
     placement, session = placements_of(setup)[-1], open_session(DATA / "sim_lms221")
     sweep, sigma = session.sweep(placement.number), setup.rig.beam.sigma_range
     off, pull = spots_alone(setup, placement, lines)

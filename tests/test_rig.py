@@ -5,11 +5,10 @@ import json
 import math
 import operator
 import os
-import socketserver
 import threading
-import time
 from dataclasses import replace
 from functools import partial, reduce
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, r
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, unchanged
 from lrfcal_lib.drivers.rig_file import HeadSettings, Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import find_source
 from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
@@ -366,14 +365,14 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
     monkeypatch.setattr(rig_module, "GAP_S", 0.05)
     monkeypatch.setattr(rig_module, "BATCH_S", 0.02)
     rig = make_rig(rig_data(mode="continuous"))
-    newest = rig.lrf.newest
+    take = rig.lrf.take
 
-    def once(**options):
-        found = newest(**options)
+    def once(*args, **options):
+        found = take(*args, **options)
         rig.lrf.silent = True
         return found
 
-    rig.lrf.newest = once
+    rig.lrf.take = once
     rig.head.speed = 1e-6
     rig.head.move_to = lambda pitch: setattr(rig.head, "at", pitch) or pitch
     with pytest.raises(NoReply, match=r"no scan for 0\.05 s of the sweep"):
@@ -400,14 +399,6 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
         opener = raising(instead[driver]) if driver in instead else partial(make, driver, fake)
         monkeypatch.setattr(rig_module, driver, opener)
     return made
-
-
-def test_the_clock_of_a_rig_is_not_set_by_others(monkeypatch):
-    clock = host_clock()
-    before, wall = clock(), time.time()
-    assert before == pytest.approx(wall, abs=1.0)
-    monkeypatch.setattr(time, "time", lambda: wall + 1e6)
-    assert 0 <= clock() - before < 100
 
 
 def test_all_devices_are_closed_again(monkeypatch):
@@ -448,23 +439,22 @@ def test_a_recording_begins_with_the_configuration():
     assert raw[4] == CONFIGURATION and parse_configuration(raw).measuring_mode == 0
 
 
-class Control(socketserver.StreamRequestHandler):
-    """The control socket of a rig that has eight placements."""
+class Control(BaseHTTPRequestHandler):
+    """An emulated rig that has eight placements."""
 
-    def handle(self):
-        number = json.loads(self.rfile.readline())["arguments"][0]
-        answer = {"ok": True} if number < 9 else {"ok": False, "error": f"no placement {number}"}
-        self.wfile.write(json.dumps(answer).encode() + b"\n")
+    def do_GET(self):
+        self.send_response(204 if int(self.path[-1]) < 9 else 400, f"no placement {self.path[-1]}")
+        self.end_headers()
 
 
-def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
-    rig, path = make_rig(), str(tmp_path / "control")
+def test_the_board_of_an_emulated_rig_is_moved():
+    rig = make_rig()
     assert rig.move_board(1) is False and rig.hold_close("left", 0) is False
-    rig = make_rig(changed("devices.control", path))
-    with socketserver.ThreadingUnixStreamServer(path, Control) as server:
+    with HTTPServer(("127.0.0.1", 0), Control) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        rig = make_rig(changed("devices.control", f"http://127.0.0.1:{server.server_port}"))
         assert rig.move_board(3) is True
-        with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
+        with pytest.raises(DeviceError, match="control http:.*: no placement 9"):
             rig.move_board(9)
         server.shutdown()
     with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):

@@ -21,10 +21,10 @@ from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import transform_from_json
 from lrfcal_lib.simulate import record
 from lrfcal_lib.simulate.beam import LMS221
-from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
+from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, load_setup, pairs
 from lrfcal_lib.simulate.scene import Exposure, Imager, World
 
-FULL = sim_quick()
+FULL = load_setup("sim_quick")
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_the_scan_plane_meets_a_point_at_the_sweep_pitch():
 
 
 def test_placements_come_in_near_perpendicular_pairs_in_view():
-    setup = sim_lms221()
+    setup = load_setup("sim_lms221")
     *found, room = record.placements_of(setup)
     assert [p.number for p in found] == list(range(1, 25)) and (room.number, room.T_platform_board) == (25, None)
     assert [len(p.image_pitch) for p in found] == [3, 1] * 12
@@ -225,7 +225,7 @@ def test_what_cannot_be_simulated(tmp_path, tiny):
 
 
 def test_a_set_up_takes_over_what_it_does_not_say():
-    quick, full = sim_quick(), sim_lms221()
+    quick, full = load_setup("sim_quick"), load_setup("sim_lms221")
     assert quick.rig.beam == full.rig.beam and quick.rig.platform == full.rig.platform and quick.step == full.step
     assert (quick.pairs, full.pairs, quick.quality, full.quality) == (2, 12, 90, 95)
     for small, large in zip(quick.rig.cameras, full.rig.cameras, strict=True):

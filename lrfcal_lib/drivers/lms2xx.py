@@ -21,8 +21,8 @@ COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects"
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
-    Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
-    `counts`, `stop` and `close` may be called.
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only `take`, `counts`,
+   , `stop` and `close` may be called.
 
     Parameters
     ----------
@@ -37,8 +37,6 @@ class LMS2xx(Closed):
         To be set, see :meth:`set_variant`.
     find_s : float
         Longest time to find the rate.
-    clock : callable, optional
-        Seconds, for the instants of scans; time.time() of the host by default.
     host : Host
         Machine that the driver runs on; tests have one of their own.
     **configuration
@@ -64,14 +62,14 @@ class LMS2xx(Closed):
     """
 
     def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", variant=None, find_s=FIND_S,
-                 clock=None, log=LOG, host=REAL, **configuration):  # fmt: skip
+                 host=REAL, **configuration):  # fmt: skip
         if baudrate not in (None, *RATES):
             raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
-        self.port, self._password, self._host, self._log = str(port), bytes(password), host, log
-        self._clock, self._counts, self._interrupted = clock or host.time, dict.fromkeys(COUNTS, 0), host.event()
-        self._options = {"address": address, "clock": clock, "interrupted": self._interrupted, "host": host}
+        self.port, self._password, self._host = str(port), bytes(password), host
+        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
+        self._options = {"address": address, "interrupted": self._interrupted, "host": host}
         self._link = self._assembler = self._settled = self._scan_clock = self._reader = None
         self._interlaced = False
         try:
@@ -90,7 +88,7 @@ class LMS2xx(Closed):
         try:
             self.stop()
         except DeviceError as error:
-            self._log.warning("%s: closed without the device's consent: %s", self.port, error)
+            LOG.warning("%s: closed without the device's consent: %s", self.port, error)
         finally:
             self._release()
 
@@ -128,7 +126,7 @@ class LMS2xx(Closed):
         self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
         self._read_configuration()
         told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
-        self._log.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
+        LOG.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
 
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
@@ -187,7 +185,7 @@ class LMS2xx(Closed):
         self._prepare()
         self._link.deadline = math.inf
         self._counts["reconnects"] += 1
-        self._log.warning("%s: the device is back at %d Bd", self.port, rate)
+        LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
     # ------------------------------------------------------------------------------------------------- settings
 
@@ -243,7 +241,7 @@ class LMS2xx(Closed):
         try:
             self._opened().ask(wire.VARIANT, words)
         except NoReply as error:  # the reply may be lost and the variant set
-            self._log.warning("%s; reading the variant", error)
+            LOG.warning("%s; reading the variant", error)
         self.status = self._told(wire.STATUS, codec.parse_status)
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
@@ -274,7 +272,7 @@ class LMS2xx(Closed):
             self._mode(INSTALLATION + self._password, "the password of the installation mode")
             self._link.ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
-            self._log.warning("%s; reading the configuration", error)
+            LOG.warning("%s; reading the configuration", error)
         finally:
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
@@ -320,7 +318,7 @@ class LMS2xx(Closed):
             self._stream()
 
         interval_s = (4 if interlaced else 1) * self._assembler.interval_s
-        self._reader = ScanReader(receive, recover, interval_s, self._interrupted, self._log, self._host)
+        self._reader = ScanReader(receive, recover, interval_s, self._interrupted, self._host)
 
     def _stream(self):
         self._prepare(self._interlaced)
@@ -331,21 +329,6 @@ class LMS2xx(Closed):
             raise DeviceError(f"{self.port}: the device does not stream; call start() first")
         return self._reader
 
-    def newest(self, after=None, timeout=2.0):
-        """The newest scan of the stream, a Reading, within so many seconds.
-
-        Its first beam is later than `after` by the host's clock; by default it is one that was not handed out before
-        and is not older than the stream needs. NoReply, which tells what is wrong with the stream, if there is none.
-        """
-        reader = self._streaming()
-
-        def find(readings):
-            oldest_s = max(reader.handed_s, self._clock() - 3 * reader.interval_s - wire.LEAST_QUIET_S)
-            fresh = readings and readings[-1].time_s > (oldest_s if after is None else after)
-            return readings[-1] if fresh else None
-
-        return reader.wait(find, timeout)
-
     def take(self, count, after=None, timeout=None):
         """Consecutive scans of the stream, a list of Reading, later than an instant, by default that of the call.
 
@@ -354,7 +337,7 @@ class LMS2xx(Closed):
         """
         reader, found = self._streaming(), []
         limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout
-        begin_s, end = self._clock() if after is None else after, self._host.now() + limit
+        begin_s, end = self._host.time() if after is None else after, self._host.now() + limit
 
         def find(readings):
             last_s = found[-1].time_s if found else begin_s

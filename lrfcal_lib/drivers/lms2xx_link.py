@@ -1,6 +1,7 @@
 """The line to an LMS2xx: telegrams with their instants, retries, the baud rate, scans on request and as a stream."""
 
 import itertools
+import logging
 import math
 from collections import deque
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import numpy as np
 from lrfcal_lib.drivers.port import REAL, DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session import lms2xx_codec as codec
 
+LOG = logging.getLogger(__name__)
 ACK, NAK = 0x06, 0x15
 MODE, VALUES, STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURE = 0x20, 0x30, 0x31, 0x32, 0x3A, 0x3B, 0x74, 0x77
 POWER_ON, NOT_UNDERSTOOD = 0x90, 0x92
@@ -32,7 +34,7 @@ WINDOWS_S = (0.25, 0.25, 0.6)  # to listen at a rate, in turn
 
 
 class Arrival(NamedTuple):
-    """A telegram and when its last byte came in, by the clock of the link."""
+    """A telegram and when its last byte came in, by the host's clock."""
 
     raw: bytes
     time_s: float
@@ -59,9 +61,9 @@ class Link:
     the last one was sent for the first time, and `heard` counts bytes of any kind.
     """
 
-    def __init__(self, path, baudrate, counts, *, address=0, clock=None, interrupted=None, host=REAL):
+    def __init__(self, path, baudrate, counts, *, address=0, interrupted=None, host=REAL):
         self.path, self.counts, self.address, self.host = path, counts, address, host
-        self.clock, self.interrupted = clock or host.time, interrupted or host.event()
+        self.interrupted = interrupted or host.event()
         self.senders, self.deadline, self.asked_s, self.heard = None, math.inf, 0.0, 0
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
@@ -115,7 +117,7 @@ class Link:
             data += self._port.read(self._port.in_waiting)
         if not data:
             return []
-        now, self._last = self.clock(), self.host.now()
+        now, self._last = self.host.time(), self.host.now()
         self.heard += len(data)
         data = self._rest + data
         stream = codec.split_stream(data)
@@ -140,7 +142,7 @@ class Link:
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
         end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
-        said, self.asked_s = None, self.clock()
+        said, self.asked_s = None, self.host.time()
         for _ in range(TRIES):
             self.send(code, data)
             reply, said = self._await(code | 0x80, sign, again_s, end)
@@ -368,13 +370,13 @@ class ScanReader:
 
     ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
     ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
-    `interval_s` is that between two readings, `handed_s` the instant of the newest one that somebody waited for.
+    `interval_s` is that between two readings.
     """
 
-    def __init__(self, receive, recover, interval_s, leave, log, host):
+    def __init__(self, receive, recover, interval_s, leave, host):
         self._receive, self._recover, self.interval_s = receive, recover, interval_s
-        self._leave, self._log, self._host, self._news = leave, log, host, host.event()
-        self.readings, self.handed_s, self._trouble = [], -math.inf, None
+        self._leave, self._host, self._news = leave, host, host.event()
+        self.readings, self._trouble = [], None
         self.thread = host.thread(self._run, "LMS2xx reader")
         self.thread.start()
 
@@ -385,7 +387,6 @@ class ScanReader:
             self._news.clear()
             alive, found = self.thread.is_alive(), find(self.readings)
             if found is not None:
-                self.handed_s = max(self.handed_s, found.time_s)
                 return found
             left = end - self._host.now()
             if left <= 0 or not alive:
@@ -406,10 +407,10 @@ class ScanReader:
                 if lost:
                     self._leave.wait(AGAIN_S)
                 self._trouble, lost = str(error), True
-                self._log.warning("LMS2xx: %s; looking for the device", error)
+                LOG.warning("LMS2xx: %s; looking for the device", error)
             except Exception as error:  # told to whoever waits, who would wait for nothing
                 self._trouble = f"the reader thread failed: {error!r}"
-                self._log.exception("LMS2xx reader thread")
+                LOG.exception("LMS2xx reader thread")
                 raise
 
     def _read(self):

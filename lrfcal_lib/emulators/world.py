@@ -7,7 +7,6 @@ while it does none is sent, and one that was begun before a move is not sent aft
 import contextlib
 import itertools
 import logging
-import math
 import os
 import signal
 import threading
@@ -24,8 +23,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
 from lrfcal_lib.simulate.rig import placements_of
@@ -55,8 +54,8 @@ class EmulatedWorld:
 
     place = property(lambda self: self._scene[0], doc="Where the board is.")
 
-    def __init__(self, setup, clock, seed=0, placements=None):
-        self.setup, self.clock, self.head = setup, clock, Head(setup.rig.platform, seed)
+    def __init__(self, setup, host=REAL, seed=0, placements=None):
+        self.setup, self.host, self.head = setup, host, Head(setup.rig.platform, seed)
         self.placements = {p.number: p for p in placements or placements_of(setup)}
         self._rng, self._still = np.random.default_rng([seed, 3]), (None, None)
         self.put(None)
@@ -94,13 +93,6 @@ class EmulatedWorld:
             self._still = key, lrf.ideal_readings(rig.beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
         return *lrf.measured(rig.beam, *self._still[1], self._rng), pitch[[np.argmin(times), np.argmax(times)]]
 
-    def truth(self):
-        """What only the simulator knows, as JSON."""
-        boards = {n: transform_to_json(p.T_platform_board) for n, p in self.placements.items()}
-        pitch = math.degrees(float(self.head.pitch(self.clock.now())))
-        about = {"boards": boards, "place": list(self.place.key), "pitch_deg": pitch}
-        return {"setup": self.setup.name} | self.setup.rig.truth() | about
-
 
 def scaled(rig, width):
     """The rig with images of another width, the same field of view; ValueError for an odd number of pixels."""
@@ -114,20 +106,6 @@ def scaled(rig, width):
         changed |= {"cx": (m.cx + 0.5) * scale - 0.5, "cy": (m.cy + 0.5) * scale - 0.5}
         cameras.append(replace(camera, model=replace(m, **changed)))
     return replace(rig, cameras=tuple(cameras))
-
-
-class Serving:
-    """A server of `socketserver` in a thread of its own."""
-
-    def __init__(self, server):
-        self.server, self._thread = server, threading.Thread(target=server.serve_forever, args=(0.2,), daemon=True)
-        self.start = self._thread.start
-
-    def close(self):
-        """End it, started or not."""
-        if self._thread.is_alive():
-            self.server.shutdown()
-        self.server.server_close()
 
 
 _drawing = None  # in the drawing process: the setup, its cameras' imagers, worlds by place
@@ -152,47 +130,43 @@ def _draw(index, place, pitch, seed):
 
 
 class CameraServer:
-    """The cameras of a world.
+    """The cameras of a world, and who puts its board elsewhere, over HTTP.
+
+    `url` has ``NAME.mjpg`` of the cameras in `names`, and obeys ``place/NUMBER`` (or none) and ``close/CAMERA/VIEW``.
 
     Parameters
     ----------
     world : EmulatedWorld
-    setup : Setup
-        Whose cameras to show, such as smaller ones than the world's.
     seed : int
     rest_s : float
-        Seconds of the devices that the head must rest before an image is drawn. Nobody tells a camera whether its
-        image is wanted; most stops of a sweep need none and are shorter.
+        Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its image is wanted;
+        most stops of a sweep need none and are shorter.
 
     Attributes
     ----------
-    urls : dict of str to str
     error : Exception or None
         What ended the drawing process; there are no more images.
     """
 
     serving = property(lambda self: not self.quit.is_set() and self.error is None, doc="Whether images are to come.")
 
-    def __init__(self, world, setup, *, seed=0, rest_s=0.5):
+    def __init__(self, world, *, seed=0, rest_s=0.5):
         self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
-        self.names = [camera.name for camera in setup.rig.cameras]
+        self.names = [camera.name for camera in world.setup.rig.cameras]
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
         self.quit = threading.Event()
-        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (setup,))
-        server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
-        self._serving = Serving(server)
-        self.urls = {name: f"http://127.0.0.1:{server.server_port}/{name}.mjpg" for name in self.names}
-
-    def start(self):
-        """Serve, and draw the first images ahead."""
-        self._serving.start()
-        for name in self.names:
-            self._drawn(self._key(name))
+        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (world.setup,))
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        self.start = self._thread.start
 
     def close(self):
-        """End the server and the drawing process."""
+        """End the server, started or not, and the drawing process."""
         self.quit.set()
-        self._serving.close()
+        if self._thread.is_alive():
+            self._server.shutdown()
+        self._server.server_close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def image(self, name, timeout=1.0):
@@ -223,7 +197,7 @@ class CameraServer:
 
     def _key(self, name):
         """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
-        head, now = self.world.head, self.world.clock.now()
+        head, now = self.world.head, self.world.host.now()
         if not head.settled(now) or head.resting(now)[0] < self.rest_s + head.platform.settle:
             return None
         return name, self.world.place, round(float(head.pitch(now)), 7)
@@ -242,13 +216,29 @@ class CameraServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Sends the images of a camera as a stream, NAME.mjpg."""
+    """Sends the images of a camera as a stream, or moves the board."""
 
     def do_GET(self):
         """Answer a request, see :mod:`http.server`."""
-        cameras, name = self.cameras, self.path.strip("/").removesuffix(".mjpg")
-        if name not in cameras.names:
-            return self.send_error(404, f"cameras are {', '.join(cameras.urls.values())}")
+        cameras, world = self.cameras, self.cameras.world
+        try:
+            match self.path.removesuffix(".mjpg").strip("/").split("/"):
+                case [name] if name in cameras.names:
+                    return self._stream(name)
+                case ["place", number]:
+                    world.put(None if number == "none" else int(number))
+                case ["close", camera, view]:
+                    world.hold_close(camera, int(view))
+                case _:
+                    known = ", ".join(f"{name}.mjpg" for name in cameras.names)
+                    return self.send_error(404, f"there are {known}, place/NUMBER and close/CAMERA/VIEW")
+        except ValueError as error:
+            return self.send_error(400, str(error))
+        self.send_response(204)
+        return self.end_headers()
+
+    def _stream(self, name):
+        cameras = self.cameras
         with contextlib.suppress(ConnectionError, TimeoutError):
             self.send_response(200)
             self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
