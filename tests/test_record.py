@@ -28,7 +28,7 @@ from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder, finish
+from lrfcal_lib.session.write import SessionRecorder
 
 
 def write(rig, path, **options):
@@ -232,12 +232,6 @@ def test_placements_are_begun_and_finished_one_by_one(path, rig):
         with pytest.raises(SessionError, match=message) if message else contextlib.nullcontext():
             call(*arguments)
     assert open_session(path).placements == (1,)
-
-
-def test_a_recording_that_was_left_is_finished_from_outside(path, rig):
-    write(rig, path, count=1).close()
-    finish(path)
-    assert open_session(path).placements == (1,) and validate(path) == []
 
 
 # ------------------------------------------------------------------------------------------------ killed, disk full
