@@ -15,7 +15,7 @@ def run(args):
         case "import":
             from lrfcal_lib.session.importers import import_lasersetero
 
-            miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+            miss = import_lasersetero(args.src, args.dst)
             print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
         case "check":
             from lrfcal_lib.session.read import open_session, validate
@@ -44,7 +44,7 @@ def run(args):
         case "report":
             from lrfcal_lib.report.report import main
 
-            return main(args.rest)
+            return main(args.sessions, args.out, args.jobs, args.store)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
@@ -67,10 +67,8 @@ def parser():
     kinds = verbs.add_parser("import", help="make a session of a recording by other people")
     kinds = kinds.add_subparsers(title="recordings", metavar="KIND", required=True)
     add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
-    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m")
+    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png")
     add.add_argument("dst", help="folder of the new session")
-    choices = {"choices": ("own", "published"), "default": "own"}
-    add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
@@ -88,7 +86,11 @@ def parser():
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
     emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
-    verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
+    report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
+    report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the one at hand)")
+    report.add_argument("--out", help="folder of the report (default reports/<session>)")
+    report.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
+    report.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     return top
 
 
@@ -106,9 +108,7 @@ def main(argv=None):
         0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after Ctrl-C. ``record`` has
         its own: 2 after a message that says what to do; ``calibrate`` has 3 where the verdict is 'no'.
     """
-    args, args.rest = parser().parse_known_args(argv)
-    if args.rest and args.verb not in ("report", "emulate"):
-        parser().error(f"unrecognized arguments: {' '.join(args.rest)}")
+    args = parser().parse_args(argv)
     try:
         return run(args) or 0
     except ValueError as error:

@@ -17,8 +17,6 @@ WOBBLE_HZ = 4.0
 KEPT = 2000  # pieces of motion; ten times as many frames
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
-FEEDBACK = ("full", "partial", "none")
-REPLIES = ("extended", "general", "five", "single", "none")
 
 
 class Head:
@@ -132,8 +130,6 @@ class EmulatedHead(SerialDevice):
 
     def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", reply="extended", echo=False,
                  speeds=(0.5, 12.0), go_speed=8.0, watchdog_s=None, invert=False, seed=0, host=REAL):  # fmt: skip
-        if feedback not in FEEDBACK or reply not in REPLIES:
-            raise ValueError(f"feedback is one of {FEEDBACK} and reply one of {REPLIES}, got {feedback!r}, {reply!r}")
         super().__init__(path, host, seed)
         self.head, self.baudrate, self.address = head or Head(seed=seed), baudrate, address
         self.feedback, self.reply_kind, self.echo = feedback, "none" if feedback == "none" else reply, echo

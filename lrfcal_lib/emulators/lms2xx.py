@@ -52,7 +52,7 @@ class ScanRecord:
 
 @dataclass
 class Memory:
-    """Settings of the device; ValueError for those that no device has."""
+    """Settings of the device."""
 
     model: str = "LMS221;302063;X01.27 "  # 21 characters, the answer to the type request
     variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
@@ -63,14 +63,6 @@ class Memory:
     password: bytes = b"SICK_LMS"
     serial: str = "05270497"
     flash_writes: int = 0  # since the device was made; the flash endures a few thousand
-
-    def __post_init__(self):
-        if len(self.model) != 21 or not self.model.isascii():
-            raise ValueError(f"a type has 21 ASCII characters, got {self.model!r}")
-        if not self.takes_variant(self.variant):
-            raise ValueError(f"{self.model[:6]} has no variant {self.variant}; variants are {VARIANTS}")
-        if self.baudrate not in BAUD_WORD or len(self.password) != 8:
-            raise ValueError(f"rate {self.baudrate} Bd, password {self.password!r}: no LMS2xx has that")
 
     def takes_variant(self, variant):
         """Whether the device offers a variant; the LMS211 sees 100 deg only."""
