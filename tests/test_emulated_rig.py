@@ -187,11 +187,13 @@ def obeyed(url, command):
     return urllib.request.urlopen(f"{url}/{command}", timeout=DEADLINE).status == 204
 
 
-def test_the_board_is_put_elsewhere(rig):
-    url = rig.camera_server.url
-    assert obeyed(url, "place/2") and rig.world.place.key == ("placement", 2)
-    assert obeyed(url, "place/none") and rig.world.place.key == ("placement", None)
-    assert obeyed(url, "close/right/1") and rig.world.place.key == ("close", "right", 1)
+def test_the_board_is_put_elsewhere(world):
+    server = CameraServer(world)
+    server.start()
+    for command, key in (("place/2", ("placement", 2)), ("place/none", ("placement", None)),
+                         ("close/right/1", ("close", "right", 1))):  # fmt: skip
+        assert obeyed(server.url, command) and world.place.key == key
+    server.close()
 
 
 @pytest.mark.parametrize(
