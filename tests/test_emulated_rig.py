@@ -173,16 +173,6 @@ def test_an_image_is_drawn_only_where_the_head_rests_long_enough(small, drawing,
     assert server.image("left", timeout=0.3) == (None, None) and bool(asked) == drawn
 
 
-def test_the_end_of_the_drawing_process_is_told(placements, caplog):
-    with EmulatedRig(SMALL, placements=placements) as rig:
-        until(lambda: rig.camera_server.image("left")[0] is not None, "an image")
-        for process in rig.camera_server._pool._processes.values():
-            process.kill()
-        rig.world.put(2)
-        until(lambda: rig.camera_server.image("left") == (None, None) and rig.error() is not None, "the error")
-    assert "the process that draws the images ended" in caplog.text
-
-
 def obeyed(url, command):
     return urllib.request.urlopen(f"{url}/{command}", timeout=DEADLINE).status == 204
 

@@ -59,7 +59,7 @@ class EmulatedRig:
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared)
         self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
         self.scans, self.camera_server = self.lrf.scans, CameraServer(self.world, seed=seed, rest_s=rest_s)
-        self.camera_urls = {name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.names}
+        self.camera_urls = {name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras}
         self._parts = self.lrf, self.pan_tilt, self.camera_server
         for part in self._parts:
             self._closing.callback(part.close)
@@ -78,7 +78,7 @@ class EmulatedRig:
 
     def error(self):
         """What ended a device by itself, None while all live."""
-        return self.lrf.error or self.pan_tilt.error or self.camera_server.error
+        return self.lrf.error or self.pan_tilt.error
 
     def plan(self):
         """What a recording of this rig can do: the sweep that holds all placements, and each of them."""

@@ -1,23 +1,16 @@
 """The one simulated world that all emulated devices look at, and its cameras as MJPEG over HTTP on this machine.
 
-A process of its own draws the images, so that the serial devices keep their times. No image shows a head that moves:
-while it does none is sent, and one that was begun before a move is not sent after it.
+No image shows a head that moves: while it does none is sent, and one that was begun before a move is not sent after it.
 """
 
 import contextlib
 import itertools
-import logging
-import os
-import signal
 import threading
 import time
-from concurrent.futures import CancelledError, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
 
 import cv2
 import numpy as np
@@ -30,7 +23,6 @@ from lrfcal_lib.simulate.record import close_views, world_of
 from lrfcal_lib.simulate.rig import placements_of
 from lrfcal_lib.simulate.scene import Imager
 
-LOG = logging.getLogger(__name__)
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
 QUALITY = 97  # of JPEG
@@ -108,31 +100,10 @@ def scaled(rig, width):
     return replace(rig, cameras=tuple(cameras))
 
 
-_drawing = None  # in the drawing process: the setup, its cameras' imagers, worlds by place
-
-
-def _begin(setup):
-    """Furnish the drawing process, which ends with a parent that was killed."""
-    global _drawing
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this process
-    threading.Thread(target=lambda: wait([parent_process().sentinel]) and os._exit(1), daemon=True).start()
-    cv2.setNumThreads(1)
-    imagers = [Imager(camera.model, camera.exposure) for camera in setup.rig.cameras]
-    _drawing = setup, imagers, lru_cache(2)(lambda place: world_of(setup, place.T_platform_board, stand=place.stand))
-
-
-def _draw(index, place, pitch, seed):
-    """JPEG of what a camera sees; runs in the drawing process."""
-    setup, imagers, world = _drawing
-    pose = setup.rig.camera_pose(setup.rig.cameras[index], pitch)
-    image = imagers[index].render(world(place), pose, np.random.default_rng(seed))
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-
-
 class CameraServer:
     """The cameras of a world, and who puts its board elsewhere, over HTTP.
 
-    `url` has ``NAME.mjpg`` of the cameras in `names`, and obeys ``place/NUMBER`` (or none) and ``close/CAMERA/VIEW``.
+    `url` has ``NAME.mjpg`` of all `cameras`, and obeys ``place/NUMBER`` (or none) and ``close/CAMERA/VIEW``.
 
     Parameters
     ----------
@@ -141,29 +112,24 @@ class CameraServer:
     rest_s : float
         Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its image is wanted;
         most stops of a sweep need none and are shorter.
-
-    Attributes
-    ----------
-    error : Exception or None
-        What ended the drawing process; there are no more images.
     """
 
-    serving = property(lambda self: not self.quit.is_set() and self.error is None, doc="Whether images are to come.")
-
     def __init__(self, world, *, seed=0, rest_s=0.5):
-        self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
-        self.names = [camera.name for camera in world.setup.rig.cameras]
+        self.world, self.seed, self.rest_s, self.quit = world, seed, rest_s, threading.Event()
+        self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
+        self._imager = lru_cache(lambda name: Imager(self.cameras[name].model, self.cameras[name].exposure))
+        self._scene = lru_cache(2)(lambda place: world_of(world.setup, place.T_platform_board, stand=place.stand))
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
-        self.quit = threading.Event()
-        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (world.setup,))
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
+        self._pool = ThreadPoolExecutor(1, "drawing")
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"server_of": self}))
         self.url = f"http://127.0.0.1:{self._server.server_port}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self.start = self._thread.start
 
     def close(self):
-        """End the server, started or not, and the drawing process."""
-        self.quit.set()
+        """End the server, started or not, and the drawing."""
+        with self._lock:
+            self.quit.set()
         if self._thread.is_alive():
             self._server.shutdown()
         self._server.server_close()
@@ -175,24 +141,15 @@ class CameraServer:
         (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
         """
         end = time.monotonic() + timeout
-        try:
-            while self.serving and time.monotonic() < end:
-                key = self._key(name)
-                if key is None:
-                    self.quit.wait(LOOK_S)
-                    continue
-                with contextlib.suppress(TimeoutError, CancelledError):
-                    data = self._drawn(key).result(LOOK_S)
-                    if self._key(name) == key:
-                        return key, data
-        except BrokenProcessPool as error:
-            if self.serving:
-                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
-                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
-            self.error = error
-        except RuntimeError:  # a pool that was shut down is no news
-            if self.serving:
-                raise
+        while not self.quit.is_set() and time.monotonic() < end:
+            key = self._key(name)
+            if key is None:
+                self.quit.wait(LOOK_S)
+                continue
+            with contextlib.suppress(TimeoutError, CancelledError):
+                data = self._drawn(key).result(LOOK_S)
+                if self._key(name) == key:
+                    return key, data
         return None, None
 
     def _key(self, name):
@@ -209,10 +166,17 @@ class CameraServer:
             if before != key:
                 if image is not None:
                     image.cancel()
-                index = self.names.index(key[0])
-                image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
+                if self.quit.is_set():
+                    raise CancelledError
+                image = self._pool.submit(self._draw, *key, [self.seed, next(self._count)])
                 self._images[key[0]] = key, image
         return image
+
+    def _draw(self, name, place, pitch, seed):
+        """JPEG of what a camera sees."""
+        pose = self.world.setup.rig.camera_pose(self.cameras[name], pitch)
+        image = self._imager(name).render(self._scene(place), pose, np.random.default_rng(seed))
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -220,17 +184,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self):
         """Answer a request, see :mod:`http.server`."""
-        cameras, world = self.cameras, self.cameras.world
+        cameras, world = self.server_of.cameras, self.server_of.world
         try:
             match self.path.removesuffix(".mjpg").strip("/").split("/"):
-                case [name] if name in cameras.names:
+                case [name] if name in cameras:
                     return self._stream(name)
                 case ["place", number]:
                     world.put(None if number == "none" else int(number))
                 case ["close", camera, view]:
                     world.hold_close(camera, int(view))
                 case _:
-                    known = ", ".join(f"{name}.mjpg" for name in cameras.names)
+                    known = ", ".join(f"{name}.mjpg" for name in cameras)
                     return self.send_error(404, f"there are {known}, place/NUMBER and close/CAMERA/VIEW")
         except ValueError as error:
             return self.send_error(400, str(error))
@@ -238,20 +202,20 @@ class _Handler(BaseHTTPRequestHandler):
         return self.end_headers()
 
     def _stream(self, name):
-        cameras = self.cameras
+        server = self.server_of
         with contextlib.suppress(ConnectionError, TimeoutError):
             self.send_response(200)
             self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
             self.send_header("Cache-Control", "no-cache")
             self.end_headers()
-            while cameras.serving:
-                _, data = cameras.image(name)
+            while not server.quit.is_set():
+                _, data = server.image(name)
                 if data is None:
                     self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
                 else:
                     head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     self.wfile.write(head.encode() + data + b"\r\n")
-                    cameras.quit.wait(1 / FPS)
+                    server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass
