@@ -15,7 +15,7 @@ def run(args):
         case "import":
             from lrfcal_lib.session.importers import import_lasersetero
 
-            miss = import_lasersetero(args.src, args.dst)
+            miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
             print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
         case "check":
             from lrfcal_lib.session.read import open_session, validate
@@ -48,7 +48,7 @@ def run(args):
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.setup, args.rig_file)
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
     return 0
 
 
@@ -67,8 +67,10 @@ def parser():
     kinds = verbs.add_parser("import", help="make a session of a recording by other people")
     kinds = kinds.add_subparsers(title="recordings", metavar="KIND", required=True)
     add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
-    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png")
+    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m")
     add.add_argument("dst", help="folder of the new session")
+    choices = {"choices": ("own", "published"), "default": "own"}
+    add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
@@ -86,6 +88,9 @@ def parser():
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
     emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
+    emulate.add_argument("--seed", type=int, default=0, help="of noise")
+    told = {"choices": ("full", "partial", "none"), "default": "full"}
+    emulate.add_argument("--feedback", **told, help="what the head tells of its position")
     report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
     report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the one at hand)")
     report.add_argument("--out", help="folder of the report (default reports/<session>)")

@@ -38,7 +38,7 @@ from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.lms2xx_codec import check_crc, crc16, encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
-from lrfcal_lib.session.write import SessionRecorder, SessionWriter
+from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
@@ -80,10 +80,12 @@ def make_sessions(folder):
     bearings, pitch = np.radians(np.arange(60.0, 121.0)), np.radians([-1.0, 0.0, 1.0])
     with SessionWriter(folder / "scans", SQUARE, LRF, cameras, HEAD) as writer:
         for placement in (1, 2):
-            writer.add_sweep(placement, np.full((3, 61), 2.0), bearings, pitch, [0.0, 1, 2])
+            writer.add_sweep(placement, np.full((3, 61), 2.0), bearings, pitch, [0.0, 1, 2], np.ones((3, 61)))
             writer.add_image("right", picture(placement), placement, pitch=0.1, time_s=placement)
         for view in range(3):
             writer.add_image("left", picture(3 + view), 1 + view % 2, pitch=0.1, purpose="intrinsics")
+    rows = "left,images/left/0001.png,ab,1,2,20,3\nright,images/right/0001.png,bc,1,2,30,3\n"
+    (folder / "scans" / "edges.csv").write_text("camera,file,edge,u1,v1,u2,v2\n" + rows)
     stated = json.loads((folder / "scans" / "session.json").read_text())
     truth = {"T_head_lrf": transform_to_json(HEAD), "board": stated["board"]}
     truth |= {"cameras": {c: {"T_camera_lrf": transform_to_json(HEAD)} for c in ("left", "right")}}
@@ -310,7 +312,7 @@ def use(rng, path):
         return [_caught(read_rig_file, path / "rig.json")]  # what it names belongs to who wrote it
     surveyed = rng.random() < SURVEYED
     read = [validate, _survey if surveyed else read_all][rng.integers(2)]
-    writing = [_go_on] * (rng.random() < 0.3)
+    writing = [_go_on if rng.random() < 0.7 else finish] * (rng.random() < 0.3)
     return [_caught(work, path) for work in (read, *writing)]
 
 
@@ -339,7 +341,7 @@ def _caught(work, *arguments):
         trace, frames = traceback.format_exc(), traceback.extract_tb(error.__traceback__)
         if "MemoryError" in trace or "nsufficient memory" in trace:
             return "memory", repr(error)[:300], trace
-        ours = [SessionError, RigFileError] + [OSError] * (work == _go_on)
+        ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
         if work in (read_all, _survey) and frames[-1].filename.startswith(LIBRARY):
             ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
         if not isinstance(error, tuple(ours)):

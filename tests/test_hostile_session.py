@@ -14,9 +14,9 @@ import pytest
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder
+from lrfcal_lib.session.write import SessionRecorder, finish
 
-SCANS = ["session.json", "lrf/scans.npz", "images.csv", "images/left/0001.png", "truth.json"]
+SCANS = ["session.json", "lrf/scans.npz", "images.csv", "edges.csv", "images/left/0001.png", "truth.json"]
 FILES = [f"scans/{name}" for name in SCANS]
 FILES += [f"telegrams/{name}" for name in ("lrf/telegrams.bin", "lrf/index.csv", "platform.csv")]
 
@@ -151,9 +151,10 @@ def test_mistakes_of_ours_are_not_taken_for_damage(folder, monkeypatch):
 
 def test_a_second_writer_is_told_who_writes(folder):
     path = folder / "telegrams"
-    told = rf"telegrams: process {os.getpid()} on \S+ since 20\S+ \S+ writes"
-    with fuzz.recorder(path), pytest.raises(SessionError, match=told):
-        fuzz.recorder(path)
+    for refused in (fuzz.recorder, finish):
+        told = rf"telegrams: process {os.getpid()} on \S+ since 20\S+ \S+ writes"
+        with fuzz.recorder(path), pytest.raises(SessionError, match=told):
+            refused(path)
     assert not (path / "writer.lock").exists()
     fuzz.recorder(path).finish()
     assert open_session(path).placements == (1,)
@@ -186,3 +187,10 @@ def test_check_finds_what_two_writers_left(folder, monkeypatch):
     found = "\n".join(validate(path))
     assert re.search(r"images.csv line 5: images/left/0003.png stands in line 4 already; remove one", found)
     assert re.search(r"index.csv line 8: t_s runs back from 5.5 to 5: two writers at once\? Record the", found)
+
+
+def test_check_finds_an_edge_that_is_picked_twice(folder):
+    with (folder / "scans" / "edges.csv").open("a") as table:
+        table.write("left,images/left/0001.png,ab,1,2,20,9\n")
+    told = "\n".join(validate(folder / "scans"))
+    assert "edges.csv line 4: left, images/left/0001.png, ab stands in line 2" in told

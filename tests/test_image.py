@@ -12,14 +12,14 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
-from lrfcal_lib.model.camera import CameraModel, line_distance, line_through, pinhole, project, undistort
+from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
-from lrfcal_lib.preprocess.edges_in_image import ImageEdge, correlation_factor, refine_edge
+from lrfcal_lib.preprocess.edges_in_image import correlation_factor, picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grid_noise, pattern_orders
 from lrfcal_lib.report.notebook import ROOT
-from lrfcal_lib.session.read import ImageRecord, open_session
+from lrfcal_lib.session.read import EdgePick, ImageRecord, open_session
 
 SIZE = 640, 480
 MODEL = CameraModel(*SIZE, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
@@ -142,10 +142,10 @@ def up_to_a_turn(corners, exact):
     return min((corners - p for p in (exact, exact[::-1])), key=lambda off: np.abs(off).max())
 
 
-def seen(picture, board=SHEET):
+def seen(picture, board=SHEET, picks=()):
     """The view of a single image."""
     records = [record("left", "a.png", 3, 0.1)]
-    return survey.survey(records, lambda r: picture, board, {"left": MODEL}).views["left"][0]
+    return survey.survey(records, lambda r: picture, board, {"left": MODEL}, picks).views["left"][0]
 
 
 # --- corners -------------------------------------------------------------------------------------------------------
@@ -323,6 +323,7 @@ PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i i
         lambda: adjust(ONE[None, None, :4], PATTERN.points()[:4], [MODEL], STACKED),
     "four or more of the pattern's 24 corners": lambda: board_pose(ONE[:10], PATTERN, MODEL),
     "four or more": lambda: board_pose(np.where(np.arange(24)[:, None] < 3, ONE, np.nan), PATTERN, MODEL),
+    "two points 0.00 px apart": lambda: picked_edge("top", [3, 4], [3, 4], [0, 1]),
     "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0),
 }.items())  # fmt: skip
 def test_what_does_not_suffice(message, call):
@@ -365,10 +366,7 @@ def noisy_edges(pose, seed, sigma=0.1):
     for i, name in enumerate(SHEET.edges):
         exact = true_line(name, pose)
         ends = on_board(pose, CORNERS[[i, (i + 1) % 4]]) + rng.normal(0, sigma, (2, 1)) * exact[:2]
-        line, length = line_through(*ends), np.linalg.norm(ends[1] - ends[0])
-        covariance = np.diag([sigma**2 / 2, 2 * sigma**2 / length**2])
-        line *= np.sign(line[:2] @ exact[:2])
-        out.append(ImageEdge(name, line, covariance, ends.mean(axis=0), ends, 2, 0.0))
+        out.append(replace(picked_edge(name, *ends, exact[:2], sigma), picked=False))
     return out
 
 
@@ -478,6 +476,25 @@ def test_what_cannot_be_used_is_listed_with_the_reason():
     assert "inner corners" in view.reason and (view.edges, view.T_camera_board) == ((), None)
 
 
+def test_picks_override_the_detector():
+    pose = pose_of()
+    corners = on_board(pose, CORNERS, project)
+    picks = [
+        EdgePick("left", Path("a.png"), "top", corners[[1, 0]] + [0.5, 0.5]),
+        EdgePick("left", Path("b.png"), "right", corners[:2]),
+        EdgePick("right", Path("a.png"), "left", corners[:2]),
+    ]
+    view = seen(render(pose), picks=picks)
+    assert [e.name for e in view.edges if e.picked] == ["top"]
+    top, ends = view.edge("top"), undistort(picks[0].ends, MODEL)
+    np.testing.assert_allclose(top.ends, ends, atol=1e-9)
+    assert np.abs(line_distance(ends, top.line)).max() < 1e-9
+    assert line_distance(on_board(pose, [[0.12, 0.095]])[0], top.line) < 0
+    assert view.edge("left").picked is False and view.edge("nowhere") is None
+    with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
+        seen(render(pose), picks=[replace(picks[0], edge="hypotenuse")])
+
+
 # --- the outline that nobody measured ------------------------------------------------------------------------------
 
 
@@ -569,7 +586,7 @@ def test_further_images_of_a_placement_are_turned_as_its_first_one_was(session, 
     asked, views = [], {c: {v.placement: v for v in own} for c, own in surveyed.views.items()}
     views["right"][2] = replace(views["right"][2], pixels=None, T_camera_board=None, reason="no chessboard")
     images = SimpleNamespace(
-        images=lambda purpose: records + more, read_image=lambda r: asked.append(r) or read(r)
+        images=lambda purpose: records + more, picks=(), read_image=lambda r: asked.append(r) or read(r)
     )
     found = survey.all_views(
         SimpleNamespace(
@@ -658,6 +675,17 @@ def test_a_plain_triangle_is_found_in_all_its_poses_with_the_names_of_its_edges(
     for other in (found, *found.alternatives):
         there = on_board(other.T_camera_board, TRIANGLE.corners)
         np.testing.assert_allclose(np.sort(there, axis=0), np.sort(corners, axis=0), atol=0.1)
+
+
+def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector():
+    pose = triangle_pose()
+    corners = on_board(pose, TRIANGLE.corners, project)
+    picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
+    view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": picks["bc"]})
+    assert view.edge("bc").picked and worst_edge(view, pose, TRIANGLE) < 0.1
+    view = view_board(BLANK, TRIANGLE, MODEL, picks=picks)
+    assert view.reason == "" and all(e.picked for e in view.edges)
+    np.testing.assert_allclose(nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
 
 def test_a_plain_quadrilateral_is_over_determined():

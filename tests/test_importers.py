@@ -3,13 +3,29 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import importers
-from lrfcal_lib.session.importers import import_lasersetero, read_pcd, recover_polar
+from lrfcal_lib.session.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.stated import SessionError, transform_from_json
+
+BOUGUET = """
+fc = [ 700.5 ; 701.5 ];
+cc = [ 15.25 ; 11.75 ];
+alpha_c = 0.000000000000000;
+kc = [ -0.17 ; 0.02 ; -0.0003 ; 0.0004 ; 0.0 ];
+fc_error = [ 3.0 ; 6.0 ];
+cc_error = [ 0.3 ; 0.6 ];
+kc_error = [ 0.003 ; 0.0 ; 0.0 ; 0.0 ; 0.0 ];
+%-- Image size:
+nx = 32;
+ny = 24;
+omc_1 = [ -7.4e-01 ; -3.0e-01 ; 1.4e+00 ];
+Tc_1  = [ -1.428e+02 ; 9.8e+01 ; 1.3e+03 ];
+"""
 
 
 def authors_points(ranges, bearing_deg, p):
@@ -36,6 +52,7 @@ def write_source(folder, rng):
         rows = "\n".join(" ".join(f"{v:.6f}" for v in p) for p in points)
         (folder / f"plane_{n:02d}.pcd").write_text(header + rows)
     for name in ("left", "right"):
+        (folder / f"Calib_Results_{name}.m").write_text(BOUGUET)
         for n in (1, 2):
             cv2.imwrite(str(folder / f"{name}_{n:02d}.png"), rng.integers(0, 255, (24, 32, 3)).astype(np.uint8))
     return folder
@@ -89,9 +106,12 @@ def line(first):
 REFUSED = [
     (lambda _: recover_polar(line(0) + [0, 0, 4e-4], "c 7"), r"c 7: rebuilding the points misses by 0\.\d+ mm, more"),
     (lambda _: recover_polar(line(39.6)), r"bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
+    (lambda folder: read_bouguet(written(folder / "c.m", "fc = [ 1 ; 2 ];\n")), r"c\.m: no value of cc, kc"),
     (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),
+    (lambda folder: import_lasersetero(folder, folder / "dst", intrinsics="best"), "'own' or 'published', got 'best'"),
     (without("plane_*"), "plane_.*"),
     (without("left_*"), "left_.*"),
+    (without("Calib_Results_right.m"), "Calib_Results_right.m"),
     (cloud(lambda text: text[: len(text) // 2].rpartition("\n")[0]), "truncated"),
     (cloud(lambda text: text.replace("0.", "0,", 40)), "could not convert"),
     (cloud(lambda text: text.replace("x y z", "x y z rgb")), "ASCII PCD file with the fields x y z"),
@@ -126,12 +146,23 @@ def test_import_makes_a_sound_session(source, tmp_path):
         assert record.file.read_bytes() == original.read_bytes()
 
 
+def test_published_intrinsics(source, tmp_path):
+    import_lasersetero(source, tmp_path / "dst", intrinsics="published")
+    session = open_session(tmp_path / "dst")
+    model = session.cameras["left"].model
+    assert (model.fx, model.fy, model.cx, model.cy) == (700.5, 701.5, 15.25, 11.75)
+    np.testing.assert_allclose(np.sqrt(np.diag(model.covariance))[:5], [1, 2, 0.1, 0.2, 0.001])
+    pose = transform_from_json(session.reference["cameras"]["left"]["T_camera_board"]["1"])
+    np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
+    np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
+
+
 # ---------------------------------------------------------------------------------------------- command line
 
 
 def test_command_line(source, tmp_path, capsys):
     target = str(tmp_path / "dst")
-    assert main(["import", "lasersetero", str(source), target]) == 0
+    assert main(["import", "lasersetero", str(source), target, "--intrinsics", "published"]) == 0
     assert "rebuild to 0.00" in capsys.readouterr().out
     assert main(["check", target]) == 0
     (tmp_path / "dst" / "images" / "left" / "0001.png").unlink()

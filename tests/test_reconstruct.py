@@ -250,9 +250,10 @@ def test_blocks_are_the_whole(monkeypatch, tmp_path):
 
 def test_what_no_image_saw_is_flagged_and_points_tell_where_they_come_from():
     _, noisy = scan(step_edge)
+    noisy = replace(noisy, intensities=np.full(noisy.ranges.shape, 7.0))
     cloud = whole(noisy, [view(plain_image(), pose=AHEAD, number=5)])
     assert 0.2 < cloud.seen.mean() < 1 and (cloud.colors[~cloud.seen] == rec.GREY).all()
-    assert set(np.unique(cloud.image)) == {-1, 5}
+    assert set(np.unique(cloud.image)) == {-1, 5} and (cloud.intensity == 7).all()
     back = np.stack([np.cos(cloud.bearing), np.sin(cloud.bearing)], -1) * cloud.range[:, None]
     np.testing.assert_allclose(cloud.points[:, 0], back[:, 0], atol=1e-9)
     np.testing.assert_allclose(cloud.points[:, 2], back[:, 1] * np.sin(cloud.pitch), atol=1e-9)

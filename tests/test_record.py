@@ -28,7 +28,7 @@ from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder
+from lrfcal_lib.session.write import SessionRecorder, finish
 
 
 def write(rig, path, **options):
@@ -232,6 +232,12 @@ def test_placements_are_begun_and_finished_one_by_one(path, rig):
         with pytest.raises(SessionError, match=message) if message else contextlib.nullcontext():
             call(*arguments)
     assert open_session(path).placements == (1,)
+
+
+def test_a_recording_that_was_left_is_finished_from_outside(path, rig):
+    write(rig, path, count=1).close()
+    finish(path)
+    assert open_session(path).placements == (1,) and validate(path) == []
 
 
 # ------------------------------------------------------------------------------------------------ killed, disk full
@@ -554,9 +560,9 @@ def test_the_command_line_passes_everything_on(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         command_line.main(["record", "rig.json", "s", "--placements", "0"])
     assert "1 or more are needed" in capsys.readouterr().err
-    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda *args: got.update(args=args) or 0)
+    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda *args, **options: got.update(options, args=args) or 0)
     assert command_line.main(["emulate", "sim_quick", "--rig-file", "x.json"]) == 0
-    assert got["args"] == ("sim_quick", "x.json")
+    assert got["args"] == ("sim_quick", "x.json") and (got["seed"], got["feedback"]) == (0, "full")
 
 
 # ---------------------------------------------------------------------------------------------------------- lights

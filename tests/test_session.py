@@ -16,7 +16,7 @@ from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.read import image_size, open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
-from lrfcal_lib.session.write import SessionWriter
+from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
 LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)
@@ -44,7 +44,7 @@ def write(path, *sweeps, **options):
             writer.add_sweep(number, *sweep)
         if not sweeps:
             writer.add_sweep(1, *wall())
-            writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5])
+            writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
             for camera in ("left", "right"):
                 writer.add_image(camera, pixels(1), 1, pitch=0.1)
                 writer.add_image(camera, pixels(2), 2, time_s=3.5)
@@ -80,7 +80,7 @@ def same(a, b):
 def test_what_is_written_is_read(path):
     session = open_session(path)
     assert (session.name, session.licence, session.source, session.simulated) == ("trip", "CC0", "a test", False)
-    assert session.placements == (1, 2) and session.problems == ()
+    assert session.placements == (1, 2) and session.problems == () and session.picks == ()
     assert validate(path) == []
     assert session.lrf.field_of_view == pytest.approx(LRF.field_of_view, abs=1e-12)
     assert session.lrf.bearing_step == pytest.approx(LRF.bearing_step, abs=1e-12) and session.lrf.max_range == 8.0
@@ -98,6 +98,11 @@ def test_sweeps_keep_order_gaps_and_times(path):
     np.testing.assert_array_equal(first.bearings, bearings)
     np.testing.assert_array_equal(first.pitch, pitch)
     assert np.isnan(first.time_s).all() and second.time_s.tolist() == [0.5, 1.0, 1.5]
+
+
+def test_intensities_are_kept_where_all_sweeps_have_them(tmp_path):
+    write(tmp_path / "s", (*wall(), None, np.full((3, len(BEARINGS)), 7.0)))
+    assert (open_session(tmp_path / "s").sweep(1).intensities == 7).all()
 
 
 def test_images_are_found_by_camera_placement_and_purpose(path):
@@ -138,12 +143,44 @@ def test_boards_models_and_transforms_survive_json():
     same(stated.transform_from_json(through(stated.transform_to_json(HEAD))), HEAD)
 
 
+def test_picks_override_by_camera_file_and_edge(path):
+    pick("left,images/left/0001.png,ab,1,2,20,3.5")(path)
+    session = open_session(path)
+    (found,) = session.picks
+    assert found.edge == "ab" and found.file == session.images("left", 1)[0].file
+    assert found.ends.tolist() == [[1, 2], [20, 3.5]]
+
+
 def test_zero_and_infinite_ranges_are_no_returns(path):
     edit_scans(path, ranges=lambda ranges: np.where(np.arange(61) < 2, [[0.0], [np.inf]] * 3, ranges))
     assert np.isnan(open_session(path).sweep(1).ranges[:, :2]).all()
 
 
 # ---------------------------------------------------------------------------------------------- crashes
+
+
+def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
+    path = tmp_path / "s"
+    with pytest.raises(RuntimeError, match="power"), SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer:
+        writer.add_sweep(4, *wall())
+        writer.add_image("left", pixels(), 4)
+        raise RuntimeError("power cut")
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images/left/00")
+    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"):
+        open_session(path)
+    finish(path)
+    session = open_session(path)
+    assert session.placements == (4,) and len(session.images("left", 4)) == 1
+    assert sorted(p.name for p in (path / "lrf").iterdir()) == ["scans.npz"]
+
+
+def test_finish_needs_sweeps(path):
+    with pytest.raises(SessionError, match="no sweep to finish"):
+        finish(path)
+    (path / "images").mkdir(exist_ok=True)
+    with pytest.raises(SessionError, match="lrf is missing; is this the folder of a session"):
+        finish(path / "images")
 
 
 def test_an_existing_target_is_refused(path):
@@ -183,10 +220,6 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("schema", "gone", "schema is None"),
     ("board", "gone", "json: board is missing"),
     ("rig.cameras", "gone", r"rig\.cameras is missing"),
-    ("rig.lrf.file", "../scans.npz", "must stay inside the session's folder, got '../scans.npz'"),
-    ("rig.lrf.file", "/etc/passwd", "must stay inside the session's folder, got '/etc/passwd'"),
-    ("rig.lrf.file", "C:\\a", r"must stay inside the session's folder, got 'C:\\a'"),
-    ("rig.lrf.file", "lrf/scans.csv", "the LRF's file is one of"),
     ("name", "../up", "name is '../up': this becomes a file name"),
     ("rig.cameras.a/", {}, r"name is 'a/': this becomes a file name"),
     ("placements", [1, 1], r"placements is \[1, 1\]: placements are different numbers"),
@@ -266,6 +299,10 @@ def cell(column, value):
     return edit
 
 
+def pick(row):
+    return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
+
+
 SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the session's folder, got "
 DAMAGE = [
     (gone("session.json"), r"session\.json: No such file"),
@@ -308,6 +345,12 @@ DAMAGE = [
     (written(IMAGES, b"\xff\xfe"), "not a CSV file in UTF-8"),
     (written(IMAGES, lambda data: data.replace(b"_deg", b"")), r"columns must be t_s, .*; got t_s, .*, pitch, purpose"),
     (written(IMAGES, lambda data: data + b",left,images"), "line 7: 3 values for 6 columns; truncated"),
+    (pick("left,images/left/0009.png,ab,1,2,20,3"), "no 'images/left/0009.png' of camera 'left'"),
+    (pick("left,../0001.png,ab,1,2,20,3"), OUT),
+    (pick("left,images/left/0001.png,top,1,2,20,3"), "edge is one of ab, bc, ca, got 'top'"),
+    (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
+    (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
+    (pick("left,images/left/0001.png,ab,1,2,x,3"), "could not convert"),
 ]
 
 

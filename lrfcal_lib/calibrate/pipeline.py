@@ -419,7 +419,8 @@ def cloud_blocks(calibration, method="line", scene=False):
         if mask is not None:  # the board and what is around it
             lines, beams = (slice(max(0, at.min() - 20), at.max() + 21) for at in np.nonzero(mask))
             part = {"pitch": sweep.pitch[lines], "time_s": sweep.time_s[lines], "bearings": sweep.bearings[beams]}
-            sweep = replace(sweep, ranges=sweep.ranges[lines, beams], **part)
+            echoes = None if sweep.intensities is None else sweep.intensities[lines, beams]
+            sweep = replace(sweep, ranges=sweep.ranges[lines, beams], intensities=echoes, **part)
             mask = mask[lines, beams]
         yield from reconstruct.reconstruct(sweep, views, **settings, mask=mask)
 

@@ -43,8 +43,8 @@ class Cloud:
         Whether any camera sees the point.
     placement, image : ndarray of int, shape (n,)
         The sweep, and the number in `Session.image_records` of the image that counts most, -1 for none.
-    pitch, bearing, range : ndarray, shape (n,)
-        As measured (radians, radians, metres).
+    pitch, bearing, range, intensity : ndarray, shape (n,)
+        As measured (radians, radians, metres; NaN where no intensity was recorded).
     sigma : ndarray, shape (n,)
         Standard deviation across the surface, metres: scatter of the readings about it; see `scenes.with_sigma`.
     removed : int
@@ -60,6 +60,7 @@ class Cloud:
     pitch: np.ndarray
     bearing: np.ndarray
     range: np.ndarray
+    intensity: np.ndarray
     sigma: np.ndarray
     removed: int = 0
 
@@ -272,9 +273,12 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
         line, beam = np.nonzero(take)
         colors, seen, source = painter.paint(points[take], normals[take])
         colors = np.where(seen[:, None], np.clip(np.rint(np.nan_to_num(colors)), 0, 255), GREY).astype(np.uint8)
+        ranges, echo = sweep.ranges[rows][take], np.full(len(line), np.nan)
+        if sweep.intensities is not None:
+            echo = sweep.intensities[rows][take].astype(float)
         number, sigma = np.full(len(line), sweep.placement), scatter[take]
         sigma = np.where(np.isfinite(sigma), sigma, lrf.sigma_range)
-        measured = sweep.pitch[rows][line], sweep.bearings[beam], sweep.ranges[rows][take]
+        measured = sweep.pitch[rows][line], sweep.bearings[beam], ranges, echo
         at = points[take], normals[take], colors, seen, number, source, *measured, sigma
         yield Cloud(*at, removed=int((wanted & ~good).sum()))
 
@@ -489,7 +493,7 @@ COLUMNS = {  # of a PLY file, of attributes that are no single float by the attr
     "points": ("<f4", "x y z"), "normals": ("<f4", "nx ny nz"), "colors": ("u1", "red green blue"),
     "seen": ("u1", "seen"), "placement": ("<i4", "placement"), "image": ("<i4", "image"),
 }  # fmt: skip
-COLUMNS |= {name: ("<f4", name) for name in ("pitch", "bearing", "range", "sigma")}
+COLUMNS |= {name: ("<f4", name) for name in ("pitch", "bearing", "range", "intensity", "sigma")}
 KINDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 
 

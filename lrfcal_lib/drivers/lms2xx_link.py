@@ -1,7 +1,6 @@
 """The line to an LMS2xx: telegrams with their instants, retries, the baud rate, scans on request and as a stream."""
 
 import itertools
-import logging
 import math
 from collections import deque
 from dataclasses import dataclass, replace
@@ -9,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.port import REAL, DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
+from lrfcal_lib.drivers.port import REAL, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session import lms2xx_codec as codec
 
-LOG = logging.getLogger(__name__)
 ACK, NAK = 0x06, 0x15
 MODE, VALUES, STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURE = 0x20, 0x30, 0x31, 0x32, 0x3A, 0x3B, 0x74, 0x77
 POWER_ON, NOT_UNDERSTOOD = 0x90, 0x92
@@ -357,73 +355,3 @@ class Assembler:
         columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
                    for name in ("ranges", "reasons", "bearings", "beam_times_s")}  # fmt: skip
         return replace(parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns)
-
-
-KEPT = 256  # scans that can be asked for by their instant
-LEAST_QUIET_S = 0.6
-RECOVERY_S = 8.0  # one attempt; there are more until the stream is stopped
-AGAIN_S = 0.1
-
-
-class ScanReader:
-    """A thread that reads scans until the event `leave` is set; `readings`, the last 256, is replaced, never changed.
-
-    ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
-    ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
-    `interval_s` is that between two readings.
-    """
-
-    def __init__(self, receive, recover, interval_s, leave, host):
-        self._receive, self._recover, self.interval_s = receive, recover, interval_s
-        self._leave, self._host, self._news = leave, host, host.event()
-        self.readings, self._trouble = [], None
-        self.thread = host.thread(self._run, "LMS2xx reader")
-        self.thread.start()
-
-    def wait(self, find, timeout):
-        """The reading that ``find(readings)`` gives as soon as it is not None; NoReply if there is none in time."""
-        end = self._host.now() + timeout
-        while True:
-            self._news.clear()
-            alive, found = self.thread.is_alive(), find(self.readings)
-            if found is not None:
-                return found
-            left = end - self._host.now()
-            if left <= 0 or not alive:
-                state = "the stream is silent" if alive else "the reader thread ended"
-                raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
-            self._news.wait(min(left, 0.2))
-
-    def _run(self):
-        """Read; whatever goes wrong with the line, find the device again."""
-        lost = False
-        while not self._leave.is_set():
-            try:
-                if lost:
-                    self._recover(RECOVERY_S)
-                    lost = False
-                self._read()
-            except DeviceError as error:
-                if lost:
-                    self._leave.wait(AGAIN_S)
-                self._trouble, lost = str(error), True
-                LOG.warning("LMS2xx: %s; looking for the device", error)
-            except Exception as error:  # told to whoever waits, who would wait for nothing
-                self._trouble = f"the reader thread failed: {error!r}"
-                LOG.exception("LMS2xx reader thread")
-                raise
-
-    def _read(self):
-        """Post readings until the stream falls silent, or until the end."""
-        last = self._host.now()
-        while not self._leave.is_set():
-            found = self._receive()
-            if any(code == POWER_ON for code, _ in found):
-                raise NoReply("the device started anew")
-            fresh = [reading for _, reading in found if reading is not None]
-            if fresh:
-                self.readings, self._trouble = [*self.readings, *fresh][-KEPT:], None
-                self._news.set()
-                last = self._host.now()
-            if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
-                raise NoReply("the stream fell silent")

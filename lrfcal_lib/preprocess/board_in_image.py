@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian, project, undistort
+from lrfcal_lib.model.camera import line_distance, pinhole, pinhole_jacobian, project, undistort
 from lrfcal_lib.model.geometry import gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
 from lrfcal_lib.preprocess import edges_in_image
-from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, board_line, on_board, refine_edge
+from lrfcal_lib.preprocess.edges_in_image import EdgeNotSeen, ImageEdge, board_line, on_board, picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import SIGMA_FLOOR_PX, board_pose, raised_points
 from lrfcal_lib.preprocess.pattern_in_image import grey
 
@@ -20,6 +20,7 @@ LEAST_AREA_SHARE = 0.002  # of the image
 LEAST_FILL = 0.9  # of the polygon by the dark region, and the other way round
 SEARCH_PX = 4.0
 EXACT_PX = 0.5  # a pose explains the outline when its corners fall this near (or within 4 sigma)
+SAME_NAMES_PX = 10.0  # from picks to the edges of their names
 AGREE_CHI2 = 18.4  # an edge disagrees with a pose beyond this: 1 in 10000 true ones (two degrees of freedom)
 WINDOW = 0.010  # half width of the narrow search, metres: edges sit within 1-3 mm (sd) in the sheet's frame
 PREDICTION_SIGMA = 0.005  # of an edge on the board, metres
@@ -77,7 +78,7 @@ class BoardView:
         return next((e for e in self.edges if e.name == name), None)
 
 
-def view_board(image, board, model, view=None, *, lines=None, relief=None):
+def view_board(image, board, model, view=None, picks=None, *, lines=None, relief=None):
     """Find the board, its pose and its straight edges in one image.
 
     Parameters
@@ -88,6 +89,8 @@ def view_board(image, board, model, view=None, *, lines=None, relief=None):
     model : CameraModel
     view : BoardView, optional
         Says whose image it is; for a board with a pattern it has the `pixels` of its corners, in the right order.
+    picks : dict of str to ndarray, shape (2, 2), optional
+        Ends of edges picked by hand (recorded pixels), which override the detector.
     lines, relief : ndarray
         For a board with a pattern: the outline (E, 3) that predicts its edges (without it none are looked for), and the
         heights of the corners (k,), metres.
@@ -97,26 +100,26 @@ def view_board(image, board, model, view=None, *, lines=None, relief=None):
     BoardView
         An image that cannot be used is no error: `reason` says why.
     """
-    view = view or BoardView()
+    view, picks = view or BoardView(), picks or {}
     if image.shape[:2] != (model.height, model.width):
         size = f"the image is {image.shape[1]} x {image.shape[0]}"
         return replace(view, reason=f"{size}, the intrinsics are for {model.width} x {model.height} pixels")
     if board.pattern is None:
         try:
-            found = _views_plain(view, image, board, model)
+            found = _views_plain(view, image, board, model, picks)
         except (OutlineNotFound, EdgeNotSeen) as error:
             return replace(view, reason=str(error))
         if not found:
             return replace(view, reason=f"no pose of board '{board.name}' explains the outline in the image")
         return replace(found[0], alternatives=tuple(found[1:]))
-    view = _view_pattern(view, image, board, model, lines, relief)
+    view = _view_pattern(view, image, board, model, picks, lines, relief)
     if board.corners is None:
         return view
     pose, covariance = pose_with_edges(view, board, model, relief)
     return replace(view, T_camera_board=pose, covariance=covariance)
 
 
-def _view_pattern(view, image, board, model, lines, relief, most=np.inf):
+def _view_pattern(view, image, board, model, picks, lines, relief, most=np.inf):
     """The view with the pose from the pattern's corners and the edges near it, each by `most` profiles or fewer."""
     pose, covariance, used = board_pose(view.pixels, board.pattern, model, relief)
     pixels = np.where(used[:, None], view.pixels, np.nan)
@@ -125,6 +128,9 @@ def _view_pattern(view, image, board, model, lines, relief, most=np.inf):
         return replace(view, rejected=tuple((name, "the outline of the board is not known") for name in board.edges))
     inner, corners, edges, rejected = undistort(np.nanmean(pixels, axis=0), model), corners_of_lines(lines), [], []
     for name, line, start, end in zip(board.edges, lines, corners, np.roll(corners, -1, axis=0), strict=True):
+        if name in picks:
+            edges.append(_pick(name, picks, inner, model))
+            continue
         inset, middle = CORNER_INSET * (end - start), (start + end) / 2
         uv = on_board(np.stack([start + inset, end - inset, middle, middle + WINDOW * line[:2]]), pose, model)
         scale = np.linalg.norm(uv[3] - uv[2]) / WINDOW
@@ -134,6 +140,11 @@ def _view_pattern(view, image, board, model, lines, relief, most=np.inf):
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
+
+
+def _pick(name, picks, inner, model):
+    start, end = undistort(picks[name], model)
+    return picked_edge(name, start, end, (start + end) / 2 - inner)
 
 
 def order_scores(image, board, model, orders, poses):
@@ -251,16 +262,27 @@ def line_residuals(edges, board, model, pose):
     return (white @ off[..., None])[..., 0], white @ gradient_by_pose(turned, by_point)
 
 
-def _views_plain(view, image, board, model):
-    """Views of a dark board without pattern, one for each pose that its outline allows."""
-    corners = undistort(find_polygon(image, len(board.known_corners())), model)
-    middle = corners.mean(axis=0)
-    sides = [
-        refine_edge(image, model, "", a + 0.04 * (b - a), b - 0.04 * (b - a), (a + b) / 2 - middle, SEARCH_PX)
-        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    ]
-    return [replace(view, T_camera_board=pose, covariance=covariance, edges=edges)
-            for pose, covariance, edges in board_poses(sides, board, model)]  # fmt: skip
+def _views_plain(view, image, board, model, picks):
+    """Views of a dark board without pattern, one for each pose that its outline (or picks of all its edges) allows."""
+    ends = {name: undistort(uv, model) for name, uv in picks.items()}
+    if set(picks) == set(board.edges):
+        inner = undistort(np.mean([picks[n] for n in board.edges], axis=(0, 1)), model)
+        # sides in the turning sense of the image
+        sides = [_pick(name, picks, inner, model) for name in board.edges][::-1]
+    else:
+        corners = undistort(find_polygon(image, len(board.known_corners())), model)
+        middle = corners.mean(axis=0)
+        sides = [
+            refine_edge(image, model, "", a + 0.04 * (b - a), b - 0.04 * (b - a), (a + b) / 2 - middle, SEARCH_PX)
+            for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        ]
+    found = []
+    for pose, covariance, edges in board_poses(sides, board, model):
+        if all(np.abs(line_distance(ends[e.name], e.line)).max() < SAME_NAMES_PX for e in edges if e.name in ends):
+            inner = np.mean([e.centre for e in edges], axis=0)
+            edges = tuple(_pick(e.name, picks, inner, model) if e.name in picks else e for e in edges)
+            found.append(replace(view, T_camera_board=pose, covariance=covariance, edges=edges))
+    return found
 
 
 def find_polygon(image, n_corners):

@@ -19,6 +19,7 @@ LEAST_SHARE = 0.2  # of the edge that must lie inside the image
 LEAST_PROFILES = 25
 SYSTEMATIC_PX = 0.1  # of a line at its centre, whatever the number of profiles: rims, paint and optics
 FULL_CONTRAST = 30.0  # grey levels: a step of this height counts half, cardboard and paint have weaker ones
+PICK_SIGMA_PX = 1.0  # of a point clicked by hand
 STEP = 0.02  # of the wide search, in squares
 NEAREST, FARTHEST = 1.1, 6.0  # squares outside the outermost inner corners
 BEHIND = -1e6  # pixels; where points behind the camera are drawn
@@ -45,6 +46,8 @@ class ImageEdge:
     n_points : int
         Profiles that the line was fitted to (2 for a pick).
     rms_px : float
+    picked : bool
+        True for an edge picked by hand.
     """
 
     name: str
@@ -54,6 +57,7 @@ class ImageEdge:
     ends: np.ndarray
     n_points: int
     rms_px: float
+    picked: bool = False
 
 
 class EdgeNotSeen(ValueError):
@@ -211,6 +215,16 @@ def outward_line(a, b, outward):
     """Pixel (or board) line through two points whose unit normal points to one side."""
     line = line_through(a, b)
     return line if line[:2] @ outward > 0 else -line
+
+
+def picked_edge(name, start, end, outward, sigma=PICK_SIGMA_PX):
+    """The edge through two points clicked by hand (undistorted pixels, `sigma` each)."""
+    ends = np.stack([np.asarray(start, float), np.asarray(end, float)])
+    length = np.linalg.norm(ends[1] - ends[0])
+    if length < 1:
+        raise ValueError(f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart")
+    covariance = np.diag([sigma**2 / 2, 2 * sigma**2 / length**2])
+    return ImageEdge(name, outward_line(*ends, outward), covariance, ends.mean(axis=0), ends, 2, 0.0, True)
 
 
 def board_line(view, edge, model):

@@ -76,10 +76,10 @@ def views_of(session, models=None, *, one_per_placement=False):
     """:func:`survey` of a session's images; `models` by camera replace its intrinsics, missing ones are estimated."""
     known = {name: info.model for name, info in session.cameras.items()} | dict(models or {})
     records = [r for r in session.images() if r.purpose in ("board", "intrinsics")]
-    return survey(records, session.read_image, session.board, known, one_per_placement=one_per_placement)
+    return survey(records, session.read_image, session.board, known, session.picks, one_per_placement=one_per_placement)
 
 
-def survey(records, read, board, models, *, one_per_placement=False):
+def survey(records, read, board, models, picks=(), *, one_per_placement=False):
     """See the board in all images: corners, intrinsics where they are missing, turns, outline, edges.
 
     Parameters
@@ -91,6 +91,7 @@ def survey(records, read, board, models, *, one_per_placement=False):
     board : Board
     models : dict of str to (CameraModel or None)
         By camera; None asks for an estimate from these images.
+    picks : sequence of EdgePick
     one_per_placement : bool
         Use one image of each camera and placement: of those that show the board the one whose pitch is nearest to the
         middle of the placement's images. Images of no placement are all used.
@@ -102,9 +103,10 @@ def survey(records, read, board, models, *, one_per_placement=False):
     Raises
     ------
     ValueError
-        If a camera has no intrinsics and the board no pattern, or too few images show it.
+        If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
+        the board does not have.
     """
-    read = lru_cache(maxsize=REMEMBERED_IMAGES)(read)
+    read, marks = lru_cache(maxsize=REMEMBERED_IMAGES)(read), _marks(picks, board)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
         lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
@@ -112,8 +114,8 @@ def survey(records, read, board, models, *, one_per_placement=False):
     finder = None if plain else PatternFinder(board.pattern)
 
     def look(r, view, models, **options):
-        """The board in one image."""
-        return view_board(read(r), board, models[r.camera], view, **options)
+        """The board in one image, with what was picked in it by hand."""
+        return view_board(read(r), board, models[r.camera], view, marks.get((r.camera, r.file)), **options)
 
     def begin(r):
         """The corners of the pattern in one image, in any order; all of a board that has none."""
@@ -149,7 +151,7 @@ def all_views(prepared):
     records = [r for r in session.images(purpose="board") if r.placement in prepared.views.get(r.camera, {})]
     if len(records) <= sum(map(len, prepared.views.values())) or board.pattern is None:
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
-    finder, orders = PatternFinder(board.pattern), pattern_orders(board.pattern)
+    marks, finder, orders = _marks(session.picks, board), PatternFinder(board.pattern), pattern_orders(board.pattern)
     options = {"lines": None if board.corners is None else board.lines(), "relief": prepared.relief}
     for r in records:
         view, seen = _view(r), prepared.views[r.camera][r.placement]
@@ -161,9 +163,20 @@ def all_views(prepared):
         if not view.reason:
             off = [np.nanstd(view.pixels[order] - seen.pixels, axis=0).sum() for order in orders]
             view = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]])
-            view = view_board(image, board, prepared.models[r.camera], view, **options)
+            picked = marks.get((r.camera, r.file))
+            view = view_board(image, board, prepared.models[r.camera], view, picked, **options)
         views[r.camera].append(view)
     return views
+
+
+def _marks(picks, board):
+    """Ends of edges picked by hand, by camera and file, then by edge."""
+    marks = {}
+    for pick in picks:
+        if pick.edge not in board.edges:
+            raise ValueError(f"{pick.file}: picked edge '{pick.edge}' is not one of the board's edges {board.edges}")
+        marks.setdefault((pick.camera, pick.file), {})[pick.edge] = np.asarray(pick.ends, float)
+    return marks
 
 
 def _view(record):
@@ -380,8 +393,8 @@ def measure_outline(views, board, models):
         lines.append(np.array([own[name] for own in seen if name in own]))
         if not len(lines[-1]):
             raise DegenerateGeometry(
-                f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: give the "
-                "corners of the board"
+                f"edge '{name}' of board '{board.name}' was found in none of {len(usable)} images: pick it by hand "
+                "in edges.csv or give the corners of the board"
             )
     rough = corners_of_lines([np.median(found, axis=0) for found in lines])
     ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)

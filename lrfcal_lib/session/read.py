@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -20,10 +21,12 @@ from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming,
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
+EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
 PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
-BY_LINE = ("ranges", "placement", "pitch", "time_s")
+PART = re.compile(r"part_\d+\.npz")  # a sweep, until the session is finished
+ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -43,30 +46,48 @@ class ImageRecord:
     purpose: str
 
 
+@dataclass(frozen=True)
+class EdgePick:
+    """An edge of the board picked by hand in an image; overrides the detector.
+
+    `ends`, shape (2, 2), are two pixels on the edge as recorded (distorted), far apart.
+    """
+
+    camera: str
+    file: Path
+    edge: str
+    ends: np.ndarray
+
+
 SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
 
 
-def read_scans(path, file):
+def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
-    if file is None:
-        file = next((name for name in SOURCES if os.path.lexists(path / name)), SOURCES[0])
-    target = inside(path, file, "session.json: file of the LRF")
-    if file not in SOURCES:
-        raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
-    if file == "lrf/scans.npz":
-        return read_npz(target, path), None
-    scans, log = read_telegrams(target, path)
-    with naming(target):
+    file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
+    if file.suffix == ".npz":
+        if not os.path.lexists(file) and parts_of(path):
+            remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
+            raise SessionError(f"{path}: the recording was interrupted; {remedy}")
+        return read_npz(file, path), None
+    scans, log = read_telegrams(file, path)
+    with naming(file):
         return check_scans(scans), log
 
 
+def parts_of(path):
+    """Files of a session's sweeps in their order, until it is finished."""
+    folder = stated.checked(path / "lrf" / "any", path).parent if os.path.lexists(path / "lrf") else path
+    return sorted(file for file in folder.iterdir() if PART.fullmatch(file.name))
+
+
 def read_npz(file, within):
-    """The arrays of a scans.npz, checked by :func:`check_scans`; no other is unpacked."""
+    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
     if not os.path.lexists(file):
         raise SessionError(f"{file}: no such file; a session needs the scan lines")
     scans, values = {}, 0
     with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream, ZipFile(stream) as archive:
-        for key in (key for key in (*BY_LINE, "bearings") if f"{key}.npy" in archive.namelist()):
+        for key in (key for key in ARRAYS if f"{key}.npy" in archive.namelist()):
             with archive.open(f"{key}.npy") as member:
                 old = np.lib.format.read_magic(member) == (1, 0)
                 header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
@@ -85,15 +106,16 @@ def read_npz(file, within):
 def check_scans(scans):
     """Scan lines with consistent shapes and credible units.
 
-    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,) and time_s (N,); gives
-    the same as floats (placement: integers), zero or infinite ranges NaN. KeyError or ValueError for a missing array,
-    wrong shapes or units, bearings that do not ascend, no range at all.
+    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and
+    intensities (N, B) where there are any; gives the same as floats (placement: integers), zero or infinite ranges NaN.
+    KeyError or ValueError for a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
     """
     ranges = np.asarray(scans["ranges"], float)
     if ranges.ndim != 2:
         raise ValueError(f"ranges must be scan lines x beams, got shape {ranges.shape}")
     lines, beams = ranges.shape
     shapes = {"bearings": (beams,), "placement": (lines,), "pitch": (lines,), "time_s": (lines,)}
+    shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
     for key, shape in shapes.items():
         if scans[key].shape != shape:
             raise ValueError(f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}")
@@ -166,6 +188,27 @@ def read_images(path, facts, unfinished=None):
     return tuple(out)
 
 
+def read_edges(path, facts, records):
+    """The picks of edges.csv, if there is one, for images and edges that the session knows."""
+    file, out = path / "edges.csv", []
+    known, edges = {(r.camera, r.file) for r in records}, facts["board"].edges
+    rows = stated.read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
+    for number, row in enumerate(rows, start=2):
+        with naming(f"{file} line {number}"):
+            target = inside(path, row["file"], "edges.csv: file")
+            if (row["camera"], target) not in known:
+                raise ValueError(f"images.csv has no '{row['file']}' of camera '{row['camera']}'")
+            if row["edge"] not in edges:
+                raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
+            ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
+            if not np.isfinite(ends).all():
+                raise ValueError(f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}")
+            if np.linalg.norm(ends[1] - ends[0]) < 5:
+                raise ValueError(f"the two pixels {ends.tolist()} are too close for a direction: pick them far apart")
+            out.append(EdgePick(row["camera"], target, row["edge"], ends))
+    return tuple(out)
+
+
 def image_size(file, data):
     """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither."""
     ends = {b"\x89PNG\r\n\x1a\n": b"IEND", b"\xff\xd8": b"\xff\xd9"}
@@ -194,6 +237,7 @@ def check_image_size(file, data, camera, size=None):
 ORDERED = {
     "lrf/index.csv": (INDEX_COLUMNS, ("placement",), ("offset",)),
     "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose"), ("file",)),
+    "edges.csv": (EDGE_COLUMNS, (), ("camera", "file", "edge")),
 }
 
 
@@ -209,6 +253,7 @@ class Sweep:
         Radians, ascending; 0 right, pi/2 ahead.
     pitch, time_s : ndarray, shape (L,)
         Radians, positive lifts the view; seconds, NaN where unknown.
+    intensities : ndarray, shape (L, B), or None
     """
 
     placement: int
@@ -216,6 +261,7 @@ class Sweep:
     bearings: np.ndarray
     pitch: np.ndarray
     time_s: np.ndarray
+    intensities: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -237,6 +283,7 @@ class Session:
     placements : tuple of int
         All that the session states, also those without data.
     image_records : tuple of ImageRecord
+    picks : tuple of EdgePick
     reference : dict
         Results other people published about this recording; free form, never used in an estimate.
     problems : tuple of str
@@ -257,6 +304,7 @@ class Session:
     cameras: dict[str, CameraInfo]
     placements: tuple[int, ...]
     image_records: tuple[ImageRecord, ...]
+    picks: tuple[EdgePick, ...]
     reference: dict
     problems: tuple[str, ...]
     scans: dict[str, np.ndarray] = field(repr=False)
@@ -265,7 +313,7 @@ class Session:
     def sweep(self, placement):
         """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
         rows = self.scans["placement"] == self._known(placement)
-        picked = {key: self.scans[key][rows] for key in ("ranges", "pitch", "time_s")}
+        picked = {k: v[rows] for k, v in self.scans.items() if k in ("ranges", "pitch", "time_s", "intensities")}
         if not np.isfinite(picked["ranges"]).any():
             raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
         return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
@@ -350,11 +398,12 @@ def open_session(path):
             raise ValueError(f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'")
         facts = stated.parse_session(data)
         unfinished = facts.pop("unfinished")
-        scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
+    scans, log = read_scans(path)
     records = read_images(path, facts, unfinished)
+    picks = read_edges(path, facts, records)
     problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)
     problems += () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
-    found = {"image_records": records, "problems": problems, "scans": scans, "telegrams": log}
+    found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
     return Session(path=path, **found, **facts)
 
 

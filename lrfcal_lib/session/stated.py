@@ -39,7 +39,8 @@ LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
 LOCK = "writer.lock"
 FILES = (  # of any session, besides its images
-    "session.json", "lrf/scans.npz", "lrf/telegrams.bin", "lrf/index.csv", "images.csv", "platform.csv", "truth.json",
+    "session.json", "lrf/scans.npz", "lrf/telegrams.bin", "lrf/index.csv", "images.csv", "edges.csv", "platform.csv",
+    "truth.json",
 )  # fmt: skip
 KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "b": "a device", "c": "a device"}
 

@@ -19,9 +19,9 @@ from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 
-    Telegrams and images are on the disk (fsync) before the table that names them is. A session holds the telegrams of a
-    device (:meth:`add_telegrams`) or scan lines (:meth:`add_sweep`), never both; scan lines are of other recordings,
-    and are written at the end of the with statement, all at once.
+    Every sweep and every image is on the disk (fsync) before the table that names it is; :func:`finish` then makes
+    the one scans.npz, or leaves the telegrams as they are. An interrupted session is completed by ``finish(path)``.
+    A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class SessionWriter:
     ):  # fmt: skip
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
-        self.sweeps, self.shots = [], dict.fromkeys(self.cameras, 0)
+        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
         platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
         if platform_sigma is not None:
@@ -86,10 +86,8 @@ class SessionWriter:
 
     def __exit__(self, kind, error, trace):
         with contextlib.closing(self):
-            if kind is None and self.sweeps:
-                arrays = {key: np.concatenate([one[key] for one in self.sweeps]) for key in read.BY_LINE}
-                arrays["bearings"] = self.sweeps[0]["bearings"]
-                write_file(self.path / read.SOURCES[0], arrays, self.path)
+            if kind is None:
+                complete(self.path)
 
     def close(self):
         """Write nothing any more: others may."""
@@ -115,8 +113,8 @@ class SessionWriter:
         if placement >= 0 and placement not in self.data["placements"]:
             self._state(placements=sorted([*self.data["placements"], int(placement)]))
 
-    def add_sweep(self, placement, ranges, bearings, pitch, time_s=None):
-        """Add the scan lines of a placement; SessionError for wrong shapes or units, or other bearings than before.
+    def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
+        """Append the scan lines of a placement; SessionError for wrong shapes or units, or other bearings than before.
 
         Parameters
         ----------
@@ -126,18 +124,20 @@ class SessionWriter:
             Radians, ascending; the same in all sweeps of a session.
         pitch : array_like, shape (L,)
             Radians.
-        time_s : array_like, shape (L,), optional
+        time_s, intensities : array_like, shapes (L,) and (L, B), optional
         """
         if self.telegrams.exists():
             raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
+        ranges, bearings = np.array(ranges, float, ndmin=2), np.asarray(bearings, float)
         time_s = np.full(len(ranges), np.nan) if time_s is None else time_s
-        scans = {"ranges": ranges, "bearings": bearings, "pitch": pitch, "time_s": time_s}
-        scans = {key: np.array(values, float) for key, values in scans.items()}
+        scans = {"ranges": ranges, "bearings": bearings, "pitch": pitch, "time_s": time_s, "intensities": intensities}
+        scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
         with naming(f"{self.path}: placement {placement}"):
             scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
-            if self.sweeps and not np.array_equal(self.sweeps[0]["bearings"], scans["bearings"]):
+            if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
-        self.sweeps.append(scans)
+        self.bearings, self.parts = bearings, self.parts + 1
+        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
@@ -169,7 +169,7 @@ class SessionWriter:
             pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
-            if self.sweeps:
+            if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
@@ -202,6 +202,34 @@ class SessionWriter:
         self._append_rows("images.csv", [[cell(time_s), camera, *where, purpose]])
 
 
+def finish(path):
+    """Complete a session: one scans.npz out of the sweeps. Also completes a session whose recording was interrupted.
+
+    A recording of telegrams is complete as it is; only what a crash cut off at the end of a table is removed.
+    SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
+    """
+    try:
+        with stated.alone(path):
+            complete(Path(path))
+    except FileNotFoundError as error:
+        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
+
+
+def complete(path):
+    """As :func:`finish`, for who writes the session already."""
+    mend_tables(path)
+    if os.path.lexists(path / "lrf" / "telegrams.bin"):
+        return
+    if not (parts := read.parts_of(path)):
+        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
+    sweeps = [read.read_npz(part, path) for part in parts]
+    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
+    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, np.savez_compressed)
+    for part in parts:
+        part.unlink()
+
+
 def mend_tables(path):
     """Remove rows that a crash cut off at the end of a session's tables."""
     for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
@@ -219,13 +247,13 @@ def cell(value):
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
-def write_file(file, content, within):
+def write_file(file, content, within, save=np.savez):
     """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
     draft = stated.checked(file, within).with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
     with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
         if isinstance(content, dict):
-            np.savez_compressed(stream, **content)
+            save(stream, **content)
         else:
             stream.write(content.encode() if isinstance(content, str) else content)
         stream.flush()
@@ -334,6 +362,7 @@ class SessionRecorder(SessionWriter):
             self.drop_placement(placement)
         del self.data["unfinished"]
         self._state()
+        complete(self.path)
         self.close()
 
     def __exit__(self, kind, error, trace):
