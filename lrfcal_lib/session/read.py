@@ -66,7 +66,7 @@ def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
     if file.suffix == ".npz":
-        if not os.path.lexists(file) and parts_of(path):
+        if not os.path.lexists(file) and os.path.lexists(path / "lrf") and parts_of(path):
             remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
             raise SessionError(f"{path}: the recording was interrupted; {remedy}")
         return read_npz(file, path), None
@@ -77,8 +77,8 @@ def read_scans(path):
 
 def parts_of(path):
     """Files of a session's sweeps in their order, until it is finished."""
-    folder = stated.checked(path / "lrf" / "any", path).parent if os.path.lexists(path / "lrf") else path
-    return sorted(file for file in folder.iterdir() if PART.fullmatch(file.name))
+    files = stated.checked(path / "lrf" / "any", path).parent.iterdir()
+    return sorted(file for file in files if PART.fullmatch(file.name))
 
 
 def read_npz(file, within):
