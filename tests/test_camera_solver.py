@@ -9,7 +9,6 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations, numeric
 
-from lrfcal_lib.evaluate.tables import rms
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m, sight_normals
 from lrfcal_lib.model import observations
@@ -101,19 +100,14 @@ def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_error_falls_with_more_placements_and_agrees_with_the_covariance(name):
-    errors, scores = {}, []
-    for count in (6, 30):
-        rig, obs = camera_case(5, count)
-        rng = np.random.default_rng(6)
-        poses, errors[count] = [RigidTransform.from_matrix(m) for m in obs.board_poses], []
-        for _ in range(10):
-            found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
-            e = increment(found.transform, rig.T_camera_lrf)
-            errors[count].append(np.linalg.norm(e[3:]))
-            known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
-            scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
-    assert rms(errors[30]) < 0.75 * rms(errors[6])
+def test_errors_agree_with_the_covariance(name):
+    rig, obs = camera_case(5, 12)
+    rng, scores, poses = np.random.default_rng(6), [], [RigidTransform.from_matrix(m) for m in obs.board_poses]
+    for _ in range(10):
+        found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
+        e = increment(found.transform, rig.T_camera_lrf)
+        known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
+        scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
     assert 0.6 < np.mean(scores) < 1.6
 
 
