@@ -54,7 +54,6 @@ lab: setup
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py
-	@PYTHONPATH=tests $(RUN) tests/bench_joint.py
 
 fuzz: setup
 	@PYTHONPATH=tests $(RUN) tests/fuzz.py
