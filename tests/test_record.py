@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, picture, rig_data, telegram
-from shared import QUICK
+from shared import QUICK, campaign
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.acquire import record
@@ -275,10 +275,11 @@ def record_and_die(data, path, told, writes):
         os.write(told, bytes([placement.number]))
 
 
-def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(path):
+@pytest.mark.parametrize("kills", [6, pytest.param(20, marks=campaign)])
+def test_kills_of_two_writers_lose_nothing_that_was_finished(path, kills):
     data = listed(*np.linspace(-50, 40, 120).round(1).tolist(), cameras=("left", "right"))
     rng, rig, known, lost = np.random.default_rng(5), make_rig(data), set(), 0
-    for _ in range(20):
+    for _ in range(kills):
         read_end, write_end = os.pipe()
         children = [in_child(record_and_die, data, path, write_end, int(n)) for n in rng.integers(60, size=2)]
         os.close(write_end)
@@ -294,7 +295,7 @@ def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(path):
             known = finished
             for number in finished:
                 assert contents(path, number, session) == expected(rig, number)
-    assert 5 < len(known) < len(rig.stated.plan.to_do()) and lost > 3
+    assert kills // 4 < len(known) < len(rig.stated.plan.to_do()) and lost > kills // 6
     recording = write(rig, path, resume=True, count=max(known) + 1)
     recording.finish()
     assert validate(path) == [] and len(recording.finished) == max(known) + 1
