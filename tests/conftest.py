@@ -98,7 +98,7 @@ LONGEST = (
     "test_alternatives", "test_joint", "test_record_emulated", "test_same_numbers", "test_camera_solver",
     "test_emulated_rig", "test_hostile_text", "test_joint_calibration", "test_record_bad_input",
 )  # fmt: skip
-ALONE = ("test_stored_outputs_and_golden_tables", "test_tables_of_the_recording", "test_buttons_record")  # a notebook each
+ALONE = "test_stored_outputs_and_golden_tables", "test_tables_of_the_recording", "test_buttons_record"
 NOTEBOOKS = ("08", "07", "09", "[1", "05", "06", "04", "03", "02", "01", "00")  # who works out stages waits for nobody
 
 

@@ -160,13 +160,6 @@ def test_advice_is_asked_from_the_third_placement_on(connect):
 # ----------------------------------------------------------------------------------------------- the live view
 
 
-def test_a_look_shows_scan_images_and_where_the_head_is(connected):
-    assert connected.move_to(0.05) == pytest.approx(0.05)
-    view = connected.look()
-    assert view.ranges.shape == view.bearings.shape and list(view.frames) == ["left"] and view.trouble == ""
-    assert view.pitch == pytest.approx(0.05) and view.measured
-
-
 def test_a_lost_line_is_looked_for(connected):
     connected.rig.lrf.lost = 1
     connected.look()
@@ -359,33 +352,6 @@ def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypa
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
     assert panel.notes not in logging.getLogger("lrfcal_lib").handlers
-
-
-def test_stop_ends_what_a_button_began(panel):
-    panel.connect()
-    begun, lrf = threading.Event(), panel.collector.rig.lrf
-
-    def wait():
-        if threading.current_thread().name != "panel view":
-            begun.set()
-            panel.collector.stopped.wait(WAIT_S)
-
-    lrf.wait = wait
-    panel.parts.capture.click()
-    assert begun.wait(WAIT_S)
-    panel.parts.stop.click()
-    panel.job.result(WAIT_S)
-    assert "does not count" in panel.parts.error.value and panel.collector.finished == ()
-
-
-def test_shown_with_words_for_those_who_do_not_run_it(panel, monkeypatch):
-    import IPython.display
-
-    shown = []
-    monkeypatch.setattr(IPython.display, "display", lambda data, raw: shown.append(data))
-    panel.show()
-    assert shown[0]["text/plain"].startswith("The data collection panel")
-    assert shown[0]["application/vnd.jupyter.widget-view+json"]["model_id"] == panel.parts.root.model_id
 
 
 def test_the_emulated_rigs_are_those_that_there_are():
