@@ -1,7 +1,6 @@
 """Stages are worked out once, and again as soon as anything that they depend on is different."""
 
 import os
-import pickle
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from shared import QUICK
 
-from lrfcal_lib.preprocess.prepared import prepare_scans
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 
@@ -138,9 +136,3 @@ def test_what_was_made_of_a_session_can_be_the_first_argument(folder, session):
     for shift in (0.0, 0.0, 0.001):
         stage.run(SimpleNamespace(prepared=SimpleNamespace(session=session), shift=shift))
     assert stage.calls == 2
-
-
-def test_a_kept_stage_is_the_stage_itself(folder, session):
-    fresh, (_, kept) = prepare_scans.__wrapped__(session), (prepare_scans(session), prepare_scans(session))
-    assert kept is not fresh and pickle.dumps(kept) == pickle.dumps(pickle.loads(pickle.dumps(fresh)))
-    assert prepare_scans.__doc__.startswith("The board in every sweep") and list(kept.scans) == list(fresh.scans)
