@@ -157,10 +157,10 @@ def all_views(prepared):
     options = {"lines": None if board.corners is None else board.lines(), "relief": prepared.relief}
 
     def look(r):
-        """The board in one image."""
+        """The board in one image; None where the prepared view says it: the same image, or none shows the board."""
         view, seen = _view(r), prepared.views[r.camera][r.placement]
-        if seen.file == view.file or seen.pixels is None:  # the same, or none of the placement's images shows it
-            return replace(seen, file=view.file, pitch=view.pitch)
+        if seen.file == view.file or seen.pixels is None:
+            return None
         image = session.read_image(r)
         view = _corners(view, image, finder)
         if view.reason:
@@ -169,8 +169,9 @@ def all_views(prepared):
         view, picked = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]]), marks.get((r.camera, r.file))
         return view_board(image, board, prepared.models[r.camera], view, picked, **options)
 
-    for view in spread(look, records):
-        views[view.camera].append(view)
+    for r, view in zip(records, spread(look, records), strict=True):
+        same = replace(prepared.views[r.camera][r.placement], file=_view(r).file, pitch=r.pitch)
+        views[r.camera].append(same if view is None else view)
     return views
 
 
