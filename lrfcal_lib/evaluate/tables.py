@@ -566,7 +566,7 @@ def joint_fit(joint, cameras=None):
 def edge_misses_px(joint, camera):
     """Distances of crossings of scan lines from one camera's edges without the edge bias, undistorted pixels, (n,)."""
     solution, edges, placements = joint.solution, list(joint.observations.edges), list(joint.solution.boards)
-    obs, pose = joint.seen_by(camera, crossings=ALL).along().select(placements), solution.transforms[camera]
+    obs, pose = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements), solution.transforms[camera]
     if len(obs.crossing_points) == 0:
         return np.zeros(0)
     rows = [placements.index(p) for p in obs.crossing_placement], [edges.index(e) for e in obs.crossing_edge]
