@@ -154,6 +154,8 @@ def test_telegrams_come_out_of_any_bytes():
     (encode_telegram(0xB2, b"\x15", status=0x15), False, False),
     (b"\x15" + encode_telegram(0xB2, status=0x10)[:4], False, False),
 ])  # fmt: skip
+
+
 def test_acknowledgements_count_only_where_they_can_be_ones(data, acknowledged, declined):
     far, link = linked()
     link.send(0x20, b"\x25")
@@ -209,13 +211,6 @@ def test_the_device_is_found_at_any_rate_whatever_it_was_doing(past, rate):
         assert (lms.baudrate, device.streaming, device.memory.mode) == (rate, False, 0x25)
 
 
-def test_opening_switches_to_the_rate_wanted_and_no_flash_is_written():
-    device = emulated(baudrate=9600)
-    with opened(device, baudrate=500000) as lms:
-        assert lms.baudrate == device.baudrate == 500000
-    assert device.memory.flash_writes == 0
-
-
 @pytest.mark.parametrize("address", [0, 3])
 def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(address):
     with opened(emulated(address=3), address=address) as lms:
@@ -227,6 +222,8 @@ def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(address):
     ({"address": 128}, "an address is 0 to 127, got 128"),
     ({"password": b"SICK"}, "a password has 8 bytes, got 4"),
 ])  # fmt: skip
+
+
 def test_bad_arguments_are_refused_before_the_port_is_touched(options, message):
     with pytest.raises(ValueError, match=message):
         LMS2xx("/dev/nowhere", **options)
@@ -291,6 +288,8 @@ def test_a_configuration_that_is_not_taken_is_said(monkeypatch):
 @pytest.mark.parametrize(("command", "call"), [
     (0x77, lambda lms: lms.configure(unit="cm")), (0x3B, lambda lms: lms.set_variant(100, 0.5)),
 ])  # fmt: skip
+
+
 def test_a_lost_reply_does_not_make_a_second_write(command, call):
     device = emulated()
     with opened(device) as lms:
@@ -363,29 +362,6 @@ def test_late_arrivals_do_not_shift_scans():
     assert list(steps[1:]) == np.diff(turns).tolist()
 
 
-@pytest.mark.parametrize("first_late", [0.01, 0.3, 0.7])
-def test_instants_rise_even_if_the_first_scan_came_late(first_late):
-    clock, times = ScanClock(), 5.0 + np.arange(200) * 2 * TURN_S
-    late = np.random.default_rng(2).exponential(0.005, 200)
-    late[0] = first_late
-    instants = [clock.place(2 * k % 256, t)[0] for k, t in enumerate(times + late)]
-    told = np.array([i for i in instants if i is not None])
-    assert np.all(np.diff(told) > 0) and len(told) > 150
-    np.testing.assert_allclose(instants[-50:], times[-50:], atol=0.002)
-
-
-@pytest.mark.parametrize("times", [2, 4, 8])
-def test_no_scan_of_a_device_that_runs_faster_than_the_clock_is_refused(times):
-    """Emulated ones do; every turn is a scan, and some come later than others."""
-    clock, turns = ScanClock(), np.arange(3000)
-    late = np.random.default_rng(times).exponential(0.002, len(turns))
-    arrivals = np.maximum.accumulate(5.0 + turns * TURN_S / times + late)
-    placed = [clock.place(turn % 256, arrival) for turn, arrival in zip(turns.tolist(), arrivals, strict=True)]
-    assert [step for _, step in placed[1:]] == [1] * (len(turns) - 1)
-    instants = np.array([instant for instant, _ in placed], float)
-    assert np.all(np.diff(instants) > 0) and np.abs(instants - arrivals).max() < 0.05
-
-
 def test_old_and_repeated_scans_are_refused():
     clock = ScanClock()
     assert clock.place(250, 10.0) == (10.0, 0)
@@ -403,18 +379,10 @@ def assembler(variant=(180, 0.5), *, configuration=INDEXED, rate=38400, interlac
     return Assembler(variant, configuration, rate, interlaced, {"dropped": 0, "stale": 0}, clock)
 
 
-def test_an_old_scan_that_comes_first_after_a_change_has_its_own_instant():
-    clock = ScanClock()
-    streamed, requested = (assembler(clock=clock) for _ in range(2))
-    raws = [encode_scan(np.full(361, 2.0), indices=(turn, 0)) for turn in (54, 70)]
-    first = streamed.feed(raws[0], 50.0)
-    old = requested.feed(raws[1], 50.0 + 16 * TURN_S + 0.7)
-    assert old.time_s - first.time_s == pytest.approx(16 * TURN_S) and requested.counts["dropped"] == 0
-    assert requested.feed(raws[0], 51.5) is None and requested.counts["stale"] == 1
-
-
 @pytest.mark.parametrize(("variant", "first_deg"), [((180, 1.0), 0), ((180, 0.5), 0), ((100, 0.5), 40),
                                                     ((100, 0.25), 40)])  # fmt: skip
+
+
 def test_beams_have_their_own_instants(variant, first_deg):
     count, turns = round(variant[0] / variant[1]) + 1, round(1 / variant[1])
     raw = encode_scan(np.full(count, 2.0), indices=(0, 0))
@@ -454,6 +422,8 @@ def test_four_partial_scans_make_one(indexed):
 @pytest.mark.parametrize(("missing", "made"), [
     ([4], [3, 11]), ([5], [3, 11]), ([6], [3, 11]), ([7], [3, 11]), ([2, 3, 4, 5, 8, 9, 10, 11], []),
 ])  # fmt: skip
+
+
 def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
     """The last: 0 and 1 of one set and 2 and 3 of the next."""
     assert list(interlaced([0, 1, 2, 3] * 3, indexed, missing)) == made
@@ -468,14 +438,6 @@ def test_telegrams_of_another_kind_are_no_scan():
         encode_telegram(0xB0, b"\x05\x40\1\1", status=16), encode_telegram(0xBA, b"LMS200", status=16),
     ):  # fmt: skip
         assert one.feed(raw, 5.1) is None
-
-
-def test_special_values_are_nan_with_a_reason():
-    ranges = np.full(181, 2.0)
-    ranges[3], ranges[5] = np.inf, np.nan
-    reading = assembler((180, 1.0)).feed(encode_scan(ranges, indices=(1, 1)), 5.0)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(reading.ranges)), [3, 5])
-    assert reading.reasons[[2, 3, 5]].tolist() == [0, 6, 1]
 
 
 # ------------------------------------------------------------------------------------------------ scans of a device
@@ -566,19 +528,12 @@ def test_a_request_declined_thrice_is_refused_and_once_is_not(fault):
         assert device.faults.counts[fault] == 5
 
 
-def test_replies_of_other_commands_and_the_power_on_string_are_skipped():
-    device = emulated()
-    with opened(device) as lms:
-        string, real = encode_telegram(0x90, b"LMS221;302063;X01.27 ", status=0x10), device.prepare
-        device.prepare = lambda raw: string + real(raw)
-        device.faults.inject("foreign", 3)
-        assert not lms.configure(unit="mm") and len(lms.request().ranges) == 361
-
-
 @pytest.mark.parametrize(("call", "limit_s"), [
     (lambda lms: lms.request(), 4.5), (lambda lms: lms.request(timeout=0.1), 0.2),
     (lambda lms: lms.set_variant(100, 1), 5.2), (lambda lms: lms.configure(unit="cm"), 2.6),
 ])  # fmt: skip
+
+
 def test_a_silent_device_is_given_up_in_time(call, limit_s):
     device = emulated()
     with opened(device) as lms:

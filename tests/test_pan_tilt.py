@@ -146,13 +146,6 @@ def test_inverted_head_with_another_zero(opened, settings):
     assert device.pitch() == near(-15)
 
 
-@pytest.mark.parametrize("degrees", [-50, 0, 50])
-def test_pitch_of_a_head_whose_zero_is_far_off(degrees):
-    settings = HeadSettings(position_zero_deg=170)
-    value = pelco_d.encode_tilt(settings.elevation(degrees * DEGREE))
-    assert settings.pitch(pelco_d.decode_tilt(value)) == near(degrees, 0.01)
-
-
 def test_limits_are_named_and_nothing_moves(opened):
     device, head = opened()
     before = len(device.frames)
@@ -225,13 +218,6 @@ def test_late_reply_is_not_taken_for_the_next(opened):
     assert head.pitch()[0] == near(2, 0.01)
 
 
-def test_speed_nought_is_not_stop(opened):
-    device, head = opened(replace(FAST, tilt_speed=0, degrees_per_second=2.0), feedback="none")
-    head.move_to(0.5 * DEGREE)
-    assert [frame.data2 for frame in sent(device, pelco_d.UP)] == [0]
-    assert halted(device) and 0.5 < device.pitch() / DEGREE < 1.5  # at 4 deg/s, twice what was stated
-
-
 # ------------------------------------------------------------------------------------------------- timed moves
 
 
@@ -285,31 +271,6 @@ def test_sweep_logs_the_pitch(opened, habits):
     assert worst < (0.5 if told else 1.5) * DEGREE
 
 
-def test_sweep_of_a_silent_head_with_a_wrong_speed_is_drawn_to_where_it_ends(opened):
-    device, head = opened(replace(SLOW, degrees_per_second=9.0), feedback="partial")
-    head.start_sweep(15 * DEGREE)
-    track = head.finish_sweep()
-    assert device.pitch() == near(20, 1.5)
-    assert [pitch for _, pitch, measured in track if not measured][-1] == near(device.pitch() / DEGREE, 2)
-
-
-def test_sweep_downwards_at_another_speed_learns_it(opened):
-    _, head = opened()
-    head.move_to(20 * DEGREE)
-    head.start_sweep(-20 * DEGREE, speed=0x1F)
-    assert head.finish_sweep()[-1][1] == near(-20, 3)
-    assert math.degrees(head.motion.speed(-1, 0x1F)) == pytest.approx(35, rel=0.05)
-
-
-def test_sweep_at_the_slowest_line(opened):
-    device, head = opened(HeadSettings(settle_s=0.1), baudrate=2400, speeds=(2.0, 60.0), settle=0.1)
-    head.start_sweep(30 * DEGREE)
-    times, pitches, measured = zip(*head.finish_sweep(), strict=True)
-    wrong = np.abs(device.head.motor(np.array(times) - 1.2e9) - pitches)
-    assert sum(measured) >= 5 and pitches[-1] == near(30, 1.0)
-    assert wrong.max() < 1.0 * DEGREE  # 30 deg/s and half of the query's 60 ms
-
-
 def test_sweep_is_ended_by_a_stop(opened):
     device, head = opened(SLOW)
     assert head.track == []
@@ -327,6 +288,8 @@ def test_sweep_is_ended_by_a_stop(opened):
 @pytest.mark.parametrize(("settings", "habits", "stop", "above"), [
     (TIMED, NONE, PanTilt.stop, 5), (SURE, {}, PanTilt.emergency_stop, None),
 ])  # fmt: skip
+
+
 def test_stop_from_another_thread_ends_a_move(opened, settings, habits, stop, above):
     device, head = opened(settings, **habits)
     later(device, lambda: stop(head), degrees=above)
@@ -451,16 +414,6 @@ def test_lost_line_makes_dead_reckoning_unknown(opened):
     assert head.move_to(10 * DEGREE) == near(10, 1.5)
 
 
-@pytest.mark.parametrize("habits", [{}, NONE], ids=["full", "nothing"])
-def test_line_lost_in_a_sweep(opened, habits):
-    device, head = opened(replace(SLOW, repeat_s=0.1), **habits)
-    head.start_sweep(50 * DEGREE)
-    later(device, lambda: go_away(device), degrees=3)
-    with pytest.raises(LineLost):
-        head.finish_sweep()
-    assert halted(device)
-
-
 def test_head_that_falls_silent_in_a_move(opened):
     device, head = opened()
     later(device, lambda: device.faults.inject("mute", seconds=1e6), degrees=4)
@@ -474,6 +427,8 @@ def test_head_that_falls_silent_in_a_move(opened):
     ({}, {"echo": True}, NoReply, "does not echo"),
     (None, {}, WrongDevice, "no Pelco-D at 38400 Bd"),
 ])  # fmt: skip
+
+
 def test_what_was_stated_and_does_not_come(habits, changes, error, message):
     device = emulated(**habits or {})
     if habits is None:
@@ -484,16 +439,12 @@ def test_what_was_stated_and_does_not_come(habits, changes, error, message):
         PanTilt("nowhere", FAST, host=device.host)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_an_echo_that_was_not_expected(opened, caplog, stated):
-    opened(replace(FAST, echo=stated), echo=True)
-    assert ("not expected" in caplog.text) != stated
-
-
 @pytest.mark.parametrize(("name", "value"), [
     ("address", 256), ("tilt_speed", 64), ("pitch_limits_deg", (10, -10)), ("feedback", "maybe"), ("baudrate", 0),
     ("degrees_per_second", (4.0, 0.0)), ("repeat_s", 0.0), ("settle_s", -1.0), ("echo", "loud"),
 ])  # fmt: skip
+
+
 def test_settings_that_no_head_has(name, value):
     with pytest.raises(ValueError, match=rf"HeadSettings\n{name}.*\n  .* (is needed|should be .*|comes first)"):
         HeadSettings(**{name: value})

@@ -88,24 +88,6 @@ def test_compiled_loops_do_what_plain_numpy_does(model):
     assert (source[seen] == 0).all() and (source[~seen] == -1).all() and 500 < seen.sum() < 15_000
 
 
-def test_a_slanted_floor_does_not_hide_itself():
-    x, z = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(0.8, 6, 400))
-    floor = np.column_stack([x.ravel(), np.full(x.size, 0.3), z.ravel()])
-    painter = rec.Painter([view(plain_image())], 0.04, 0.01)
-    painter.hide(floor)
-    inside = project(floor, MODEL)[:, 1] < 47
-    assert painter.paint(floor, np.tile([0.0, -1, 0], (len(floor), 1)))[1][inside].mean() > 0.99
-
-
-def test_nothing_is_coloured_beyond_the_fold_of_a_lens():
-    angle = np.radians(np.arange(0, 89, 0.5))
-    fan = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
-    ghosts = (project(fan, WIDE)[:, 0] < 64) & (np.tan(angle) ** 2 > rec.fold(WIDE))
-    _, seen, _ = paint(fan, view(plain_image(), WIDE), step=0.001)
-    assert ghosts.sum() > 10 and not seen[ghosts].any() and seen[angle < np.radians(40)].all()
-    assert rec.fold(MODEL) == np.inf
-
-
 def test_exposures_are_compared_and_taken_off():
     rng, points = np.random.default_rng(0), grid(1.0, 0.25, 60)
     base = np.repeat(rng.uniform(60, 90, (6, 8)).repeat(8, 0).repeat(8, 1)[..., None], 3, -1)

@@ -19,7 +19,7 @@ from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, unchanged
 from lrfcal_lib.drivers.rig_file import HeadSettings, Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import find_source
-from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
+from lrfcal_lib.session.lms2xx_codec import Configuration
 
 # ------------------------------------------------------------------------------------------------------ rig file
 
@@ -144,6 +144,8 @@ NO_FILES = (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero"))
     *((lambda path, text=text: path.write_bytes(text), "not JSON") for text in NO_JSON),
     *((make, "no file, or one of more than") for make in NO_FILES),
 ])  # fmt: skip
+
+
 def test_no_rig_file(tmp_path, made, message):
     path = tmp_path / "rig.json"
     made(path)
@@ -263,17 +265,6 @@ def test_interlaced_scans_are_streamed():
     assert not rig.lrf.streaming
 
 
-def test_nothing_is_held_back():
-    rig = make_rig()
-    events = begun(rig)
-    for _ in range(3):
-        at = rig.head.at
-        assert isinstance(next(events), Moved) and rig.head.at != at
-        made = len(rig.lrf.readings)
-        assert isinstance(next(events), Scanned) and len(rig.lrf.readings) == made + 1
-    events.close()
-
-
 def scans(moving, noise, step=0.0):
     """Ranges of 40 scans of a wall, 361 beams, while a head moves by 20 deg or not; a person walks by."""
     rng, pitch = np.random.default_rng(5), np.linspace(-10, 10, 40) * moving
@@ -355,12 +346,6 @@ def test_scans_of_a_sweep_have_the_pitch_of_their_instant(heads):
     assert np.ptp(pitch) > math.radians(38)
 
 
-def test_scans_of_a_sweep_are_handed_out_while_it_goes_on():
-    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-10, 50, 1]))
-    shares = [e.share for e in events_of(rig, kind=Scanned)]
-    assert len(shares) > 2 and shares == sorted(shares) and shares[0] < 0.7 and shares[-1] == 1.0
-
-
 def test_a_sweep_without_scans_is_given_up(monkeypatch):
     monkeypatch.setattr(rig_module, "GAP_S", 0.05)
     monkeypatch.setattr(rig_module, "BATCH_S", 0.02)
@@ -401,19 +386,14 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
     return made
 
 
-def test_all_devices_are_closed_again(monkeypatch):
-    made = fake_drivers(monkeypatch)
-    with Rig.open(rig_of(rig_data())) as rig:
-        assert sorted(made) == ["Camera", "LMS2xx", "PanTilt"] and list(rig.cameras) == ["left"]
-    assert made == []
-
-
 @pytest.mark.parametrize(("options", "error", "message"), [
     ({"LMS2xx": PortError("there is no port")}, PortError, "lrf: there is no port"),
     ({"Camera": PortError("there is no port")}, PortError, "camera 'left': there"),
     ({"LMS2xx": ValueError("an LMS2xx has 9600 Bd, got 300")}, RigFileError, r"rig\.json: lrf: an LMS2xx has 9600 Bd"),
     ({"size": (16, 12)}, RigFileError, r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"),
 ])  # fmt: skip
+
+
 def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
     made = fake_drivers(monkeypatch, **options)
     with pytest.raises(error, match=message):
@@ -432,11 +412,6 @@ def test_what_the_device_says_about_itself_counts():
         assert rig.lrf_info.max_range == pytest.approx(longest)
     rig = make_rig(changed("devices.lrf.interlaced", True))
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
-
-
-def test_a_recording_begins_with_the_configuration():
-    (raw,) = make_rig().begin_telegrams()
-    assert raw[4] == CONFIGURATION and parse_configuration(raw).measuring_mode == 0
 
 
 class Control(BaseHTTPRequestHandler):
