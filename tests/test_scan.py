@@ -12,7 +12,7 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter
-from lrfcal_lib.preprocess.edges_in_scan import ScanSide, crossings, edge_points, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import crossings, edge_points, sweep_edges
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
@@ -327,14 +327,6 @@ def test_sides_are_turned_as_little_as_their_sigma_says():
     assert len(turned) > 30 and max(turned) < 1.5  # a spot of no size before an even wall does better than a real one
 
 
-def test_the_sigma_of_a_direction_is_that_of_neighbours_which_share_their_errors():
-    rng, t = np.random.default_rng(0), np.linspace(0, 0.4, 40)
-    noise = np.repeat(0.01 * rng.standard_normal((3000, 20)), 2, axis=1)
-    side = ScanSide(0, 1, 40, 0.4, 0.01, 1.0, np.zeros((2, 3)))
-    assert side.angle_sigma == pytest.approx(np.std(np.polyfit(t, noise.T, 1)[0]), rel=0.15)
-    assert replace(side, rms=0.0).angle_sigma > 0
-
-
 def test_a_triangle_has_three_sides_and_a_paper_like_scan_shows_two():
     s = scene(triangle_board(0.6, 0.7), facing(1.5, 20.0, 15.0, (0.2, 0.23)), sigma=0.004)
     e = edge_points(found(s))
@@ -356,16 +348,6 @@ def test_holes_do_not_make_edges(fill):
     assert s.worst(holed) < 0.008 and np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
 
 
-def test_speckle_at_a_side_is_outvoted():
-    s = scene(sigma=0.003)
-    rng, ranges, rows = np.random.default_rng(4), s.sweep.ranges.copy(), np.flatnonzero(s.on.any(axis=1))
-    last = ranges.shape[1] - 1 - s.on[:, ::-1].argmax(axis=1)
-    for row in rng.choice(rows, 30, replace=False):
-        ranges[row, last[row] - rng.integers(3, 25) : last[row] + 1] = np.nan
-    e = edge_points(found(spoiled(s, ranges)))
-    assert s.worst(e) < 0.012 and np.sum(e.side >= 0) > np.sum(edge_points(found(s)).side >= 0) - 40
-
-
 def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     post = scene(sigma=0.003)
     hidden = np.abs(np.degrees(post.sweep.bearings) - 102) < 5
@@ -376,27 +358,6 @@ def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     ):
         e = function(found(s))
         assert {x.end for x in e.sides} == {end} and s.worst(e) < 0.012
-
-
-def test_scans_at_one_pitch_give_their_ends():
-    s = scene(pitch=0.0)
-    three = {"ranges": np.repeat(s.sweep.ranges, 3, axis=0), "pitch": np.zeros(3), "time_s": np.zeros(3)}
-    e = edge_points(found(replace(s, sweep=replace(s.sweep, **three))))
-    assert e.side.tolist() == [0, 0, 0, 1, 1, 1] and e.end.tolist() == [-1] * 3 + [1] * 3
-    assert np.abs(s.edge_errors(e)[0]).max() < 0.004
-    np.testing.assert_allclose(edge_points(found(s)).points, e.points[[0, 3]])
-
-
-def test_a_warped_board_moves_the_ends_where_the_board_is():
-    s = scene(wall=None, sigma=0.002)
-    count, beam = np.maximum(s.on.sum(axis=1, keepdims=True), 1), np.arange(s.on.shape[1])
-    centre = (s.on * beam).sum(axis=1, keepdims=True) / count
-    bend = 0.012 * ((beam - centre) / (count / 2)) ** 2
-    e = edge_points(found(spoiled(s, s.sweep.ranges + np.where(s.on, bend, 0.0))))
-    r = np.linalg.norm(e.points, axis=1, keepdims=True)
-    p, flat = (e.points, e.points * (1 - 0.012 / r))  # where a flat board would be
-    off, least = (np.median(np.abs(s.pose.inv().apply(lrf_to_platform(q, e.pitch, HEAD))[:, 2])) for q in (p, flat))
-    assert least < 0.4 * off
 
 
 # ---------------------------------------------------------------------------------------------- invariances
