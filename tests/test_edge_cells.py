@@ -14,11 +14,11 @@ from lrfcal_lib.session.stated import LrfInfo
 LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)
 
 
-def cells_of(made, reach=2, lrf=LRF, change=None):
+def cells_of(made, change=None):
     sweep = made.sweep if change is None else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
     board = board_in_scan.find_board(sweep, made.board, HEAD)
     along, swept = edges_in_scan.edge_points(board), edges_in_scan.sweep_edges(board)
-    return board, edge_cells(board, along, swept, lrf, reach)
+    return board, edge_cells(board, along, swept, LRF)
 
 
 def outside(made, cells):
@@ -82,10 +82,8 @@ def test_background_follows_from_its_distance(made, found):
     assert (cells.background < wall + 0.05).all() and (cells.background > wall - 0.6).all()
 
 
-def test_reach_and_spot_are_taken_as_given(made):
-    assert len(cells_of(made, reach=1)[1]) < 0.7 * len(cells_of(made, reach=2)[1])
-    np.testing.assert_allclose(cells_of(made, lrf=None)[1].radius, 0.005)
-    _, cells = cells_of(made)
+def test_the_spot_is_taken_as_given(found):
+    cells = found[1]
     np.testing.assert_allclose(cells.radius, (0.01 + 0.004 * cells.range_m) / 2)
 
 
@@ -108,11 +106,6 @@ def test_clouds_cut_to_the_board_have_no_background(made):
     _, cells = cells_of(made, change=lambda r: np.where(made.on, r, np.nan))
     assert len(cells) > 500 and not cells.background.any()
     np.testing.assert_array_equal(cells.hit, made.on[cells.line, cells.beam])
-
-
-def test_a_reach_below_one_is_refused(made):
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        cells_of(made, reach=0)
 
 
 def test_odds_of_backgrounds():

@@ -330,9 +330,9 @@ def _beams(prepared, placements):
     for row, placement in enumerate(placements):
         cells = cells_of(prepared, placement)
         for side, name in prepared.names.get(placement, {}).items():
-            some = cells.select(thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE))
+            some = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
             n, edge = len(some), prepared.board.edges.index(name)
-            own = {key: getattr(some, key) for key in ("bearing", "pitch", "hit", "radius", "background")}
+            own = {key: some[key] for key in ("bearing", "pitch", "hit", "radius", "background")}
             yield own | {
                 "step": some.step * some.range_m, "edge": np.full(n, edge), "placement": np.full(n, row)
             }  # fmt: skip

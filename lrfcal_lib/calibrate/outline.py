@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -179,7 +179,7 @@ def platform_of(prepared, T_head_lrf=None):
 
 
 def cells_of(prepared, placement):
-    """Beams about the edges in the sweep of a placement, an EdgeCells."""
+    """Beams about the edges in the sweep of a placement, see :func:`edge_cells`."""
     along, swept = prepared.edges["half_step"][placement], prepared.swept["half_step"].get(placement)
     return edge_cells(prepared.scans[placement], along, swept, prepared.session.lrf)
 
@@ -194,7 +194,7 @@ def likely_outline_of(prepared, placement, model):
     face = points, model.correct(placement, points, pitch)[1], scan.sigma_range
     cells = cells_of(prepared, placement)
     on_board = polar_to_points(cells.range_m, cells.bearing)
-    cells = replace(cells, pitch=model.correct(placement, on_board, cells.pitch)[1])
+    cells.pitch = model.correct(placement, on_board, cells.pitch)[1]
     names = {side: name for name, _, side, _ in sides}
     measured = measure_outline(cells, face, names, prepared.board.edges, model)
     return measured, frozenset(name for name, _, _, swept in sides if swept)
@@ -203,14 +203,14 @@ def likely_outline_of(prepared, placement, model):
 def measure_outline(cells, face, names, edges, model):
     """Measure a board of unknown size in one sweep.
 
-    `cells` are its beams about the edges (EdgeCells), `face` points on it (LRF frame, metres), their pitch (radians)
+    `cells` are its beams about the edges, `face` points on it (LRF frame, metres), their pitch (radians)
     and the standard deviation of a range (metres), `names` the edge of each side, `edges` all edges in order around the
     board. Raises DegenerateGeometry if the face does not span a plane, or no side has enough cells.
     """
     pose, bend = face_surface(face, model)
     found = {side: name for side, name in names.items() if np.sum(cells.side == side) >= FEWEST_CELLS}
     if not found:
-        raise DegenerateGeometry(f"placement {cells.placement}: no side has {FEWEST_CELLS} beams about it")
+        raise DegenerateGeometry(f"no side has {FEWEST_CELLS} beams about it")
     rays = rays_about(cells, list(found), pose, bend, model)
     lines, middle = start_lines(rays)
     lines, information = fit_sides(rays, lines, middle, model)
@@ -251,7 +251,7 @@ def _quadratic(x, y):
 
 def rays_about(cells, sides, pose, bend, model):
     """Cells of some sides as rays in the plane's frame, padded by side (s, n), and where they meet the face."""
-    cells = cells.select(np.isin(cells.side, sides))
+    cells = cells[np.isin(cells.side, sides)]
     p_lrf = polar_to_points(np.ones(len(cells)), cells.bearing)
     direction = tilt(p_lrf @ model.T_head_lrf.rotation.as_matrix().T, cells.pitch) @ pose[:3, :3]
     origin = (tilt(model.T_head_lrf.translation, cells.pitch) - pose[:3, 3]) @ pose[:3, :3]
@@ -259,7 +259,7 @@ def rays_about(cells, sides, pose, bend, model):
     for _ in range(4):  # intersect with the height of the bent face at the last place
         at = origin + ((height - origin[:, 2]) / direction[:, 2])[:, None] * direction
         height = _quadratic(at[:, 0], at[:, 1]) @ bend
-    rays = {name: getattr(cells, name) for name in ("hit", "radius", "background")}
+    rays = {name: cells[name] for name in ("hit", "radius", "background")}
     rays |= {"at": at[:, :2], "direction": direction, "step": cells.range_m * cells.step}
     return pad(rays | {"placement": np.array([sides.index(side) for side in cells.side])}, len(sides))
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import DEPTH_NOISE, depth_jump, plane_axes, row_ends, row_median
-from lrfcal_lib.session.stated import ASSUMED_SPOT_RADIUS
 
 VARIANTS = ("last_beam", "half_step")
 MIXING = 1.0  # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram listing)
@@ -384,83 +383,30 @@ def _describe(scan, flat, axes, end, pitch):
     return ScanSide(-1, end, len(flat), float(np.ptp(along)), rms, float(np.arccos(min(cosine, 1.0))), ends)
 
 
-@dataclass(frozen=True)
-class EdgeCells:
-    """Beams about the edges of the board in one placement.
-
-    Attributes
-    ----------
-    placement : int
-    line, beam : ndarray of int, shape (n,)
-        Scan line and beam; every pair appears once.
-    bearing, pitch : ndarray, shape (n,)
-        Radians.
-    hit : ndarray of bool, shape (n,)
-        Whether the beam read the board.
-    side : ndarray of int, shape (n,)
-        Number of the side, as in ScanEdges.
-    range_m : ndarray, shape (n,)
-        Distance of the board's plane along the beam, metres.
-    radius : ndarray, shape (n,)
-        Of the spot there, across the beam, metres.
-    background : ndarray, shape (n,)
-        What the background adds to the log odds at which the reading flips, as far as distances and incidence tell it.
-    across : ndarray of bool, shape (n,)
-        Whether the boundary was found across the scan lines (the neighbour is a scan line, not a beam).
-    step : ndarray, shape (n,)
-        Angle between neighbours in that direction, radians.
-    """
-
-    placement: int
-    line: np.ndarray
-    beam: np.ndarray
-    bearing: np.ndarray
-    pitch: np.ndarray
-    hit: np.ndarray
-    side: np.ndarray
-    range_m: np.ndarray
-    radius: np.ndarray
-    background: np.ndarray
-    across: np.ndarray
-    step: np.ndarray
-
-    def __len__(self):
-        return len(self.line)
-
-    def select(self, keep):
-        """Some of the cells: a mask or indices."""
-        names = [f.name for f in fields(self) if f.name != "placement"]
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
-
-
-def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
+def edge_cells(scan, along, swept, lrf):
     """The beams about every boundary of the board, along and across the scan lines.
 
     Parameters
     ----------
     scan : BoardScan
     along, swept : ScanEdges
-        Of :func:`edge_points` and :func:`sweep_edges`; no `swept` for a single shot.
-    lrf : LrfInfo, optional
-        States the spot; a radius of 5 mm everywhere where it does not.
-    reach : int
-        Beams (or scan lines) on either side of a boundary.
+        Of :func:`edge_points` and :func:`sweep_edges`; None instead of `swept` for a single shot.
+    lrf : LrfInfo
+        Knows the spot.
 
     Returns
     -------
-    EdgeCells
-        Of all straight sides, no cell twice. Without cells in holes, at the border of the view, where something nearer
-        hides the board, with two edges in one spot, and beside a background less than a pulse length (1 m) behind,
-        whose echo melts into the board's. Where most of the outline has such a background they stay, with `background`
-        0; so do all cells where most boundaries have no return behind them (clouds cut to the board).
-
-    Raises
-    ------
-    ValueError
-        For a reach below 1.
+    recarray
+        ``line`` and ``beam`` (every pair appears once); ``bearing`` and ``pitch``, radians; ``hit``, whether the beam
+        read the board; ``side``, its number as in ScanEdges; ``range_m``, distance of the board's plane along the beam,
+        and ``radius`` of the spot there, metres; ``background``, what it adds to the log odds at which the reading
+        flips, as far as distances and incidence tell it; ``across``, whether the boundary was found across the scan
+        lines (the neighbour is a scan line, not a beam); ``step``, angle between neighbours in that direction, radians.
+        Of all straight sides, without cells in holes, at the border of the view, where something nearer hides the
+        board, with two edges in one spot, and beside a background less than a pulse length (1 m) behind, whose echo
+        melts into the board's. Where most of the outline has such a background they stay, with `background` 0; so do
+        all cells where most boundaries have no return behind them (clouds cut to the board).
     """
-    if reach < 1:
-        raise ValueError(f"reach is a number of beams on either side of an edge, at least 1, got {reach}")
     found, sweep = [edges for edges in (along, swept) if edges is not None], scan.sweep
     line, beam, step, side = (
         np.concatenate([getattr(edges, name)[edges.side >= 0] for edges in found])
@@ -468,13 +414,13 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     )
     board, cosine = _plane_range(scan, polar_to_points(1.0, sweep.bearings), sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
-    radius = np.full(board.shape, ASSUMED_SPOT_RADIUS) if lrf is None else lrf.spot_radius(board)
+    radius = lrf.spot_radius(board)
     here, behind = board[line, beam], beyond(scan, line, beam, step)
     seen, mixed = np.isfinite(behind), behind - here < MIXING
     close = len(seen) == 0 or np.mean(seen) < 0.5 or np.mean(mixed) >= 0.5
     odds = np.zeros(len(here)) if close else background_odds(here, behind)
     usable = np.flatnonzero(seen & ~mixed) if not close else np.arange(len(here))
-    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape, reach)
+    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
     # before a far background also beams that noise takes off the plane read the board
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
     gaps = [np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (sweep.pitch, sweep.bearings)]
@@ -493,16 +439,17 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     sides = [s for edges in found for s in edges.sides]
     keep &= _on_one_side(scan, (line, beam), board, (CORNER * radius / np.abs(cosine))[line, beam], sides, side[row])
     across = step[row, 0] != 0
-    cells = EdgeCells(
-        scan.placement, line, beam, sweep.bearings[beam], sweep.pitch[line], hit, side[row], board[line, beam],
-        radius[line, beam], odds[row], across, np.where(across, *gaps),
-    )  # fmt: skip
-    return cells.select(keep)
+    cells = {
+        "line": line, "beam": beam, "bearing": sweep.bearings[beam], "pitch": sweep.pitch[line], "hit": hit,
+        "side": side[row], "range_m": board[line, beam], "radius": radius[line, beam], "background": odds[row],
+        "across": across, "step": np.where(across, *gaps),
+    }  # fmt: skip
+    return np.rec.fromarrays([*cells.values()], names=[*cells])[keep]
 
 
-def _neighbours(usable, line, beam, step, shape, reach):
+def _neighbours(usable, line, beam, step, shape):
     """Cells about boundaries, each once, with the nearest boundary: its number, the step k from it, line and beam."""
-    k, row = np.meshgrid(np.arange(1 - reach, reach + 1), usable, indexing="ij")
+    k, row = np.meshgrid(np.arange(1 - REACH, REACH + 1), usable, indexing="ij")
     k, row = k.ravel(), row.ravel()
     order = np.argsort(np.abs(k - 0.5), kind="stable")
     k, row = k[order], row[order]
