@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
@@ -639,20 +640,25 @@ def test_surveys_that_cannot_work(session, surveyed):
         survey.measure_outline(views, UNKNOWN, surveyed.models)
 
 
-def shown(pixels):
-    """Views of placements 0, 1, ... with those corners."""
-    return [SimpleNamespace(placement=i, pixels=own) for i, own in enumerate(pixels)]
+def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
+    """The mounting of two cameras from the corners that they see at placements 0, 1, ..., and its covariance."""
+    views = [{p: SimpleNamespace(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)]
+    views, models = (dict(enumerate(each)) for each in (views, models))
+    board = SimpleNamespace(pattern=pattern)
+    return stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))[1:]
 
 
-def test_stereo_check_recovers_the_mounting_and_its_covariance_tells_the_error():
+def test_stereo_reference_recovers_the_mounting_and_its_covariance_tells_the_error():
     poses, mount, chi2 = view_poses(6, seed=8), pose_of(0.02, (0.01, -0.02), (-0.12, 0.002, 0.004), (0, 0)), []
     for seed in range(16):
-        first = shown(pixels_of(poses, 0.2, 2 * seed))
-        second = shown(pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1))
-        chi2.append(score(*survey.stereo_check(first, second, PATTERN, [MODEL, MODEL])[:2], mount))
+        first = pixels_of(poses, 0.2, 2 * seed)
+        second = pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1)
+        chi2.append(score(*stereo(first, second), mount))
     assert 0.6 < np.mean(chi2) < 1.5
     with pytest.raises(ValueError, match="no placement shows the pattern to both cameras"):
-        survey.stereo_check(first[:2], second[3:], PATTERN, [MODEL, MODEL])
+        stereo(first, [])
+    with pytest.raises(ValueError, match="needs two cameras and a pattern"):
+        stereo(first, first, pattern=None)
 
 
 # --- boards without pattern ----------------------------------------------------------------------------------------
@@ -752,14 +758,8 @@ def test_real_cameras_edges_and_outline(lms400):
 
 
 def test_real_stereo(lms400):
-    found = lms400.prepared
-    given = *(list(v.values()) for v in found.views.values()), found.board.pattern, list(found.models.values())
-    transform, covariance, _ = survey.stereo_check(*given, relief=found.relief)
+    refined, covariance = stereo_reference(lms400.prepared)[1:]
     # shape-free bundle of an independent analysis, with its own uncertainty
-    assert np.linalg.norm(transform.translation) == pytest.approx(0.1200, abs=0.0006)
-    np.testing.assert_allclose(np.rad2deg(transform.rotation.as_rotvec()), [0.457, 0.479, -0.025], atol=0.12)
-    assert np.all(np.sqrt(np.diag(covariance)) < 1e-3)
-    refined, covariance, _ = survey.stereo_check(*given, relief=found.relief, refine=True)
     off = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
     sigma = np.sqrt(np.diag(covariance)) * np.repeat([np.rad2deg(1), 1000], 3)
     off -= [0.457, 0.479, -0.025, -120.0, -0.3, -0.8]
@@ -776,7 +776,6 @@ def test_opencv_stereo_pairs(real_data):
         assert result.rms_px < rms
         models += result.models
     assert models[0].fx == pytest.approx(535.9, abs=4)
-    transform, _, result = survey.stereo_check(*map(shown, corners), pattern, models, refine=True)
-    assert result.rms_px < 0.4478
+    transform, _ = stereo(*corners, pattern, models)
     # along the axis the pairs tell little: the detectors of OpenCV alone move it by 1 mm
     assert np.all(np.abs(1000 * transform.translation - [-83.606, 1.043, 1.324]) < [0.8, 0.3, 2.2])

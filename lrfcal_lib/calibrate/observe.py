@@ -13,6 +13,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_sourc
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
@@ -62,9 +63,7 @@ def observe(
     """
     board, model, T_head_lrf = prepared.board, prepared.models[camera], platform_of(prepared, T_head_lrf)
     posed = {p: view for p, view in prepared.views[camera].items() if view.T_camera_board is not None}
-    pattern = np.zeros((0, 3)) if board.pattern is None else board.pattern.points()
-    if prepared.relief is not None:
-        pattern[:, 2] += prepared.relief  # the waves of the sheet
+    pattern = np.zeros((0, 3)) if board.pattern is None else raised_points(board.pattern, prepared.relief)
     n, k = len(posed), len(pattern)
     pixels = [np.full((k, 2), np.nan) if view.pixels is None else view.pixels for view in posed.values()]
     planes, crossed, one_scan = [], [], variant == ONE_SCAN

@@ -15,6 +15,7 @@ from lrfcal_lib.fit.residuals import beam_terms, edge_shift, flip_sigma, pad
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.preprocess.bend import quadratic
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_scan import edge_cells
 
@@ -139,9 +140,8 @@ def sized(lines, middle, covariance, names, edges):
 
 def _flat_line(points):
     """The line ``a x + b y + c = 0`` (3,) through points (n, 2) of a plane, and their middle."""
-    middle, direction, _ = fit_line(np.column_stack([points, np.zeros(len(points))]))
-    normal = np.array([direction[1], -direction[0]])
-    return np.r_[normal, -normal @ middle[:2]], middle[:2]
+    middle, (x, y), _ = fit_line(points)
+    return np.array([y, -x, x * middle[1] - y * middle[0]]), middle
 
 
 def named_sides(prepared, placement, variant="half_step", stretch=0.0):
@@ -238,15 +238,11 @@ def face_surface(face, model):
     p = lrf_to_platform(points - model.sensor["range_offset"] * rays, pitch, model.T_head_lrf)
     pose = plane_frame(p)
     p = (p - pose[:3, 3]) @ pose[:3, :3]
-    A, freedom = _quadratic(p[:, 0], p[:, 1]), max(len(p) - 6, 1)
+    A, freedom = quadratic(p[:, :2]), max(len(p) - 6, 1)
     flat, bent = (np.linalg.lstsq(A[:, :k], p[:, 2], rcond=None)[0] for k in (3, 6))
     before, after = np.sum((p[:, 2] - A[:, :3] @ flat) ** 2), np.sum((p[:, 2] - A @ bent) ** 2)
     asked = (before - after) / 3 / (after / freedom) > fdtri(3, freedom, 0.999)
     return pose, bent if asked else np.zeros(6)
-
-
-def _quadratic(x, y):
-    return np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
 
 
 def rays_about(cells, sides, pose, bend, model):
@@ -258,7 +254,7 @@ def rays_about(cells, sides, pose, bend, model):
     height = 0.0
     for _ in range(4):  # intersect with the height of the bent face at the last place
         at = origin + ((height - origin[:, 2]) / direction[:, 2])[:, None] * direction
-        height = _quadratic(at[:, 0], at[:, 1]) @ bend
+        height = quadratic(at[:, :2]) @ bend
     rays = {name: cells[name] for name in ("hit", "radius", "background")}
     rays |= {"at": at[:, :2], "direction": direction, "step": cells.range_m * cells.step}
     return pad(rays | {"placement": np.array([sides.index(side) for side in cells.side])}, len(sides))

@@ -107,9 +107,14 @@ class Face:
     around: np.ndarray
 
     def columns(self, flat):
-        """Columns of a plane and a quadratic surface about the middle of the face at points of it, shape (n, 6)."""
-        x, y = (flat - (self.flat.min(axis=0) + self.flat.max(axis=0)) / 2).T
-        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        """Those of :func:`quadratic` about the middle of the face at points of it, shape (n, 6)."""
+        return quadratic(flat - (self.flat.min(axis=0) + self.flat.max(axis=0)) / 2)
+
+
+def quadratic(points):
+    """Columns (n, 6) of a plane and a quadratic surface at points (n, 2)."""
+    x, y = points.T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def board_bends(prepared, to_board=None):

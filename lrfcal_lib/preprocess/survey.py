@@ -13,7 +13,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
@@ -419,51 +418,3 @@ def _median_line(lines, ends):
     offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
     a, b = ends + np.median(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
-
-
-def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
-    """Relative pose of two cameras from the pattern's corners in views of the same placements.
-
-    Parameters
-    ----------
-    first, second : sequence of BoardView
-        Of two cameras; views with the same placement belong together.
-    pattern : Chessboard
-    models : pair of CameraModel
-        Intrinsics.
-    relief : ndarray, shape (k,), optional
-        Non-zero heights: the sheet is wavy, its shape is estimated along.
-    refine : bool
-        Estimate the intrinsics of both cameras along: the best knowledge of the mounting. Without, the result goes with
-        the given intrinsics (so does a calibration that uses them), and the covariance leaves their errors out.
-
-    Returns
-    -------
-    T_second_first : RigidTransform
-    covariance : ndarray, shape (6, 6)
-        Of ``[w, v]``.
-    adjustment : Adjustment
-
-    Raises
-    ------
-    ValueError
-        If no placement is seen by both cameras.
-    """
-    corners = [{v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0}
-               for views in (first, second)]  # fmt: skip
-    common = sorted(corners[0].keys() & corners[1].keys())
-    if not common:
-        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
-    pixels = np.array([[own[p] for p in common] for own in corners])
-    poses = [
-        RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in own])
-        for own, model in zip(pixels, models, strict=True)
-    ]
-    between = poses[1] * poses[0].inv()
-    rough = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
-    mounting = RigidTransform.concatenate([RigidTransform.identity(), rough])
-    wavy = relief is not None and np.any(relief)
-    options = {"intrinsics": refine, "basis": intrinsics.waves(pattern.points()) if wavy else None}
-    options["fixed"] = (8,) if all(m.distortion[4] == 0 for m in models) else ()
-    result = intrinsics.adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
-    return result.mounting[1], result.mounting_covariance[0], result
