@@ -324,7 +324,7 @@ PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i i
         lambda: adjust(ONE[None, None, :4], PATTERN.points()[:4], [MODEL], STACKED),
     "four or more of the pattern's 24 corners": lambda: board_pose(ONE[:10], PATTERN, MODEL),
     "four or more": lambda: board_pose(np.where(np.arange(24)[:, None] < 3, ONE, np.nan), PATTERN, MODEL),
-    "two points 0.00 px apart": lambda: picked_edge("top", [3, 4], [3, 4], [0, 1]),
+    "two points 0.00 px apart": lambda: picked_edge("top", np.full((2, 2), 3.0), np.zeros(2)),
     "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0),
 }.items())  # fmt: skip
 def test_what_does_not_suffice(message, call):
@@ -367,7 +367,8 @@ def noisy_edges(pose, seed, sigma=0.1):
     for i, name in enumerate(SHEET.edges):
         exact = true_line(name, pose)
         ends = on_board(pose, CORNERS[[i, (i + 1) % 4]]) + rng.normal(0, sigma, (2, 1)) * exact[:2]
-        out.append(replace(picked_edge(name, *ends, exact[:2], sigma), picked=False))
+        edge = picked_edge(name, ends, ends.mean(axis=0) - exact[:2])  # by a hand that errs by a pixel
+        out.append(replace(edge, covariance=sigma**2 * edge.covariance))
     return out
 
 
@@ -486,12 +487,12 @@ def test_picks_override_the_detector():
         EdgePick("right", Path("a.png"), "left", corners[:2]),
     ]
     view = seen(render(pose), picks=picks)
-    assert [e.name for e in view.edges if e.picked] == ["top"]
+    assert [e.name for e in view.edges if e.n_points == 2] == ["top"]
     top, ends = view.edge("top"), undistort(picks[0].ends, MODEL)
     np.testing.assert_allclose(top.ends, ends, atol=1e-9)
     assert np.abs(line_distance(ends, top.line)).max() < 1e-9
     assert line_distance(on_board(pose, [[0.12, 0.095]])[0], top.line) < 0
-    assert view.edge("left").picked is False and view.edge("nowhere") is None
+    assert view.edge("left").n_points > 2 and view.edge("nowhere") is None
     with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
         seen(render(pose), picks=[replace(picks[0], edge="hypotenuse")])
 
@@ -688,9 +689,9 @@ def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector(
     corners = on_board(pose, TRIANGLE.corners, project)
     picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
     view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": picks["bc"]})
-    assert view.edge("bc").picked and worst_edge(view, pose, TRIANGLE) < 0.1
+    assert view.edge("bc").n_points == 2 and worst_edge(view, pose, TRIANGLE) < 0.1
     view = view_board(BLANK, TRIANGLE, MODEL, picks=picks)
-    assert view.reason == "" and all(e.picked for e in view.edges)
+    assert view.reason == "" and all(e.n_points == 2 for e in view.edges)
     np.testing.assert_allclose(nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
 

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from test_scan import turn_sigma
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
@@ -67,7 +68,7 @@ def test_each_edge_gives_one_side_with_its_direction(name, placement):
             along = np.linalg.svd(mine - mine.mean(axis=0))[2][0]
             turned = np.arcsin(np.minimum(np.abs(lines[:, :2] @ along), 1.0))
             edge = int(turned.argmin())
-            assert turned[edge] < 4 * side.angle_sigma
+            assert turned[edge] < 4 * turn_sigma(side)
             assert np.abs(np.median(mine @ lines[edge, :2] + lines[edge, 2])) < WIDEST
             assert number_of.setdefault(edge, side.side) == side.side
             here.append(edge)

@@ -89,15 +89,6 @@ def plane_frame(points):
     return pose
 
 
-def corners_and_lengths(lines, edges):
-    """Corners where two neighbouring sides were found (..., 2), and lengths between them (...), by edge."""
-    pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
-    both = {after: np.stack([lines[k], lines[after]], axis=-2) for k, after in pairs if k in lines and after in lines}
-    corners = {name: corners_of_lines(sides)[..., 1, :] for name, sides in both.items()}
-    known = [(name, after) for name, after in pairs if name in corners and after in corners]
-    return corners, {name: np.linalg.norm(corners[after] - corners[name], axis=-1) for name, after in known}
-
-
 def measure_board(face, sides, edges, each=1):
     """Measure a board's outline in a cloud: plane through the face, lines through its sides, corners where they meet.
 
@@ -125,8 +116,13 @@ def sized(lines, middle, covariance, names, edges):
     """
 
     def outline(lines):
+        """Sides, corners where two neighbours were found (..., 2), and lengths between these (...), by edge."""
         sides = dict(zip(names, np.moveaxis(lines, -2, 0), strict=True))
-        return sides, *corners_and_lengths(sides, edges)
+        pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
+        both = {after: [sides[k], sides[after]] for k, after in pairs if k in sides and after in sides}
+        corners = {name: corners_of_lines(np.stack(two, axis=-2))[..., 1, :] for name, two in both.items()}
+        ends = {k: (corners[k], corners[after]) for k, after in pairs if k in corners and after in corners}
+        return sides, corners, {name: np.linalg.norm(b - a, axis=-1) for name, (a, b) in ends.items()}
 
     sides, corners, size = outline(lines)
     steps = 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)

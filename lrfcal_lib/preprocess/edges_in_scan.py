@@ -19,7 +19,6 @@ LEAST_ANGLE = np.radians(20)
 SHORTEST_SIDE = 0.1  # of the board's size
 UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of width 1
 EDGE_SCATTER = 0.006  # metres; about twice what the end points of a real board scatter about a straight edge
-EDGE_BEND = 0.001  # metres; error of edge points that no number of them averages out
 SAME_SIDE = 0.02  # metres; a side found by lines and by columns
 WARPED_BEAMS = 15  # at most, at either end of a scan line, that tell how far the board lies from the fitted line
 REACH = 2  # beams (or scan lines) on either side of a boundary
@@ -130,16 +129,6 @@ class ScanSide:
     rms: float
     angle: float
     ends: np.ndarray
-
-    @property
-    def angle_sigma(self):
-        """Standard deviation of the side's direction within the board's plane, radians.
-
-        That of a line through n points spread evenly over the length, ``sqrt(12 / n) rms / length``, where neighbours
-        share their errors in pairs, and with a millimetre that never averages out: what stands behind an edge changes
-        along it, and with it where a wide spot takes the edge to be.
-        """
-        return float(np.sqrt(12 * (2 * self.rms**2 / self.n_points + EDGE_BEND**2)) / self.length)
 
     def is_same(self, other):
         """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
