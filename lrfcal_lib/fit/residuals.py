@@ -381,9 +381,9 @@ def face_block(state, data, unknowns):
     ray = rays(state, data, group)
     o, d = ray[:2]
     normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
-    along = np.sum(normal * d, axis=-1, keepdims=True)
+    along = np.vecdot(normal, d)[..., None]
     along = np.where(np.abs(along) < 1e-9, 1e-9, along)
-    r = np.sum(normal * (origin - o), axis=-1, keepdims=True) / along
+    r = np.vecdot(normal, origin - o)[..., None] / along
     by_q = normal / along
     head, parts = ray_columns(-by_q, -r * by_q, ray)
     by_normal = (origin - o - r * d) / along
@@ -401,17 +401,17 @@ def edge_distance(state, data, group, ray):
     ``-by_o``), then a, t: point (relative to the board's origin) and direction of the edge, platform frame.
     """
     o, d = ray[:2]
-    rotation = np.swapaxes(state.boards[:, :, :3], -1, -2)
-    line = data.lines[group["edge"]]
-    normal = np.concatenate([line[..., :2], 0 * line[..., :1]], axis=-1)
-    along = np.stack([-line[..., 1], line[..., 0], 0 * line[..., 0]], axis=-1)
-    a, t, n = ((-line[..., 2:] * normal) @ rotation, along @ rotation, normal @ rotation)
+    normal, turn = data.lines * [1.0, 1.0, 0.0], np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    each = np.concatenate([-data.lines[:, 2:] * normal, normal @ turn, normal])  # of every edge: a, t, its normal
+    each = (each @ np.swapaxes(state.boards[:, :, :3], -1, -2)).reshape(len(state.boards), 3, -1, 3)
+    a, t, n = (part[np.arange(len(part))[:, None], group["edge"]] for part in np.moveaxis(each, 1, 0))
     away = o - a - state.boards[:, None, :, 3]
     m = cross(d, t)
-    length = np.linalg.norm(m, axis=-1, keepdims=True)
-    c = m / length * np.where(np.sum(m * n, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    u = np.sum(c * away, axis=-1)
-    g = (away * np.sign(np.sum(c * m, axis=-1, keepdims=True)) - u[..., None] * m / length) / length
+    length = np.sqrt(np.vecdot(m, m))[..., None]
+    sign = np.where(np.vecdot(m, n) < 0, -1.0, 1.0)[..., None]
+    c = sign * m / length
+    u = np.vecdot(c, away)
+    g = (away * sign - u[..., None] * m / length) / length
     return u, c, cross(t, g), cross(g, d), a, t
 
 

@@ -542,7 +542,8 @@ def finished(obs, state, data, unknowns, excluded, required):
     lens, lens_scale = joint_noise.lens_covariance(obs, found, data, unknowns)
     spread = None if found.covariance_placements is None else found.covariance_placements + lens
     found = replace(found, covariance=found.covariance + lens, covariance_placements=spread)
-    state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, unknowns), obs.placements.tolist()
+    wider = replace(unknowns, sensor=tuple(dict.fromkeys((*unknowns.sensor, *joint_noise.TERMS))))
+    state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, wider), obs.placements.tolist()
     levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return JointSolution(
         found, obs, data, unknowns,
@@ -555,5 +556,5 @@ def finished(obs, state, data, unknowns, excluded, required):
         | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
         misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),
         excluded=excluded, lens=lens, lens_scale=lens_scale,
-        warnings=joint_noise.joint_warnings(blocks, data, unknowns, found, obs.cameras),
+        warnings=joint_noise.joint_warnings(blocks, data, wider, found, obs.cameras),
     )  # fmt: skip

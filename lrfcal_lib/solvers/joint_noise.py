@@ -220,7 +220,10 @@ def view_misses(state, data):
 
 
 def joint_warnings(blocks, data, unknowns, found, names):
-    """What is suspicious about a joint estimate with cameras of these names, in words."""
+    """What is suspicious about a joint estimate with cameras of these names, in words.
+
+    `blocks` hold derivatives by `TERMS` too, which `unknowns` name, whether they were estimated or not.
+    """
     words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
@@ -230,9 +233,8 @@ def joint_warnings(blocks, data, unknowns, found, names):
             f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger "
             "pitch range, take images at more pitch angles, or state the platform with its accuracy"
         )
-    held = [name for name in TERMS if name not in unknowns.sensor]
-    wider = replace(unknowns, sensor=(*unknowns.sensor, *held))
-    for name, square, value in score_tests(found.state, data, wider, held):
+    held = [name for name in TERMS if name not in found.names]
+    for name, square, value in score_tests(blocks, unknowns, held):
         least, what, factor, unit = TERMS[name]
         if square > ASKED and abs(value) > least:
             words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
@@ -259,12 +261,12 @@ def noise_words(blocks, data, names):
     ]
 
 
-def score_tests(state, data, unknowns, held):
+def score_tests(blocks, unknowns, held):
     """Names, squared scores (standard deviations) of shared unknowns held at zero, and the values they would take.
 
     Each one is tested by itself, with all that was estimated free.
     """
-    hessian, gradient, *_ = linearise(residuals.joint_blocks(state, data, unknowns), None, 1.0, (-2, -1))
+    hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
     whole, score = (np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2])
     names = unknowns.names(range(unknowns.cameras))
     others = [i for i, name in enumerate(names) if name not in held]

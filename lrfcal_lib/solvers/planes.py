@@ -107,18 +107,22 @@ def board_whitener(pose, triangles, boards, board_covariance):
 
 def plane_terms(pose, triangles, boards, offset=0.0):
     """Residuals ``A h + offset`` (..., 4) and their Jacobians (..., 4, 6) by the pose and by the board's pose."""
+    residuals, turned, between = plane_residuals(pose, triangles, boards, offset)
     normal = boards[..., 2]
-    between = pose[..., 3] - boards[..., 3]
-    turned = np.swapaxes(pose[..., :3], -1, -2)
-    top, last = (turned @ normal[..., None])[..., 0], np.sum(normal * between, axis=-1, keepdims=True)
-    residuals = (triangles @ np.concatenate([top, last], axis=-1)[..., None])[..., 0] + offset
     spin = turned @ geometry.hat(normal)
-    normal = np.broadcast_to(normal, top.shape)[..., None, :]
+    normal = np.broadcast_to(normal, spin.shape[:-1])[..., None, :]
     moment = geometry.cross(normal[..., 0, :], between)[..., None, :]
     upper = np.concatenate([spin, np.zeros_like(spin)], axis=-1)
     by_pose = np.concatenate([upper, np.concatenate([np.zeros_like(normal), normal], axis=-1)], axis=-2)
     by_board = np.concatenate([-upper, np.concatenate([moment, -normal], axis=-1)], axis=-2)
     return residuals, triangles @ by_pose, triangles @ by_board
+
+
+def plane_residuals(pose, triangles, boards, offset=0.0):
+    """Residuals of :func:`plane_terms`, the rotation back (..., 3, 3), and what lies between the origins (..., 3)."""
+    normal, between, turned = boards[..., 2], pose[..., 3] - boards[..., 3], np.swapaxes(pose[..., :3], -1, -2)
+    top, last = (turned @ normal[..., None])[..., 0], np.sum(normal * between, axis=-1, keepdims=True)
+    return (triangles @ np.concatenate([top, last], axis=-1)[..., None])[..., 0] + offset, turned, between
 
 
 def check_normals(sets, camera, least=0.02):
@@ -165,17 +169,17 @@ def start_from_planes(obs):
     found = [three_planes(lines[threes[:MINIMAL]], sets.boards[threes[:MINIMAL]]).reshape(-1, 3, 4) @ frame.T]
     every = np.arange(p)[None]
     if not flat:
-        found += [closed_form(triangles[rows], sets.boards[rows], True) for rows in (threes, every)]
+        found += [closed_form(triangles, sets.boards, rows, True) for rows in (threes, every)]
     if p >= 5:
         own = _subsets(p, 5), every
-        found += [closed_form(lines[rows], sets.boards[rows], False) @ frame.T for rows in own]
+        found += [closed_form(lines, sets.boards, rows, False) @ frame.T for rows in own]
     candidates = _before_boards(np.concatenate(found), sets, _centred(triangles)[1])
 
     least = max(p // 2 + 2, 7 if flat else 5)  # more placements than a closed form uses
 
     def trimmed(candidates, count=least):
         """Mean square (m^2) of candidates over so many placements, those they suit best."""
-        residuals = plane_block(candidates, triangles, sets.boards).residuals.reshape(len(candidates), -1, 4)
+        residuals = plane_residuals(candidates[:, None], triangles, sets.boards)[0]
         squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
         return squares[:, :count].mean(axis=1)
 
@@ -240,31 +244,30 @@ def _centred(triangles):
     return turned[..., 1:, 1:], turned[..., 0, 1:] / turned[..., 0, :1]
 
 
-def closed_form(triangles, boards, solid):
-    """The linear solution of Zhang and Pless, ``T_camera_source`` (..., 3, 4), for stacks of placements.
+def closed_form(triangles, boards, rows, solid):
+    """The linear solution of Zhang and Pless, ``T_camera_source`` (n, 3, 4), from n sets (n, k) of the placements.
 
-    `solid`: the points of a placement span a plane, the rotation comes from the planes' normals (p >= 3). Otherwise
-    points of single scan lines (z = 0), nine linear unknowns (p >= 5).
+    `solid`: the points of a placement span a plane, the rotation comes from the planes' normals (k >= 3). Otherwise
+    points of single scan lines (z = 0), nine linear unknowns (k >= 5).
     """
     normal = boards[..., 2]
     offset = np.sum(normal * boards[..., 3], axis=-1)
     root, centre = _centred(triangles)
     if solid:
-        source = np.linalg.svd(root)[2][..., 2, :]
+        source = np.linalg.svd(root)[2][:, 2]
         source = source * np.sign(np.sum(source * centre, axis=-1, keepdims=True))
-        camera = normal * np.where(offset < 0, -1.0, 1.0)[..., None]
-        rotation = np.swapaxes(camera, -1, -2) @ source
+        camera = normal * np.where(offset < 0, -1.0, 1.0)[:, None]
+        rotation = np.swapaxes(camera[rows], -1, -2) @ source[rows]
     else:
-        rows = triangles[..., [0, 1, 3]]  # z is 0: the normal equations are linear in the first two columns of R, and t
-        square = np.swapaxes(rows, -1, -2) @ rows
-        square = square / square[..., 2:, 2:]
-        outer, p = normal[..., :, None] * normal[..., None, :], square.shape[:-2]
-        left = (square[..., :, None, :, None] * outer[..., None, :, None, :]).reshape(p + (9, 9)).sum(axis=-3)
-        right = (square[..., :, 2:] * (normal * offset[..., None])[..., None, :]).reshape(p + (9,)).sum(axis=-2)
-        found = (np.linalg.pinv(left, rcond=1e-14, hermitian=True) @ right[..., None]).reshape(p[:-1] + (3, 3))
-        first, second = found[..., 0, :], found[..., 1, :]
+        flat = triangles[..., [0, 1, 3]]  # z is 0: the normal equations are linear in the first two columns of R, and t
+        square = np.swapaxes(flat, -1, -2) @ flat
+        square, outer = square / square[:, 2:, 2:], normal[:, :, None] * normal[:, None, :]
+        left = (square[:, :, None, :, None] * outer[:, None, :, None, :]).reshape(-1, 9, 9)
+        right = (square[:, :, 2:] * (normal * offset[:, None])[:, None, :]).reshape(-1, 9)
+        found = _solved(left[rows].sum(axis=1), right[rows].sum(axis=1)).reshape(-1, 3, 3)
+        first, second = found[:, 0], found[:, 1]
         rotation = np.stack([first, second, np.cross(first, second)], axis=-1)
-    return _on_planes(rotation, normal, boards[..., 3], centre)
+    return _on_planes(rotation, normal[rows], boards[rows][..., 3], centre[rows])
 
 
 def _on_planes(rotation, normal, point, centre):
@@ -326,8 +329,15 @@ def shifted(rotation, normal, right):
     """Poses (..., 3, 4) of rotations with the translation for which ``n . t = right`` fits best."""
     normal = np.broadcast_to(normal, right.shape + (3,))
     transposed = np.swapaxes(normal, -1, -2)
-    shift = np.linalg.pinv(transposed @ normal, rcond=1e-12) @ (transposed @ right[..., None])
-    return np.concatenate([rotation, shift], axis=-1)
+    shift = _solved(transposed @ normal, (transposed @ right[..., None])[..., 0])
+    return np.concatenate([rotation, shift[..., None]], axis=-1)
+
+
+def _solved(square, right):
+    """Solutions of normal equations (..., k, k), (..., k); what these leave open stays about zero."""
+    size = square.shape[-1]
+    ridge = 1e-13 * np.trace(square, axis1=-2, axis2=-1)[..., None, None] + 1e-300
+    return np.linalg.solve(square + ridge * np.eye(size), right[..., None])[..., 0]
 
 
 def _subsets(p, size):
