@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_scan import HEAD, SQUARE, scene
+from test_scan import HEAD, SQUARE, edge_points, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
+from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.edges_in_scan import background_odds, edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
@@ -17,7 +17,7 @@ LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spo
 def cells_of(made, change=None):
     sweep = made.sweep if change is None else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
     board = board_in_scan.find_board(sweep, made.board, HEAD)
-    along, swept = edges_in_scan.edge_points(board), edges_in_scan.sweep_edges(board)
+    along, swept = edge_points(board), sweep_edges(board)
     return board, edge_cells(board, along, swept, LRF)
 
 
@@ -115,5 +115,5 @@ def test_odds_of_backgrounds():
 def test_single_shot_gives_cells_at_both_ends():
     made = scene(pitch=(0, 0.001), sigma=0.002)
     board = board_in_scan.find_board(made.sweep, SQUARE, HEAD)
-    cells = edge_cells(board, edges_in_scan.edge_points(board), None, LRF)
+    cells = edge_cells(board, edge_points(board), None, LRF)
     assert set(cells.side) == {0, 1} and not cells.across.any()

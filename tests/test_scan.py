@@ -12,13 +12,21 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter, segments
-from lrfcal_lib.preprocess.edges_in_scan import crossings, edge_points, straight_runs, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import crossings, straight_runs
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
 SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
                ("left", "top"))  # fmt: skip
 TRIANGLE = triangle_board()
+
+
+def edge_points(scan):
+    return crossings(scan)[0]["half_step"]
+
+
+def sweep_edges(scan):
+    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
 
 
 def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):

@@ -4,12 +4,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from test_scan import turn_sigma
+from test_scan import edge_points, sweep_edges, turn_sigma
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
-from lrfcal_lib.preprocess.edges_in_scan import edge_points, sweep_edges
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 

@@ -146,8 +146,8 @@ def named_sides(prepared, placement, variant="half_step", stretch=0.0):
     numbers, length = np.unique(along.side), prepared.board.lengths() if stretch else {}
     for side, name in prepared.names.get(placement, {}).items():
         found = along if side in numbers else swept
-        seen = 0.0 if found is None else next((s.length for s in found.sides if s.side == side), 0.0)
-        if found is not None and seen >= stretch * length.get(name, 0.0):
+        seen = next((s.length for s in found.sides if s.side == side), 0.0)
+        if seen >= stretch * length.get(name, 0.0):
             yield name, found, side, found is not along
 
 

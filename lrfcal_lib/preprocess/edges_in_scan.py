@@ -106,10 +106,10 @@ class ScanSide:
     Attributes
     ----------
     side : int
-        Number within the placement; the same in all variants and in :func:`sweep_edges`.
+        Number within the placement; the same in all variants, along and across.
     end : int
-        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of :func:`sweep_edges`: -1
-        where it ends columns at low pitch, +1 at high pitch.
+        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of columns: -1 at
+        low pitch, +1 at high pitch.
     n_points : int
     length : float
         Of the stretch with points, metres.
@@ -183,42 +183,32 @@ class ScanEdges:
     background: np.ndarray
 
 
-def edge_points(scan):
-    """Where scan lines cross the board's edges, by the half step; step (iii) of the paper's preprocessing.
+def crossings(scan, across=False, known=()):
+    """Where scan lines cross the board's edges or, with `across`, columns of the range image (one beam over the pitch).
+
+    One rule, step (iii) of the paper's preprocessing, in which bearing and pitch change places.
 
     Parameters
     ----------
     scan : BoardScan
+    across : bool
+        Edges nearly parallel to the scan lines are found here.
+    known : sequence of ScanSide
+        Found the other way: a side that is one of them gets its number.
 
     Returns
     -------
-    ScanEdges
-        Ends of scan lines at holes inside the board do not appear; neither do ends at the border of the field of
-        view, nor where something nearer hides the board. The points lie on the fitted straight line (the paper), moved
-        along the ray by what the outermost beams say where the board turns out to be warped. The covariance holds the
-        beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at
-        less than 20 deg to the scan lines are left out (side -1): there the pitch decides where a line ends.
-    """
-    return crossings(scan)[0]["half_step"]
-
-
-def sweep_edges(scan):
-    """Where columns of the range image (one beam over the pitch) cross the board's edges: as :func:`edge_points`.
-
-    Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here. Nothing ends at the
-    first or last scan lines of the sweep, which may have been cut. The points lie on the board at the pitch given with
-    them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points` sees too has the same number. The
-    covariance is that of the pitch step (as a displacement on the board) and of the line fit.
-    """
-    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
-
-
-def crossings(scan, across=False, known=()):
-    """Crossings of scan lines or, with `across`, of columns: one rule, in which bearing and pitch change places.
-
-    Returns ScanEdges by variant, and all sides with those that are seen at too small an angle; sides that are among the
-    `known` ones keep their number. 'half_step': halfway between the last beam on the board and the first off it,
-    unbiased for an edge anywhere between them; 'last_beam': the paper's rule, half a step inside on average.
+    edges : dict of str to ScanEdges
+        By variant. 'half_step': halfway between the last beam on the board and the first off it, unbiased for an edge
+        anywhere between them; 'last_beam': the paper's rule, half a step inside on average. Ends at holes inside the
+        board do not appear; neither do ends at the border of the view (of the sweep, which may have been cut), nor
+        where something nearer hides the board. The points lie on the fitted straight line (the paper), moved along the
+        ray by what the outermost beams say where the board turns out to be warped. The covariance holds the beam
+        spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at less
+        than 20 deg to the scan lines (to the columns) are left out (side -1): there the pitch (the bearing) decides
+        where a line ends.
+    sides : tuple of ScanSide
+        All of them, with those left out.
     """
     line, beam, step, end = _ends(scan, across)
     angles, cell = (scan.sweep.pitch, line) if across else (scan.sweep.bearings, beam)
@@ -379,7 +369,7 @@ def edge_cells(scan, along, swept, lrf):
     ----------
     scan : BoardScan
     along, swept : ScanEdges
-        Of :func:`edge_points` and :func:`sweep_edges`; None instead of `swept` for a single shot.
+        Of :func:`crossings`, along and across the scan lines; None instead of `swept` for a single shot.
     lrf : LrfInfo
         Knows the spot.
 
@@ -452,12 +442,10 @@ def _neighbours(usable, line, beam, step, shape):
 
 def _on_one_side(scan, cells, board, reach, sides, side):
     """Cells on the stretch of their own side whose spot reaches no other one; all of them where sides are not known."""
-    if not sides:
-        return np.ones(len(side), bool)
     axes, (line, beam) = plane_axes(scan.normal), cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
     flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
-    keep, alone = np.zeros(len(side), bool), np.ones(len(side), bool)
+    keep, alone = ~np.isin(side, [s.side for s in sides]), np.ones(len(side), bool)
     for s in sides:
         first, last = s.ends @ axes.T
         direction = (last - first) / np.linalg.norm(last - first)
