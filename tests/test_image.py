@@ -527,9 +527,8 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
     truth = np.roll(np.array([0.25, 0.15]) - CORNERS, -2, axis=0) if over.pop() else CORNERS
     outline, expected = surveyed.outline, replace(SHEET, corners=truth).lengths()
     np.testing.assert_allclose(surveyed.board.corners, truth, atol=8e-4)
-    np.testing.assert_allclose(corners_of_lines(outline.lines), surveyed.board.corners, atol=1e-12)
     assert np.all(outline.line_sd < 0.002)
-    for name, length in outline.lengths.items():
+    for name, length in outline.board.lengths().items():
         assert length == pytest.approx(expected[name], abs=0.001) and outline.length_sd[name] < 0.003
     alone = survey.measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
     assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
@@ -743,7 +742,7 @@ def test_real_cameras_edges_and_outline(lms400):
         names = [e.name for v in views for e in v.edges]
         assert len(names) >= 70 and len(names) - names.count("bottom") >= 58
         assert all(reason.startswith(("cut by", "no clear")) for v in views for _, reason in v.rejected)
-    for name, length in found.outline.lengths.items():
+    for name, length in found.board.lengths().items():
         assert length == pytest.approx(0.858, abs=0.004), name
         assert found.outline.length_sd[name] < 0.007
     assert np.all(found.outline.line_sd < 0.0035)

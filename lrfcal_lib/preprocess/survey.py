@@ -50,25 +50,20 @@ class Outline:
 
     Attributes
     ----------
-    lines : ndarray, shape (E, 3)
-        Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of ``board.edges``.
-    line_sd : ndarray, shape (E,)
-        Standard deviation over the views of an edge's offset at its middle, metres.
-    lengths, length_sd : dict of str to float
-        Edge lengths of the outline and their standard deviation over the views that show the edge with both neighbours
-        (NaN below two), metres.
-    n_lengths : dict of str to int
-        Views that show the edge with both neighbours.
     board : Board
         With its corners filled in.
+    line_sd : ndarray, shape (E,)
+        Standard deviation over the views of an edge's offset at its middle, metres.
+    length_sd : dict of str to float
+        Standard deviation of an edge's length over the views that show it with both neighbours (NaN below two), metres.
+    n_lengths : dict of str to int
+        Views that show the edge with both neighbours.
     """
 
-    lines: np.ndarray
+    board: Board
     line_sd: np.ndarray
-    lengths: dict
     length_sd: dict
     n_lengths: dict
-    board: Board
 
 
 def views_of(session, models=None, *, one_per_placement=False):
@@ -135,7 +130,7 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         views = [v if v.reason else look(r, v, models, lines=lines, relief=relief) for r, v in images]
         if not known:
             outline = measure_outline(views, board, models)
-            lines = outline.lines
+            lines = outline.board.lines()
     board = board if outline is None else outline.board
     return Survey(_by_camera(models, views), models, outline, board, relief, unseen)
 
@@ -398,12 +393,11 @@ def measure_outline(views, board, models):
     rough = corners_of_lines([np.median(found, axis=0) for found in lines])
     ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
     fitted, line_sd = map(np.array, zip(*map(_median_line, lines, ends), strict=True))
-    measured = replace(board, corners=corners_of_lines(fitted))
     for trio in zip(np.roll(board.edges, 1), board.edges, np.roll(board.edges, -1), strict=True):
         corners = [corners_of_lines([own[name] for name in trio]) for own in seen if own.keys() >= {*trio}]
         lengths[trio[1]] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
     spread, count = ({n: f(x) for n, x in lengths.items()} for f in (_spread, len))
-    return Outline(fitted, line_sd, {n: float(x) for n, x in measured.lengths().items()}, spread, count, measured)
+    return Outline(replace(board, corners=corners_of_lines(fitted)), line_sd, spread, count)
 
 
 def _spread(values):
