@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from shared import campaign
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
@@ -102,11 +103,11 @@ class Campaign:
         return min(same, key=lambda record: abs(record.time_s - reading.time_s))
 
 
-@pytest.fixture(scope="module")
-def campaigns():
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=campaign)])
+def campaigns(request):
     """All kinds of faults, long ones half as often, in random order."""
     rng, parts = np.random.default_rng(5), []
-    for kinds, times in ((STREAMED, 14), (KINDS, 10)):
+    for kinds, times in ((STREAMED, 7 * request.param), (KINDS, 5 * request.param)):
         everything = [kind for kind in kinds for _ in range(times // 2 if kind in LONG else times)]
         parts.append(np.array_split(rng.permutation(everything), DEVICES))
     return [Campaign(number).run(*part) for number, part in enumerate(zip(*parts, strict=True))]
@@ -114,10 +115,10 @@ def campaigns():
 
 def test_hundreds_of_faults_of_many_kinds_are_recovered_from(campaigns):
     counts = sum((one.faults.counts for one in campaigns), start=Counter())
-    assert sum(counts.values()) >= 500 and sum(count > 0 for count in counts.values()) >= 20
+    assert sum(counts.values()) >= 250 and sum(count > 0 for count in counts.values()) >= 20
     assert max(max(one.calls) for one in campaigns) < CALL_S
     took = sorted(recovery for one in campaigns for recovery in one.recoveries)
-    assert len(took) > 500 and took[-1][0] < RECOVERY_S, took[-5:]
+    assert len(took) > 250 and took[-1][0] < RECOVERY_S, took[-5:]
 
 
 def test_no_wrong_scan_is_accepted(campaigns):
@@ -130,6 +131,6 @@ def test_no_wrong_scan_is_accepted(campaigns):
             unit = {"cm": 0.01, "mm": 0.001}[decode_scan(record.telegram).unit]
             valid = reading.reasons == 0
             np.testing.assert_allclose(reading.ranges[valid], record.words[valid] * unit)
-    assert sum(len(one.readings) for one in campaigns) > 400
+    assert sum(len(one.readings) for one in campaigns) > 200
 
 

@@ -82,11 +82,6 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, scan):
     assert shown.mask[5, 0] and shown.mask.sum() == 1, "what did not come back stays blank"
 
 
-def test_range_image_numbers_lines_when_the_head_stands_still(ax, scan):
-    recording.range_image(ax, replace(scan.sweep, pitch=np.zeros(6)))
-    assert labels(ax)[1] == "scan line"
-
-
 def test_range_images_that_share_colours_are_cut_to_the_board(ax, scan):
     drawn = recording.range_image(ax, scan.sweep, scan.mask, (0.0, 2.5))
     assert drawn.get_clim() == (0.0, 2.5) and len(ax.figure.axes) == 1, "the colour bar is the caller's"
@@ -143,20 +138,6 @@ def test_board_view_is_cut_to_the_board_and_names_what_is_missing(ax):
     recording.board_view(ax, np.zeros((480, 640, 3), np.uint8), view, MODEL, margin=20)
     assert lines_of(ax, "right") and ax.get_title() == "right, placement 3; not used: top"
     assert ax.get_xlim()[1] == pytest.approx(320.0) and falls(ax.get_ylim())
-
-
-def test_board_view_without_anything_shows_the_whole_image(ax):
-    recording.board_view(ax, np.zeros((48, 64), np.uint8), a_view(), MODEL)
-    assert ax.get_xlim() == (-0.5, 63.5) and ax.get_ylim() == (47.5, -0.5)
-
-
-def test_points_of_two_methods_stay_apart(ax):
-    uv = {"line": np.array([[100.0, 90.0], [np.nan, np.nan]]), "zhang_pless": np.array([[404.0, 395.0]])}
-    view = a_view(image_edge((200.0, 180.0), (201.0, 220.0)))
-    recording.seen_points(ax, view, np.zeros((480, 640, 3), np.uint8), MODEL, uv, 30)
-    assert legend(ax) == ["edge in the image", "line", "zhang_pless"]
-    assert [line.get_marker() for line in ax.lines[1:]] == ["o", "x"]
-    assert ax.get_xlim() == (70.0, 434.0) and ax.get_title() == "right, placement 3"
 
 
 def test_pictures_are_shown_in_their_colours(ax):
@@ -241,13 +222,6 @@ def test_feature_surfaces_lie_where_the_feature_puts_them():
     np.testing.assert_allclose(np.r_[face, parallel], np.repeat([0.0, 0.4], 5), atol=1e-12)
 
 
-@IN_SPACE
-def test_space_is_to_scale(ax):
-    rig.rays(ax, np.zeros(3), np.eye(3))
-    rig.space(ax, [[0, 0, 0], [1.0, 2.0, 4.0]])
-    assert ax._box_aspect[2] / ax._box_aspect[0] == pytest.approx(4.0) and ax.get_zlim() == (0.0, 4.0)
-
-
 IDENTITY = RigidTransform.identity()
 
 
@@ -267,12 +241,6 @@ def test_measured_edges_lie_on_the_rendered_corners(ax):
     picture = rig.render(cloud, np.zeros((2, 3)), IDENTITY, (100, 120), 150, splat=0)
     drawn = np.rint(ax.lines[0].get_xydata()).astype(int)
     assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == ["BC 499.0 mm\ntrue 500.0 mm"]
-
-
-@IN_SPACE
-def test_lines_in_space_are_named(ax):
-    rig.lines(ax, {"tilt axis": ("red", np.array([[0.0, 0, 0], [1, 0, 0]]))})
-    assert [line.get_label() for line in ax.lines] == ["tilt axis"]
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
@@ -300,12 +268,6 @@ def test_look_at_refuses_an_impossible_view(eye):
         rig.look_at(eye, [0, 0, 1])
 
 
-def test_every_sensor_has_one_colour_of_its_own():
-    assert len(set(recording.COLORS.values())) == len(recording.COLORS)
-    assert recording.color_of("left") == recording.COLORS["left"]
-    assert recording.color_of("cam0", 9) == recording.SERIES[1]
-
-
 SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2.0]), np.array([
     [[1.0, 2, 3], [4, 5, 6]], [[np.inf, np.inf, np.inf], [2, 2, 2]]]), {"axis": np.full((2, 2, 3), 1e-3),
     "range noise": np.zeros((2, 2, 3))})  # fmt: skip
@@ -315,6 +277,8 @@ SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2
     ("index", "title", "drawn"),
     [(0, "left at 1 m: 3.9 px rms", [1, 2, 3, 4, 5, 6]), (1, "left at 2 m: no bound", [2, 2, 2])],
 )
+
+
 def test_map_of_projection_sigma(ax, index, title, drawn):
     results.projection_map(ax, SIGMA, index, "left")
     assert labels(ax) == ("u [px]", "v [px]") and ax.get_aspect() == 1 and ax.get_title() == title
@@ -327,13 +291,6 @@ def test_map_of_points_in_degrees_and_millimetres(ax):
     results.point_map(ax, replace(SIGMA, columns=np.radians([80.0, 90, 100]), rows=np.radians([-5.0, 5])))
     assert labels(ax) == ("bearing [deg]", "pitch [deg]") and ax.get_title() == "cloud at 1 m: 3.9e+03 mm rms"
     assert falls(ax.get_xlim())  # bearings grow to the left, as one sees them
-
-
-def test_parts_of_a_point_by_distance(ax):
-    results.point_parts(ax, replace(SIGMA, sigma=SIGMA.sigma[:, 1:]))
-    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
-    assert set(drawn) == {"axis", "calibration"} and np.allclose(drawn["axis"], 1.0)
-    assert labels(ax) == ("distance [m]", "standard deviation [mm]")
 
 
 def test_observability_bars_name_what_is_lost(ax):
@@ -362,11 +319,6 @@ def test_residuals_by_region_are_arrows(ax):
     arrows = ax.collections[0]
     assert np.allclose([arrows.U, arrows.V], [[3.0], [4.0]]) and arrows.scale == pytest.approx(5 / 80)
     assert ax.get_title() == "left: 5 px rms, predicted - seen" and ax.get_ylim() == (480, 0)
-
-
-def test_residuals_of_a_camera_without_boards(ax):
-    results.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
-    assert ax.get_title() == "right: no board in any image"
 
 
 FAULTS = {

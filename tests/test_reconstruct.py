@@ -88,12 +88,6 @@ def test_compiled_loops_do_what_plain_numpy_does(model):
     assert (source[seen] == 0).all() and (source[~seen] == -1).all() and 500 < seen.sum() < 15_000
 
 
-def test_a_near_wall_hides_a_far_one():
-    near, far = grid(1.0), grid(2.0, 0.3)
-    _, seen, _ = paint(np.vstack([near, far]), view(plain_image()))
-    assert seen[: len(near)].all() and not seen[len(near) :].any()
-
-
 def test_a_slanted_floor_does_not_hide_itself():
     x, z = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(0.8, 6, 400))
     floor = np.column_stack([x.ravel(), np.full(x.size, 0.3), z.ravel()])
@@ -101,20 +95,6 @@ def test_a_slanted_floor_does_not_hide_itself():
     painter.hide(floor)
     inside = project(floor, MODEL)[:, 1] < 47
     assert painter.paint(floor, np.tile([0.0, -1, 0], (len(floor), 1)))[1][inside].mean() > 0.99
-
-
-def test_colours_are_interpolated_and_turned_to_rgb():
-    u, v = np.meshgrid(np.arange(64), np.arange(48))
-    points = np.array([[0.01, 0.02, 1.0]])
-    colors, _, _ = paint(points, view(np.stack([u, 2 * v, np.full_like(u, 9)], -1)))
-    at = project(points, MODEL)[0]
-    np.testing.assert_allclose(colors[0], [9, 2 * at[1], at[0]], atol=0.01)
-
-
-@pytest.mark.parametrize("point", [[5.0, 0, 1], [0, 0, -1], [np.nan, 0, 1]])
-def test_points_outside_behind_or_unknown_are_not_coloured(point):
-    colors, seen, source = paint(np.array([point]), view(plain_image()))
-    assert not seen.any() and np.isnan(colors).all() and (source == -1).all()
 
 
 def test_nothing_is_coloured_beyond_the_fold_of_a_lens():

@@ -83,9 +83,7 @@ def test_a_port_where_another_device_is_and_a_camera_without_exposure_control(tm
 
 
 PHASES = {
-    "modules are imported": lambda program: True,
     "the head is looked for": lambda program: len(program.rig.pan_tilt.frames) > program.frames,
-    "the laser range finder is set": lambda program: len(program.rig.lrf.requests) > program.requests,
     "a session is begun": lambda program: (program.session / "session.json").exists(),
     "the head moves from stop to stop": Program.moves,
 }

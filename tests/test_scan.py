@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
-from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter, segments
-from lrfcal_lib.preprocess.edges_in_scan import crossings, straight_runs
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter
+from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
@@ -124,11 +124,6 @@ def test_the_board_and_nothing_else_is_found(wall):
     assert b.sigma_range == pytest.approx(0.004, rel=0.05)
 
 
-def test_nothing_need_be_known_about_board_or_platform():
-    s = scene(sigma=0.004)
-    assert np.mean(find_board(s.sweep).mask != s.on) < 1e-3
-
-
 def test_the_nearest_of_two_boards_is_taken_and_no_small_thing_before_it():
     near, far, apart = scene(), scene(pose=facing(2.6), wall=None), scene(pose=facing(1.2, x=-0.5), wall=None)
     small = near.sweep.ranges.copy()
@@ -237,13 +232,6 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
 # ---------------------------------------------------------------------------------------------- filter and fit
 
 
-def test_pieces_end_at_jumps_gaps_and_lines():
-    ranges = np.array([[1.0, 1.01, 2.0, 2.0, np.nan, 2.0], [2.0, np.nan, np.nan, 2.0, 2.5, 2.5]])
-    assert segments(ranges, jump=0.1).tolist() == [[0, 0, 1, 1, -1, 2], [3, -1, -1, 4, 5, 5]]
-    assert segments(ranges, jump=0.1, bridge=1).tolist() == [[0, 0, 1, 1, -1, 1], [2, -1, -1, 3, 4, 4]]
-    assert (segments(np.full((2, 3), np.nan)) == -1).all()
-
-
 def test_median_filter_is_the_median_of_what_exists():
     rng = np.random.default_rng(0)
     ranges = rng.random((7, 30))
@@ -270,14 +258,6 @@ def test_lines_are_fitted_exactly_and_outliers_do_not_count():
     np.testing.assert_allclose(fit_lines(ranges, bearings)[0], truth, atol=1e-6)
     ranges[1, 3:] = np.nan
     assert np.isnan(fit_lines(ranges, bearings)[0][1]).all()
-
-
-def test_the_covariance_of_a_fitted_line_is_what_it_scatters():
-    bearings, rng = np.radians(np.arange(80, 101, 1.0)), np.random.default_rng(0)
-    exact = 1 / (np.array([0.1, 0.5]) @ np.stack([np.cos(bearings), np.sin(bearings)]))
-    lines, information = fit_lines(exact + 0.01 * rng.standard_normal((4000, len(bearings))), bearings)
-    predicted = np.median(np.linalg.inv(information), axis=0) * 0.01**2
-    np.testing.assert_allclose(np.cov(lines.T), predicted, rtol=0.2, atol=0.02 * predicted.max())
 
 
 def test_mixed_pixels_are_counted_and_the_median_filter_removes_them():
@@ -438,33 +418,6 @@ def test_the_direction_of_the_sweep_does_not_matter_and_the_same_sweep_gives_the
         np.testing.assert_array_equal(points[0][k], points[1][k])
     np.testing.assert_allclose(points[0][0], points[2][0], atol=1e-4)
     assert np.mean(points[0][1] == points[2][1]) > 0.99 and points[0][2] == points[2][2]
-
-
-def test_a_wider_view_without_returns_changes_nothing():
-    s = scene(wall=None, sigma=0.004)
-    more = np.radians(np.arange(40, 140.1, 0.25))
-    ranges = np.full((len(s.sweep.pitch), len(more)), np.nan)
-    ranges[:, 60 : 60 + len(s.sweep.bearings)] = s.sweep.ranges
-    a, b = (edge_points(found(x)) for x in (s, replace(s, sweep=replace(s.sweep, ranges=ranges, bearings=more))))
-    np.testing.assert_allclose(a.points, b.points, atol=1e-9)
-    np.testing.assert_array_equal(a.side, b.side)
-
-
-@pytest.mark.parametrize("turn", np.radians([0, 33, 90, 200]))
-def test_straight_runs_do_not_depend_on_where_the_trace_lies(turn):
-    rng, t = np.random.default_rng(0), np.linspace(0, 1, 60)
-    trace = np.concatenate([np.column_stack([t, 0 * t]), np.column_stack([1 + 0.7 * t, 0.7 * t])])
-    trace += 0.002 * rng.standard_normal(trace.shape)
-    trace[[20, 80]] += [0.1, -0.1]
-    c, s = np.cos(turn), np.sin(turn)
-    runs = straight_runs(trace @ np.array([[c, s], [-s, c]]) + [3, -2], np.arange(120), 0.01, 0.1)
-    assert sorted(len(r) for r in runs) == pytest.approx([59, 60], abs=2)
-    assert not {20, 80} & set(np.concatenate(runs))
-
-
-@pytest.mark.parametrize("points", [np.tile(np.linspace(0, 0.05, 40), (2, 1)).T, np.zeros((3, 2)), np.zeros((0, 2))])
-def test_too_short_or_too_few_is_no_side(points):
-    assert straight_runs(points, np.arange(len(points)), 0.01, 0.1) == []
 
 
 def test_face_points_lie_on_the_face_and_away_from_the_edges():

@@ -1,6 +1,5 @@
 """A camera on the base stood still or did not: synthetic backgrounds that are turned, scaled, dimmed and covered."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -9,12 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.evaluate import diagnosis
 from lrfcal_lib.evaluate.diagnosis import motion_words, pitch_words
-from lrfcal_lib.model.camera import CameraModel, distort, project
+from lrfcal_lib.model.camera import CameraModel, distort
 from lrfcal_lib.plots.results import background_motion
 from lrfcal_lib.preprocess import steadiness
-from lrfcal_lib.preprocess.bend import BoardBends
 from lrfcal_lib.preprocess.steadiness import Steadiness, Step, find_steps, fit_motion, motion_misses, pixel_root
 from lrfcal_lib.session.read import open_session
 
@@ -204,15 +201,6 @@ def test_without_images_there_is_nothing_to_compare():
     assert "0 images" in judge([]).reason
 
 
-def test_the_hull_of_a_board_holds_its_pattern_and_edges():
-    corners = np.array([[-0.3, -0.2, 2.0], [0.3, -0.2, 2.0], [0.3, 0.2, 2.0], [-0.3, 0.2, 2.0]])
-    ends = project(corners, replace(MODEL, distortion=np.zeros(5)))
-    view = SimpleNamespace(pixels=None, edges=[SimpleNamespace(ends=ends[[0, 1]]), SimpleNamespace(ends=ends[[2, 3]])])
-    hull = steadiness.board_hull(view, MODEL).astype(np.float32)
-    assert all(cv2.pointPolygonTest(hull, p.astype(np.float32), False) > 0 for p in project(corners, MODEL))
-    assert steadiness.board_hull(SimpleNamespace(pixels=None, edges=[]), MODEL) is None
-
-
 def test_cameras_that_turn_alike_are_one_rig():
     turn = np.array([0.001, 0.0006, 0.0])
     judged = {c: Steadiness(c, np.arange(1, 21), 1, steps=(a_step(turn),)) for c in ("left", "right")}
@@ -233,13 +221,6 @@ def test_pitch_is_put_in_words():
     errors.direction_sigma = np.radians(0.1)
     assert len(pitch_words(errors)) == 2, "two and a half sigma are none"
     assert pitch_words(None) == [] and pitch_words(SimpleNamespace(wanted="none")) == []
-
-
-def test_problems_name_their_placement_and_a_faultless_recording_has_no_findings():
-    problems = {6: "camera left: its plane is 90 mm off the scan", "6 2": "placement 6: crooked"}
-    named = ["placement 6: camera left: its plane is 90 mm off the scan", "placement 6: crooked"]
-    assert diagnosis.problem_words(problems) == named
-    assert diagnosis.findings_in_words(diagnosis.Diagnosis({}, BoardBends({}), None, {})) == []
 
 
 def test_the_figure_marks_the_step():

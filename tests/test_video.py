@@ -225,14 +225,6 @@ def test_images_in_the_order_of_their_names(tmp_path, pattern):
         assert camera.lost
 
 
-def test_one_grey_image(tmp_path):
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((10, 20), 7, np.uint8))
-    with Camera(tmp_path / "grey.png", name="right") as camera:
-        assert np.array_equal(camera.newest().image, np.full((10, 20, 3), 7))
-    with pytest.raises(DeviceError, match="right is closed"):
-        camera.newest()
-
-
 def test_video_file(tmp_path):
     path = tmp_path / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
@@ -251,6 +243,8 @@ def test_video_file(tmp_path):
     ("none.avi", "there is no video"), ("text.avi", "is no video"), ("none.png", "there are no images in"),
     ("empty", "there are no images in"), ("x*.png", "there are no images in"), ("bad.png", "bad.png is no image"),
 ])  # fmt: skip
+
+
 def test_bad_files(tmp_path, name, what):
     (tmp_path / "text.avi").write_text("no video")
     (tmp_path / "bad.png").write_text("no image")
@@ -311,14 +305,6 @@ def test_what_a_device_does_as_told(device):
         assert camera.newest(timeout=WAIT_S).image.shape == (240, 320, 3)
 
 
-def test_device_left_as_it_is(device):
-    with Camera("/dev/video3", name="left") as camera:
-        assert camera.settings["exposure"] == {"asked": None, "got": pytest.approx(0.0157)}
-        assert camera.settings["warnings"] == []
-        device.grey = True
-        assert camera.newest(after=time.time() + 0.05, timeout=WAIT_S).image.shape == (480, 640, 3)
-
-
 def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
     device.fixed = {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH}
     with Camera("0", name="left", size=(1024, 480), exposure=0.005) as camera:
@@ -348,6 +334,8 @@ def test_device_lost_and_found(device):
     (0, {"allowed": False}, "no permission for /dev/video0: run 'sudo usermod -aG video"),
     (0, {"there": False}, "there is no camera /dev/video0: check its plug; present are"),
 ])  # fmt: skip
+
+
 def test_devices_that_cannot_be_opened(device, source, habit, what):
     for name, value in habit.items():
         setattr(device, name, value)

@@ -256,8 +256,7 @@ def exp_rotation(w):
 
 def log_rotation(R):
     """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be exact."""
-    x, y = 0.5 * (R[..., 2, 1] - R[..., 1, 2]), 0.5 * (R[..., 0, 2] - R[..., 2, 0])
-    z = 0.5 * (R[..., 1, 0] - R[..., 0, 1])
+    x, y, z = (0.5 * (R[..., i, k] - R[..., k, i]) for i, k in ((2, 1), (0, 2), (1, 0)))
     sine, cosine = np.sqrt(x * x + y * y + z * z), 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1)
     turned = np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12), 1.0)
     w, half = np.stack([x, y, z], axis=-1) * turned[..., None], cosine < -0.9  # near half a turn the sine says little
