@@ -271,7 +271,11 @@ def nearest_edges(board, sides):
     cost = np.array([np.median(d, axis=0) for d in distances]).reshape(-1, len(lines))
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number, edge, off = numbers[row], board.edges[column], 1000 * cost[row, column]
-        turned, allowed = _angle_to_line(sides[number], lines[column])
+        turned, allowed, points = 0.0, NAME_ANGLE, sides[number]
+        if len(points) > 2:  # what noise may turn the line through them is allowed
+            _, direction, rms = fit_line(points)
+            turned = np.arcsin(min(abs(direction[:2] @ lines[column, :2]) / np.linalg.norm(direction[:2]), 1.0))
+            allowed = np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction))
         if off > 1000 * NAME_DISTANCE:
             problems[number] = f"a side of the scan is {off:.0f} mm from the edge '{edge}': not used"
         elif turned > allowed:
@@ -280,16 +284,6 @@ def nearest_edges(board, sides):
         else:
             names[number] = edge
     return names, problems
-
-
-def _angle_to_line(points, line):
-    """Angle between the line through board-frame points and a board line, and how large noise lets it be, radians."""
-    if len(points) < 3:
-        return 0.0, NAME_ANGLE
-    _, direction, rms = fit_line(points)
-    angle = float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
-    length = np.ptp(points @ direction)
-    return angle, float(np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / length))
 
 
 def observe_joint(prepared, views=None):

@@ -350,16 +350,12 @@ def edges_in_cloud(solution, prepared, placement):
         if view is None or camera not in solution.transforms:
             continue
         T_platform_camera = solution.camera_at(camera, solution.correct(placement, np.zeros(3), view.pitch)[1]).inv()
-        for edge in view.edges:
-            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, pose[:3, 3], pose[:3, 2])
+        lens, o = prepared.models[camera], T_platform_camera.translation
+        for edge in view.edges:  # where lines of sight of a few of its points meet the plane
+            ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]
+            uv = ends[0] + ALONG[:, None] * (ends[1] - ends[0])
+            rays = np.column_stack([(uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy], np.ones(len(uv))])
+            d = T_platform_camera.rotation.apply(rays)
+            points = o + ((pose[:3, 3] - o) @ pose[:3, 2] / (d @ pose[:3, 2]))[:, None] * d
             sides.setdefault(edge.name, []).append(points)
     return face, {name: np.concatenate(points) for name, points in sides.items()}
-
-
-def edge_on_plane(edge, model, T_platform_camera, centre, normal):
-    """Points (k, 3) of an image edge where its lines of sight meet a plane, platform frame."""
-    ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]
-    uv = ends[0] + ALONG[:, None] * (ends[1] - ends[0])
-    rays = np.column_stack([(uv - [model.cx, model.cy]) / [model.fx, model.fy], np.ones(len(uv))])
-    d, o = T_platform_camera.rotation.apply(rays), T_platform_camera.translation
-    return o + ((centre - o) @ normal / (d @ normal))[:, None] * d

@@ -345,21 +345,15 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
         place = order[mine] - np.searchsorted(left_out, order[mine])
         for run in straight_runs(flat[mine], place, max(float(spacing), EDGE_SCATTER), shortest):
             rows = mine[run]
-            new = _describe(scan, flat[rows], axes, e, float(np.mean(pitch[rows])))
-            number = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
-            side[rows] = number
-            sides.append(replace(new, side=number))
+            centre, direction, along, across = line_of(flat[rows])
+            ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
+            level = np.cross(_to_platform(scan, np.array([0.0, 0.0, 1.0]), np.mean(pitch[rows])), scan.normal)
+            cosine = min(abs(level @ (direction @ axes)) / np.linalg.norm(level), 1.0)
+            rms = float(np.sqrt(np.mean(across**2) * len(rows) / max(len(rows) - 2, 1)))
+            new = ScanSide(-1, e, len(rows), float(np.ptp(along)), rms, float(np.arccos(cosine)), ends)
+            side[rows] = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
+            sides.append(replace(new, side=int(side[rows[0]])))
     return side, tuple(sides)
-
-
-def _describe(scan, flat, axes, end, pitch):
-    """A ScanSide (number still open) from its points in the plane."""
-    centre, direction, along, across = line_of(flat)
-    ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
-    level = np.cross(_to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch), scan.normal)
-    cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
-    rms = float(np.sqrt(np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)))
-    return ScanSide(-1, end, len(flat), float(np.ptp(along)), rms, float(np.arccos(min(cosine, 1.0))), ends)
 
 
 def edge_cells(scan, along, swept, lrf):
