@@ -240,11 +240,11 @@ def board_plan(ax, board):
 
 def outline(ax, measured, exaggerate=20):
     """The measured Outline of the board with the spread of each edge over the images, `exaggerate` times larger."""
-    corners, normals = measured.board.known_corners(), measured.board.lines()[:, :2]
+    corners = measured.board.known_corners()
     closed = np.vstack([corners, corners[:1]])
     ax.plot(*closed.T, "-", color=COLORS["truth"])
     for index, (name, length) in enumerate(measured.board.lengths().items()):
-        ends, normal = closed[index : index + 2], normals[index]
+        ends, normal = closed[index : index + 2], measured.lines[index, :2]
         if np.isfinite(measured.line_sd[index]):
             away = exaggerate * measured.line_sd[index] * normal
             band = np.vstack([ends - away, ends[::-1] + away])

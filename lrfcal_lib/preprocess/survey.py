@@ -52,6 +52,8 @@ class Outline:
     ----------
     board : Board
         With its corners filled in.
+    lines : ndarray, shape (E, 3)
+        Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
     length_sd : dict of str to float
@@ -61,6 +63,7 @@ class Outline:
     """
 
     board: Board
+    lines: np.ndarray
     line_sd: np.ndarray
     length_sd: dict
     n_lengths: dict
@@ -130,7 +133,7 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         views = [v if v.reason else look(r, v, models, lines=lines, relief=relief) for r, v in images]
         if not known:
             outline = measure_outline(views, board, models)
-            lines = outline.board.lines()
+            lines = outline.lines
     board = board if outline is None else outline.board
     return Survey(_by_camera(models, views), models, outline, board, relief, unseen)
 
@@ -397,7 +400,7 @@ def measure_outline(views, board, models):
         corners = [corners_of_lines([own[name] for name in trio]) for own in seen if own.keys() >= {*trio}]
         lengths[trio[1]] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
     spread, count = ({n: f(x) for n, x in lengths.items()} for f in (_spread, len))
-    return Outline(replace(board, corners=corners_of_lines(fitted)), line_sd, spread, count)
+    return Outline(replace(board, corners=corners_of_lines(fitted)), fitted, line_sd, spread, count)
 
 
 def _spread(values):
