@@ -237,12 +237,15 @@ def pose_from_edges(edges, board, model, start, covariance=None):
 
 
 def line_residuals(edges, board, model, pose):
-    """Whitened distances (E, 2) of every edge's two corners from its image line, derivatives by [w, v] (E, 2, 6)."""
+    """Those of :func:`line_misses` for every edge's two corners."""
+    i, flat = np.array([board.edges.index(e.name) for e in edges]), board.points()
+    return line_misses(edges, flat[np.stack([i, (i + 1) % len(flat)], axis=1)], model, pose)
+
+
+def line_misses(edges, points, model, pose):
+    """Whitened distances (E, n) of board points (E, n, 3) from image lines, derivatives by [w, v] (E, n, 6)."""
     line, centre, covariance = (np.stack([getattr(e, k) for e in edges]) for k in ("line", "centre", "covariance"))
-    i = np.array([board.edges.index(e.name) for e in edges])
-    flat = board.points()
-    ends = flat[np.stack([i, (i + 1) % len(flat)], axis=1)]
-    turned = rotate_points(pose, ends)
+    turned = rotate_points(pose, points)
     p_camera = turned + pose[:, 3]
     uv = pinhole(p_camera, model)
     lever = np.einsum("enk,ek->en", uv - centre[:, None], np.stack([line[:, 1], -line[:, 0]], axis=1))
