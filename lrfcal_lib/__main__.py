@@ -29,8 +29,10 @@ def run(args):
                 print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
         case "calibrate":
             from lrfcal_lib.evaluate.export import calibrate_session
+            from lrfcal_lib.session.cache import all_processors
 
-            return calibrate_session(args.session)
+            with all_processors():
+                return calibrate_session(args.session)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import SETUPS

@@ -205,6 +205,7 @@ def test_what_is_known_of_a_board_is_differentiated_exactly(joint):
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
     problems = {placement: "a dog ran through" for placement in quick.prepared.scans}
-    again = pipeline.with_joint(replace(quick, prepared=replace(quick.prepared, problems=problems), joint=None))
+    lost = pipeline.joint_or_words(replace(quick.prepared, problems=problems))
+    again = pipeline.with_joint(replace(quick, joint=None), lost)
     assert again.joint is None and "no placement" in again.problems["rig", "joint"]
     assert again.solutions is quick.solutions

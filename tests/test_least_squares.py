@@ -148,7 +148,7 @@ def test_placement_covariance_is_the_jackknife():
 @pytest.mark.parametrize("groups", [np.zeros(40, int), np.arange(40) // 20])
 def test_no_placement_covariance_from_too_few_placements(data, groups):
     found = fit(line_problem(*data), np.zeros(2), groups=groups)
-    assert found.covariance_placements is None and found.sigma_placements is None
+    assert found.covariance_placements is None and np.isnan(found.sigma_placements).all()
 
 
 NOISE = np.array([[4.0, 1.8], [1.8, 1.0]])
@@ -156,19 +156,36 @@ NOISE = np.array([[4.0, 1.8], [1.8, 1.0]])
 
 @pytest.mark.parametrize(("noise", "scatter", "sigma"), [
     (NOISE, None, [2, 1]),
-    (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # larger one by one: neither matrix as a whole
+    (NOISE, np.diag([1.0, 9.0]), [2, 3]),  # one by one: neither matrix as a whole
     (NOISE, np.diag([16.0, 0.25]), [4, 1]),
     (np.diag([np.inf, 1.0]), np.diag([1.0, 9.0]), [np.inf, 3]),
     (np.diag([0.0, 1.0]), np.diag([0.0, np.nan]), [0, 1]),
 ])  # fmt: skip
-
-
-def test_the_larger_of_noise_and_scatter_is_trusted(data, noise, scatter, sigma):
-    found = replace(fit(line_problem(*data), np.zeros(2)), covariance=noise, covariance_placements=scatter)
-    np.testing.assert_allclose(found.trusted_sigma, sigma)
+def test_scatter_over_many_placements_is_trusted_where_noise_is_smaller(data, noise, scatter, sigma):
+    found = fit(line_problem(*data), np.zeros(2))
+    found = replace(found, covariance=noise, covariance_placements=scatter, n_placements=10**6)
+    np.testing.assert_allclose(found.trusted_sigma, sigma, rtol=1e-5)
     if np.isfinite(noise).all() and noise[0, 0]:  # correlations are those of the noise
         correlation = found.trusted / np.outer(found.trusted_sigma, found.trusted_sigma)
         np.testing.assert_allclose(correlation[0, 1], NOISE[0, 1] / 2)
+
+
+@pytest.mark.parametrize("placements", [4, 12, 40])
+@pytest.mark.parametrize("true", [1.0, 4.0, 25.0])
+def test_chance_grows_no_sigma(data, placements, true):
+    """Scatter drawn about a true ratio of variances: far ones come through, and chance adds little to none."""
+    free = placements - 1
+    scatter = true * np.random.default_rng(3).chisquare(free, 20000) / free
+    found = replace(
+        fit(line_problem(*data), np.zeros(2)), covariance=np.ones((20000, 1, 1)),
+        covariance_placements=scatter[:, None, None], n_placements=placements,
+    )  # fmt: skip
+    square, larger = found.trusted[:, 0, 0], np.maximum(scatter, 1.0)
+    assert (square >= 1).all() and (square <= larger + 1e-9).all()
+    if true == 1:  # less than half of what the larger one adds
+        assert 1 < square.mean() < 1 + (larger.mean() - 1) / 2
+    elif placements > 4:
+        assert np.exp(np.log(square).mean()) == pytest.approx(true, rel=0.25 if true < 10 else 0.15)
 
 
 def test_null_space_names_the_lost_direction():

@@ -30,7 +30,7 @@ def apart(one, other):
 
 def estimate(T_head_lrf, covariance, scatter=None):
     inner = dict.fromkeys(field.name for field in fields(Solution))
-    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance}
+    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance, "n_placements": 20}
     return SimpleNamespace(T_head_lrf=T_head_lrf, solution=Solution(**inner | {"covariance_placements": scatter}))
 
 

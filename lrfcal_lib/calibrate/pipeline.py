@@ -18,7 +18,8 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
-from lrfcal_lib.session.cache import cached
+from lrfcal_lib.preprocess.survey import all_views
+from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
@@ -158,10 +159,16 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     Calibration
     """
     prepared = prepare(session)
+    together = [partial(joint_or_words, prepared, all_views(prepared))] if joint and prepared.views else []
+    *together, found = spread(lambda stage: stage(), [*together, partial(_by_themselves, prepared, methods)])
+    return with_joint(found, *together) if together else found
+
+
+def _by_themselves(prepared, methods):
+    """Calibrate the platform, then every camera."""
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
     observations = observe_all(prepared, platform.transform("combined"))
-    found = Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
-    return with_joint(found) if joint and prepared.views else found
+    return Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
 
 
 @cached
@@ -316,29 +323,36 @@ def joint_settings(prepared, observations):
 
 
 @cached
-def calibrate_jointly(prepared):
-    """Estimate everything about a session's rig at once.
+def calibrate_jointly(prepared, views=None):
+    """Estimate everything about a session's rig at once, from all its images or from `views` (see `observe_joint`).
 
     What the session does not determine is in `unobservable` and `warnings` of the solution, in words. Raises
     DegenerateGeometry when there is no start value, or most placements contradict each other.
     """
-    observations = observe_joint(prepared)
+    observations = observe_joint(prepared, views)
     settings = joint_settings(prepared, observations)
     return JointCalibration(prepared, solve_joint(observations, required=False, **settings), settings, {})
 
 
-def with_joint(calibration):
+def joint_or_words(prepared, views=None):
+    """The joint estimate, or in words why there is none."""
+    try:
+        return calibrate_jointly(prepared, views)
+    except DegenerateGeometry as error:
+        return str(error)
+
+
+def with_joint(calibration, joint):
     """Add the joint estimate to a calibration: its axis, its cameras, and observations made with them.
 
-    Where the session does not determine the whole rig, only a problem is added.
+    Where the session does not determine the whole rig (`joint` says why), only a problem is added.
     """
     platform = calibration.platform
-    try:
-        joint = calibrate_jointly(calibration.prepared)
-    except DegenerateGeometry as error:
-        return replace(calibration, problems=calibration.problems | {("rig", "joint"): str(error)})
+    if isinstance(joint, str):
+        return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
     cameras = joint.observations.cameras
-    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
+    made = {}
+    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance

@@ -16,6 +16,7 @@ from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
 
@@ -114,18 +115,21 @@ def write_clouds(folder, calibration, method):
 
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
     """
-    session, folder, files = calibration.prepared.session, Path(folder), []
-    for name, scene in (("cloud", False), ("scene", True)):
-        if session.scene_placements if scene else calibration.prepared.scans:
-            blocks = cloud_blocks(calibration, method, scene)
-            if method == "joint":
-                blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
-            files.append(folder / f"{name}.ply")
-            write_ply(files[-1], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
-    if session.scene_placements:
-        files.append(folder / "scene.pcd")
-        write_pcd(files[-1], files[-2])
-    return files
+    session, folder = calibration.prepared.session, Path(folder)
+
+    def write(scene):
+        """The files of a cloud."""
+        blocks, files = cloud_blocks(calibration, method, scene), [folder / f"{'scene' if scene else 'cloud'}.ply"]
+        if method == "joint":
+            blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
+        write_ply(files[0], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
+        if scene:
+            files.append(folder / "scene.pcd")
+            write_pcd(files[1], files[0])
+        return files
+
+    clouds = [True] * bool(session.scene_placements) + [False] * bool(calibration.prepared.scans)
+    return sum(spread(write, clouds)[::-1], [])
 
 
 def write_pcd(path, ply):
