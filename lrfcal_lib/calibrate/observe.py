@@ -193,29 +193,25 @@ def platform_observations(prepared, variant="half_step"):
     Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that one.
     """
     edges, faces = [], []
+
+    def cosine(pair):
+        u, v = (s.ends[1] - s.ends[0] for _, s in pair)
+        return u @ v / (np.linalg.norm(u) * np.linalg.norm(v))
+
     for placement, swept in prepared.swept[variant].items():
-        for number, (found, side) in enumerate(_perpendicular(prepared.edges[variant][placement], swept), 1):
-            rows = thin(np.flatnonzero(found.side == side), PLATFORM_POINTS)
+        along = prepared.edges[variant][placement]
+        known = {s.side for s in along.sides}
+        sides = [(along, s) for s in along.sides] + [(swept, s) for s in swept.sides if s.side not in known]
+        pairs = [pair for pair in combinations(sides, 2) if abs(cosine(pair)) < RIGHT_ANGLE]
+        best = max(pairs or zip(sides, strict=True), key=lambda some: np.prod([s.length for _, s in some]), default=())
+        for number, (found, side) in enumerate(best, 1):
+            rows = thin(np.flatnonzero(found.side == side.side), PLATFORM_POINTS)
             points = {key: getattr(found, key)[rows] for key in ("points", "covariance", "pitch")}
             edges.append(points | {"placement": np.full(len(rows), placement), "number": np.full(len(rows), number)})
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
     return PlatformObservations(**stack("edge_", edges), **stack("face_", faces))
-
-
-def _perpendicular(along, swept):
-    """The longest pair of perpendicular sides of a sweep, or the longest side: (edges, side number) each."""
-    known = {s.side for s in along.sides}
-    sides = [(along, s) for s in along.sides] + [(swept, s) for s in swept.sides if s.side not in known]
-
-    def cosine(pair):
-        u, v = (s.ends[1] - s.ends[0] for _, s in pair)
-        return u @ v / (np.linalg.norm(u) * np.linalg.norm(v))
-
-    pairs = [pair for pair in combinations(sides, 2) if abs(cosine(pair)) < RIGHT_ANGLE]
-    best = max(pairs or zip(sides, strict=True), key=lambda some: np.prod([s.length for _, s in some]), default=())
-    return [(edges, s.side) for edges, s in best]
 
 
 def name_sides(prepared):
