@@ -1,10 +1,7 @@
 """Stages are worked out once, and again as soon as anything that they depend on is different."""
 
 import os
-import pickle
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +13,6 @@ import numpy as np
 import pytest
 from shared import QUICK
 
-from lrfcal_lib.preprocess.prepared import prepare_scans
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 
@@ -143,12 +139,6 @@ def test_what_was_made_of_a_session_can_be_the_first_argument(folder, session):
     assert stage.calls == 2
 
 
-def test_a_kept_stage_is_the_stage_itself(folder, session):
-    fresh, (_, kept) = prepare_scans.__wrapped__(session), (prepare_scans(session), prepare_scans(session))
-    assert kept is not fresh and pickle.dumps(kept) == pickle.dumps(pickle.loads(pickle.dumps(fresh)))
-    assert prepare_scans.__doc__.startswith("The board in every sweep") and list(kept.scans) == list(fresh.scans)
-
-
 @pytest.fixture
 def two(monkeypatch):
     """Loops are shared by two processes, whatever this machine has and whoever asks."""
@@ -198,18 +188,3 @@ def test_a_process_with_threads_stays_alone():
             assert cache._processes == 1
     with cache.all_processors():
         assert cache._processes == (len(os.sched_getaffinity(0)) if threading.active_count() == 1 else 1)
-
-
-def test_two_processes_calibrate_to_the_byte(tmp_path):
-    """Poses and clouds that a command writes on one processor and on all of them."""
-    command = [sys.executable, "-m", "lrfcal_lib", "calibrate", str(QUICK)]
-    alone = "import os, runpy, sys; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); sys.argv = sys.argv[1:]; "
-    alone = [sys.executable, "-c", f"{alone}runpy.run_module('lrfcal_lib', run_name='__main__')", *command[2:]]
-    running = []
-    for name, how in (("one", alone), ("all", command)):
-        (tmp_path / name).mkdir()
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-        running.append(subprocess.Popen(how, cwd=tmp_path / name, env=environment, stdout=subprocess.DEVNULL))
-    assert [process.wait() for process in running] == [0, 0]
-    one, other = ({f.name: f.read_bytes() for f in (tmp_path / n).rglob("*") if f.is_file()} for n in ("one", "all"))
-    assert one == other and {"calibration.json", "cloud.ply"} <= one.keys()

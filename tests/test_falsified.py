@@ -37,11 +37,9 @@ def judged(change, seed, mount="head", stated=True):
     return reasons, state_errors(solution.state, truth, solution.unknowns)[:16] if whole else None, solution
 
 
-LIVE = (  # of every kind of cause one; the others in make campaign
-    "squares 5 % too small", "outline 3 % too large", "board and squares 5 % too large", "ranges 60 mm too long",
-    "angular step 3 % too small", "bearings mirrored", "pitch 3 % too small", "scans of two placements exchanged",
-    "noise of images stated a tenth", "pitch of scan lines 0.3 deg late", "spot stated 0.4 times too narrow",
-    "three placements",
+LIVE = (  # what test_alternatives does not falsify; the others in make campaign
+    "board and squares 5 % too large", "ranges 60 mm too long", "pitch 3 % too small", "noise of images stated a tenth",
+    "scans of two placements exchanged", "spot stated 0.4 times too narrow", "three placements",
 )  # fmt: skip
 
 

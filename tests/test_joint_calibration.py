@@ -66,12 +66,6 @@ def test_edges_sharper_than_beams_can_show_are_known_as_well_as_their_scores_say
     assert 0.5 < square < 1.6
 
 
-def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
-    for noise, sweep in (((0.005, 0.0), "offset"), ((0.005, 0.04), "offset_stretch")):
-        loose = replace(joint.prepared, pitch_noise=pipeline.PitchNoise(*noise))
-        assert pipeline.joint_settings(loose, joint.observations)["sweep"] == sweep
-
-
 def test_errors_agree_with_their_sigma(joint, truth):
     table = tables.joint_errors(joint, truth)
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()

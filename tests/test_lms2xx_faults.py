@@ -6,17 +6,17 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from faults import LMS
 from shared import campaign
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.port import DeviceError
-from lrfcal_lib.emulators.line import FAULTS
 from lrfcal_lib.session.lms2xx_codec import decode_scan
 
 DEVICES, BOOT_S = 4, 0.5
 RECOVERY_S, CALL_S = 3.0, 12.0  # longest: until all works again, and of any call
-KINDS = [name for name, fault in FAULTS.items() if "lrf" in fault.devices]
+KINDS = LMS
 LONG = {"unplug", "reboot", "rate", "deaf", "echo"}  # they last for a while, so there are fewer of them
 ON_REQUESTS = {"request_drop", "request_flip", "deaf", "echo", "nak", "no_ack", "refused", "reboot", "rate", "stuck",
                "slow_mode"}  # fmt: skip
@@ -29,7 +29,7 @@ class Campaign:
     def __init__(self, number):
         self.rng = np.random.default_rng([20091001, number])
         self.device = lms(baudrate=38400, boot_s=BOOT_S, seed=number, configuration=INDEXED)
-        self.host, self.faults = self.device.clock.machine, self.device.faults
+        self.host, self.faults = self.device.host, self.device.faults
         self.recoveries, self.calls, self.readings = [], [], []
 
     def run(self, streamed, requested):
@@ -58,7 +58,7 @@ class Campaign:
 
     def fresh(self):
         """A scan that was begun after this call."""
-        self.readings.append(self.lms.newest(after=self.host.time(), timeout=CALL_S))
+        self.readings += self.lms.take(1, after=self.host.time(), timeout=CALL_S)
 
     def request(self):
         self.readings.append(self.lms.request())
@@ -66,7 +66,7 @@ class Campaign:
     def stream_a_little(self):
         self.lms.start()
         try:
-            self.readings.append(self.lms.newest(timeout=RECOVERY_S))
+            self.readings += self.lms.take(1, timeout=RECOVERY_S)
         finally:
             self.lms.stop()
 

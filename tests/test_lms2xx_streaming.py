@@ -15,7 +15,7 @@ STREAM_S, SCAN_S, TURNS, BYTES = 30.0, 2 * 0.01332, 2, 732 + 2  # of the variant
 @pytest.mark.parametrize("rate", RATES)
 def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate):
     device = lms(baudrate=rate, configuration=INDEXED)
-    with LMS2xx(device.path, host=device.clock.machine) as driver:
+    with LMS2xx(device.path, host=device.host) as driver:
         before = driver.counts
         driver.start()
         readings = driver.take(1)

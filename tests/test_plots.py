@@ -82,12 +82,6 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, scan):
     assert shown.mask[5, 0] and shown.mask.sum() == 1, "what did not come back stays blank"
 
 
-def test_range_images_that_share_colours_are_cut_to_the_board(ax, scan):
-    drawn = recording.range_image(ax, scan.sweep, scan.mask, (0.0, 2.5))
-    assert drawn.get_clim() == (0.0, 2.5) and len(ax.figure.axes) == 1, "the colour bar is the caller's"
-    assert ax.get_xlim() == pytest.approx((105, 74)), "6 deg beside the board, which is seen from 80 to 99 deg"
-
-
 def test_scan_line_is_to_scale_with_the_board_in_the_colour_of_the_lrf(ax, scan):
     recording.scan_line(ax, scan.sweep, 2, scan.mask, scan.fitted)
     np.testing.assert_allclose(np.linalg.norm(lines_of(ax, "fit")[0].get_xydata(), axis=1), 2.001)
@@ -178,24 +172,6 @@ def test_residual_strips_show_every_residual_in_its_placement_and_the_rms(ax):
     np.testing.assert_array_equal(dots.get_ydata(), residuals)
     np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [4.0, 2.0, 1.0])
     assert texts(ax.get_xticklabels()) == ["3", "7", "12"] and sum(ax.get_ylim()) == pytest.approx(0.0)
-
-
-def test_pitch_offsets_are_in_degrees_and_apart_by_direction(ax):
-    results.pitch_offsets(ax, [1, 2, 3], np.radians([0.3, -0.2, 0.1]), np.radians([0.1, 0.1, 0.1]), [1, -1, 1])
-    heights = {round(bar.get_x() + bar.get_width() / 2): bar.get_height() for bar in ax.patches}
-    assert heights == pytest.approx({0: 0.3, 1: -0.2, 2: 0.1}) and legend(ax) == ["upwards", "downwards"]
-
-
-def test_parameter_comparison_draws_bars_only_where_a_sigma_is_known(ax):
-    results.parameter_comparison(ax, {"line": 1.0, "bauermann": 2.0}, {"line": 0.2, "bauermann": np.nan}, "tx [mm]")
-    assert [len(c.lines[2]) for c in ax.containers] == [1, 0]
-    assert falls(ax.get_ylim()) and texts(ax.get_yticklabels()) == ["line", "bauermann"], "first method on top"
-
-
-def test_edge_errors_show_each_edge_and_the_mean(ax):
-    results.edge_errors(ax, {"last beam": [-5.0, -3.0], "half step": [1.0, 2.0, 0.0]})
-    means = [line.get_xdata()[0] for line in ax.lines if line.get_linewidth() == 2.5]
-    assert means == pytest.approx([-4.0, 1.0]) and texts(ax.get_yticklabels()) == ["last beam", "half step"]
 
 
 @IN_SPACE
@@ -298,12 +274,6 @@ def test_observability_bars_name_what_is_lost(ax):
     assert texts(ax.texts) == [" not determined", " 2 mm"] and ax.get_title() == "1 motions are not determined"
     assert texts(ax.get_yticklabels()) == ["the range offset", "the edge bias"]
     assert [to_hex(p.get_facecolor()) for p in ax.patches] == [recording.COLORS["outlier"], recording.COLORS["fit"]]
-
-
-def test_misfit_bars_mark_outliers(ax):
-    results.misfit_bars(ax, {1: 1.0, 4: 0.9, 7: 9.0})
-    assert to_hex(ax.patches[2].get_facecolor()) == recording.COLORS["outlier"]
-    assert ax.get_title() == "1 of 3 placements fit much worse than the others"
 
 
 def test_residuals_by_range_show_a_trend(ax):

@@ -19,7 +19,7 @@ from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
 from lrfcal_lib.simulate.record import placements_of, stops_of, world_of
-from lrfcal_lib.simulate.rig import SETUPS
+from lrfcal_lib.simulate.rig import load_setup
 from lrfcal_lib.simulate.scene import World
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -86,24 +86,6 @@ def test_compiled_loops_do_what_plain_numpy_does(model):
     both = seen[expected]
     np.testing.assert_allclose(colors[expected][both], their_colors[both], atol=0.01)
     assert (source[seen] == 0).all() and (source[~seen] == -1).all() and 500 < seen.sum() < 15_000
-
-
-def test_a_slanted_floor_does_not_hide_itself():
-    x, z = np.meshgrid(np.linspace(-0.3, 0.3, 60), np.linspace(0.8, 6, 400))
-    floor = np.column_stack([x.ravel(), np.full(x.size, 0.3), z.ravel()])
-    painter = rec.Painter([view(plain_image())], 0.04, 0.01)
-    painter.hide(floor)
-    inside = project(floor, MODEL)[:, 1] < 47
-    assert painter.paint(floor, np.tile([0.0, -1, 0], (len(floor), 1)))[1][inside].mean() > 0.99
-
-
-def test_nothing_is_coloured_beyond_the_fold_of_a_lens():
-    angle = np.radians(np.arange(0, 89, 0.5))
-    fan = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
-    ghosts = (project(fan, WIDE)[:, 0] < 64) & (np.tan(angle) ** 2 > rec.fold(WIDE))
-    _, seen, _ = paint(fan, view(plain_image(), WIDE), step=0.001)
-    assert ghosts.sum() > 10 and not seen[ghosts].any() and seen[angle < np.radians(40)].all()
-    assert rec.fold(MODEL) == np.inf
 
 
 def test_exposures_are_compared_and_taken_off():
@@ -189,7 +171,7 @@ def test_mixed_pixels_of_a_furnished_room():
     It is good if it is within one sigma of such a place and of what one of the things would have read alone: neither
     noise nor a second surface made it. In between, nobody minds whether a reading goes.
     """
-    setup, lines = SETUPS["sim_lms221"](), slice(None, None, 3)
+    setup, lines = load_setup("sim_lms221"), slice(None, None, 3)
     placement, session = placements_of(setup)[-1], open_session(DATA / "sim_lms221")
     sweep, sigma = session.sweep(placement.number), setup.rig.beam.sigma_range
     off, pull = spots_alone(setup, placement, lines)

@@ -555,9 +555,9 @@ def test_the_command_line_passes_everything_on(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         command_line.main(["record", "rig.json", "s", "--placements", "0"])
     assert "1 or more are needed" in capsys.readouterr().err
-    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda rest: got.update(rest=rest) or 0)
+    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda *args, **options: got.update(options, args=args) or 0)
     assert command_line.main(["emulate", "sim_quick", "--rig-file", "x.json"]) == 0
-    assert got["rest"] == ["sim_quick", "--rig-file", "x.json"]
+    assert got["args"] == ("sim_quick", "x.json") and (got["seed"], got["feedback"]) == (0, "full")
 
 
 # ---------------------------------------------------------------------------------------------------------- lights

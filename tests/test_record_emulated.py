@@ -21,7 +21,7 @@ from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import model_to_json
-from lrfcal_lib.simulate.rig import PLACES, pairs, random, sim_quick
+from lrfcal_lib.simulate.rig import PLACES, load_setup, pairs, random
 
 DEADLINE = 180.0  # s, against hanging
 STEP = np.radians(1.25)
@@ -29,9 +29,10 @@ STEP = np.radians(1.25)
 
 def small_setup():
     """Four placements, coarse sweeps, one camera with known intrinsics and one small image a placement."""
-    rig = scaled(sim_quick().rig, 480)
+    quick = load_setup("sim_quick")
+    rig = scaled(replace(quick.rig, platform=replace(quick.rig.platform, settle=0.2)), 480)
     camera = replace(rig.cameras[0], exposure=replace(rig.cameras[0].exposure, samples=2))
-    setup = replace(sim_quick(), rig=replace(rig, cameras=(camera,)), pairs=2, distances=(1.3, 1.7), step=STEP,
+    setup = replace(quick, rig=replace(rig, cameras=(camera,)), pairs=2, distances=(1.3, 1.7), step=STEP,
                     intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
     found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), np.radians(1.0))
     return setup, [replace(p, image_pitch=p.image_pitch[len(p.image_pitch) // 2 :][:1]) for p in found]
@@ -55,11 +56,11 @@ class Still:
         self.rig, self.name, self.settings, self.count = rig, name, {"warnings": []}, 0
 
     def newest(self, after=None, timeout=None):
-        self.rig.clock.machine.sleep(0.5)
+        self.rig.host.sleep(0.5)
         _, data = self.rig.camera_server.image(self.name, timeout=DEADLINE)
         self.count += 1
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        return Frame(image, self.rig.clock.machine.time(), self.count)
+        return Frame(image, self.rig.host.time(), self.count)
 
     def close(self):
         pass
@@ -70,14 +71,14 @@ def recorded_session(setup, tmp_path_factory):
     """What `record` makes of the emulated devices."""
     folder, host = tmp_path_factory.mktemp("recorded"), VirtualHost()
     with EmulatedRig(
-        setup[0], placements=setup[1], machine=host, platform={"settle": 0.2}, rest_s=0.0,
+        setup[0], placements=setup[1], host=host, rest_s=0.0,
         head_options={"baudrate": 9600, "go_speed": 20.0},
     ) as emulated:  # fmt: skip
         data = state_intrinsics(emulated.rig_file(), setup[0])
         data["devices"]["head"] |= {"settle_s": 0.25, "poll_s": 0.05, "gap_s": 0.025}  # the head wobbles for 0.2 s
         (folder / "rig.json").write_text(json.dumps(data))
         stated = read_rig_file(folder / "rig.json")
-        with Rig.open(stated, clock=host.time, host=host, camera=lambda name: Still(emulated, name)) as rig:
+        with Rig.open(stated, host=host, camera=lambda name: Still(emulated, name)) as rig:
             record_session(rig, folder / "s")  # nobody is asked for anything: the board moves by itself
     return open_session(folder / "s")
 

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import nbformat
@@ -234,7 +233,7 @@ RUN = """import sys, pathlib
 sys.modules["rfc3987_syntax"] = None  # see conftest.py
 from lrfcal_lib.report import report
 report.NOTEBOOKS = pathlib.Path(sys.argv[1])
-sys.exit(report.main(sys.argv[2:]))"""
+sys.exit(report.main(sys.argv[2:3], sys.argv[3]))"""
 ENDS = {signal.SIGTERM: 143, signal.SIGKILL: -9}
 
 
@@ -245,7 +244,7 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
     report.make_report(session, out, notebooks=[])
     before = {file.name: file.read_bytes() for file in out.glob("*.*")}
     waiting(tmp_path / "00_late.ipynb", tmp_path)
-    command = [sys.executable, "-c", RUN, str(tmp_path), str(session), "--out", str(out)]
+    command = [sys.executable, "-c", RUN, str(tmp_path), str(session), str(out)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         wait_until_there(line)
         report.make_report(session, out.with_name("other"), notebooks=[])
@@ -257,22 +256,11 @@ def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
     assert number == signal.SIGKILL or f"stopped by {number.name}; an earlier report stays as it was" in said
     assert {file.name: file.read_bytes() for file in out.glob("*.*")} == before
     assert len(parts(out.parent)) == (number == signal.SIGKILL)
-    report.make_report(session, out, notebooks=[])
-    assert parts(out.parent) == []
-
-
-def test_disks_that_cannot_exchange_folders_rename_twice(session, tmp_path, monkeypatch):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine").symlink_to("nowhere")
-    monkeypatch.setattr(report.ctypes, "CDLL", lambda name: SimpleNamespace(renameat2=lambda *names: -1))
-    report.make_report(session, tmp_path / "out", notebooks=[])
-    assert (tmp_path / "out" / "mine").is_symlink() and (tmp_path / "out" / "index.html").is_file()
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_folder_that_cannot_be_written_is_named(session, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert report.main([str(session), "--out", str(tmp_path / "file" / "out")]) == 2
+    assert report.main([session], tmp_path / "file" / "out") == 2
     assert re.search(r"file/out: cannot write the report .*--out names another folder", capsys.readouterr().err)
 
 
@@ -285,12 +273,12 @@ def test_make_takes_a_session_with_a_space():
 def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "NOTEBOOKS", tmp_path)
     write_notebook(tmp_path / "00_good.ipynb", GOOD)
-    assert report.main([str(session), "--out", str(tmp_path / "a"), "--jobs", "1"]) == 0
+    assert report.main([session], tmp_path / "a", 1) == 0
     assert "1 of 1 notebooks" in capsys.readouterr().out
     write_notebook(tmp_path / "00_good.ipynb", "1 / 0")
-    assert report.main([str(session), "--out", str(tmp_path / "b")]) == 1
+    assert report.main([session], tmp_path / "b") == 1
     assert "00_good failed: ZeroDivisionError" in capsys.readouterr().err
-    assert report.main([str(tmp_path / "nowhere")]) == 2
+    assert report.main([tmp_path / "nowhere"]) == 2
     assert "nowhere" in capsys.readouterr().err
 
 

@@ -361,16 +361,6 @@ def test_holes_do_not_make_edges(fill):
     assert s.worst(holed) < 0.008 and np.linalg.norm(holed.points - clean.points, axis=1).max() < 0.01
 
 
-def test_speckle_at_a_side_is_outvoted():
-    s = scene(sigma=0.003)
-    rng, ranges, rows = np.random.default_rng(4), s.sweep.ranges.copy(), np.flatnonzero(s.on.any(axis=1))
-    last = ranges.shape[1] - 1 - s.on[:, ::-1].argmax(axis=1)
-    for row in rng.choice(rows, 30, replace=False):
-        ranges[row, last[row] - rng.integers(3, 25) : last[row] + 1] = np.nan
-    e = edge_points(found(spoiled(s, ranges)))
-    assert s.worst(e) < 0.012 and np.sum(e.side >= 0) > np.sum(edge_points(found(s)).side >= 0) - 40
-
-
 def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     post = scene(sigma=0.003)
     hidden = np.abs(np.degrees(post.sweep.bearings) - 102) < 5
@@ -381,27 +371,6 @@ def test_where_view_or_sweep_end_or_something_hides_the_board_is_no_edge():
     ):
         e = function(found(s))
         assert {x.end for x in e.sides} == {end} and s.worst(e) < 0.012
-
-
-def test_scans_at_one_pitch_give_their_ends():
-    s = scene(pitch=0.0)
-    three = {"ranges": np.repeat(s.sweep.ranges, 3, axis=0), "pitch": np.zeros(3), "time_s": np.zeros(3)}
-    e = edge_points(found(replace(s, sweep=replace(s.sweep, **three))))
-    assert e.side.tolist() == [0, 0, 0, 1, 1, 1] and e.end.tolist() == [-1] * 3 + [1] * 3
-    assert np.abs(s.edge_errors(e)[0]).max() < 0.004
-    np.testing.assert_allclose(edge_points(found(s)).points, e.points[[0, 3]])
-
-
-def test_a_warped_board_moves_the_ends_where_the_board_is():
-    s = scene(wall=None, sigma=0.002)
-    count, beam = np.maximum(s.on.sum(axis=1, keepdims=True), 1), np.arange(s.on.shape[1])
-    centre = (s.on * beam).sum(axis=1, keepdims=True) / count
-    bend = 0.012 * ((beam - centre) / (count / 2)) ** 2
-    e = edge_points(found(spoiled(s, s.sweep.ranges + np.where(s.on, bend, 0.0))))
-    r = np.linalg.norm(e.points, axis=1, keepdims=True)
-    p, flat = (e.points, e.points * (1 - 0.012 / r))  # where a flat board would be
-    off, least = (np.median(np.abs(s.pose.inv().apply(lrf_to_platform(q, e.pitch, HEAD))[:, 2])) for q in (p, flat))
-    assert least < 0.4 * off
 
 
 # ---------------------------------------------------------------------------------------------- invariances

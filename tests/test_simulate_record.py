@@ -21,10 +21,10 @@ from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import transform_from_json
 from lrfcal_lib.simulate import record
 from lrfcal_lib.simulate.beam import LMS221
-from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
+from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, load_setup, pairs
 from lrfcal_lib.simulate.scene import Exposure, Imager, World
 
-FULL = sim_quick()
+FULL = load_setup("sim_quick")
 
 
 @pytest.fixture(scope="module")
@@ -54,24 +54,8 @@ def test_backlash_depends_on_the_direction():
     np.testing.assert_allclose(measured, commanded, atol=1e-12)
 
 
-def test_the_encoder_rounds_and_the_head_does_not_rest_exactly():
-    platform = Platform(noise=1e-4, encoder_step=2e-3)
-    true, measured = platform.stop(np.full(4000, 0.1234), 1, np.random.default_rng(0))
-    assert np.std(true) == pytest.approx(1e-4, rel=0.05)
-    np.testing.assert_allclose(measured / 2e-3, np.round(measured / 2e-3), atol=1e-9)
-
-
-def test_the_scan_plane_meets_a_point_at_the_sweep_pitch():
-    points = np.array([[0.3, 1.8, 0.2], [-0.4, 2.0, -0.5]])
-    pitch, bearing = FULL.rig.sweep_pitch(points)
-    start, end = (lrf_to_platform(polar_to_points(np.full(2, r), bearing), pitch, FULL.rig.T_head_lrf) for r in (0, 4))
-    along = np.sum((points - start) * (end - start), axis=1) / 16
-    assert np.all(along > 0)
-    np.testing.assert_allclose(start + along[:, None] * (end - start), points, atol=1e-9)
-
-
 def test_placements_come_in_near_perpendicular_pairs_in_view():
-    setup = sim_lms221()
+    setup = load_setup("sim_lms221")
     *found, room = record.placements_of(setup)
     assert [p.number for p in found] == list(range(1, 25)) and (room.number, room.T_platform_board) == (25, None)
     assert [len(p.image_pitch) for p in found] == [3, 1] * 12

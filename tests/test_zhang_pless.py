@@ -118,14 +118,6 @@ def test_joint_solution_agrees_with_scipy(monkeypatch):
     np.testing.assert_allclose(theirs.x[:6], 0, atol=0.02 * ours.sigma[:6].max())
 
 
-def test_joint_refinement_skips_corners_that_were_not_seen():
-    rig, obs = camera_case(15)
-    pixels = obs.pattern_pixels.copy()
-    pixels[::3, ::4] = np.nan
-    found = solve_camera(replace(obs, pattern_pixels=pixels), "zhang_pless_joint")
-    assert transform_difference(found.transform, rig.T_camera_lrf)[1] < 1e-9
-
-
 def test_joint_refinement_bears_errors_common_to_a_placement(monkeypatch):
     """Boards that bend by some millimetres must not bend the intrinsics."""
     rig, obs = camera_case(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)

@@ -7,7 +7,6 @@ import os
 import re
 import select
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 import requests
 from urllib3.exceptions import HTTPError
 
-from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
 
 LOG = logging.getLogger(__name__)
 END = b"\xff\xd9"  # of a JPEG file; inside of its image data it cannot occur
@@ -229,8 +228,6 @@ class Camera(Closed):
     fps : float, optional
     silence_s : float
         A stream that sends nothing for so long is taken for lost and opened again.
-    clock : callable
-        Host clock, s.
 
     Attributes
     ----------
@@ -246,9 +243,9 @@ class Camera(Closed):
         If the source is missing, forbidden, busy, or no camera.
     """
 
-    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0, log=LOG, clock=time.time):
+    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
         asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
-        self.name, self.lost, self._log, self._clock = name, False, log, clock
+        self.name, self.lost = name, False
         self.settings = {key: {"asked": value, "got": None} for key, value in asked.items()} | {"warnings": []}
         self._source = find_source(source, silence_s)
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
@@ -287,7 +284,7 @@ class Camera(Closed):
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
             if self._thread is None:
-                self.lost = not self._capture.grab() or not self._keep(self._clock())
+                self.lost = not self._capture.grab() or not self._keep(REAL.time())
                 if self.lost:
                     raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: "
                                    "open it again")  # fmt: skip
@@ -321,7 +318,7 @@ class Camera(Closed):
             if self._capture is None or not self._capture.grab():
                 self._lose()
                 continue
-            now = self._clock()  # what was there at once may have come at any time since the frame before
+            now = REAL.time()  # what was there at once may have come at any time since the frame before
             self._keep(now if getattr(self._capture, "waited", True) else self._before)
             self._before = now
         self._release()
@@ -335,7 +332,7 @@ class Camera(Closed):
                 self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
                 self._count += 1
                 if self.lost:
-                    self._log.warning("camera %s is back", self.name)
+                    LOG.warning("camera %s is back", self.name)
                 self.lost = False
                 self._new.notify_all()
         return done
@@ -344,7 +341,7 @@ class Camera(Closed):
         """Forget the last frame, and look for the source."""
         with self._new:
             if not self.lost:
-                self._log.warning("camera %s is lost: %s", self.name, self._source.remedy)
+                LOG.warning("camera %s is lost: %s", self.name, self._source.remedy)
             self.lost, self._frame = True, None
         self._release()
         if not self._quit.wait(AGAIN_S):
@@ -354,7 +351,7 @@ class Camera(Closed):
 
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
-        self._before, capture, ticks = self._clock(), self._capture, 0
+        self._before, capture, ticks = REAL.time(), self._capture, 0
         asked = {key: one["asked"] for key, one in self.settings.items() if key != "warnings"}
         if self._source.open is _open_device:
             exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
@@ -374,5 +371,5 @@ class Camera(Closed):
                 warnings.append(f"camera {self.name}: {key} {told}, asked {asked[key]}")
         for text in warnings:
             if text not in self.settings["warnings"]:
-                self._log.warning(text)
+                LOG.warning(text)
         self.settings["warnings"] = warnings
