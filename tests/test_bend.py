@@ -129,8 +129,6 @@ def test_scans_of_a_bent_board(bend):
     assert 0.35 < half < 0.41
     assert found.size == pytest.approx(abs(bend) * half**2, abs=1.5e-3)
     assert found.bends == (bend != 0)
-    if bend:
-        assert max(found.surface, key=abs) * bend > 0, "positive away from the LRF"
 
 
 def views_of(bend, rng, noise=0.05):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
@@ -294,8 +295,8 @@ PARALLEL = [pose_of(0.3 * i, (0.0, 0.0), (0.02 * i, 0.0, 0.8 + 0.1 * i)) for i i
         lambda: adjust(ONE[None, None, :4], PATTERN.points()[:4], [MODEL], STACKED),
     "four or more of the pattern's 24 corners": lambda: board_pose(ONE[:10], PATTERN, MODEL),
     "four or more": lambda: board_pose(np.where(np.arange(24)[:, None] < 3, ONE, np.nan), PATTERN, MODEL),
-    "two points 0.00 px apart": lambda: picked_edge("top", [3, 4], [3, 4], [0, 1]),
-    "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", [10, 10], [13, 10], [0, -1], 5.0),
+    "two points 0.00 px apart": lambda: picked_edge("top", np.full((2, 2), 3.0), np.zeros(2)),
+    "predicted length is 3 px": lambda: refine_edge(BLANK, MODEL, "top", *np.array([[10, 10], [13, 10], [0, -1]]), 5.0),
 }.items())  # fmt: skip
 
 
@@ -339,7 +340,8 @@ def noisy_edges(pose, seed, sigma=0.1):
     for i, name in enumerate(SHEET.edges):
         exact = true_line(name, pose)
         ends = on_board(pose, CORNERS[[i, (i + 1) % 4]]) + rng.normal(0, sigma, (2, 1)) * exact[:2]
-        out.append(replace(picked_edge(name, *ends, exact[:2], sigma), picked=False))
+        edge = picked_edge(name, ends, ends.mean(axis=0) - exact[:2])  # by a hand that errs by a pixel
+        out.append(replace(edge, covariance=sigma**2 * edge.covariance))
     return out
 
 
@@ -450,12 +452,12 @@ def test_picks_override_the_detector():
         EdgePick("right", Path("a.png"), "left", corners[:2]),
     ]
     view = seen(render(pose), picks=picks)
-    assert [e.name for e in view.edges if e.picked] == ["top"]
+    assert [e.name for e in view.edges if e.n_points == 2] == ["top"]
     top, ends = view.edge("top"), undistort(picks[0].ends, MODEL)
     np.testing.assert_allclose(top.ends, ends, atol=1e-9)
     assert np.abs(line_distance(ends, top.line)).max() < 1e-9
     assert line_distance(on_board(pose, [[0.12, 0.095]])[0], top.line) < 0
-    assert view.edge("left").picked is False and view.edge("nowhere") is None
+    assert view.edge("left").n_points > 2 and view.edge("nowhere") is None
     with pytest.raises(ValueError, match="picked edge 'hypotenuse' is not one of"):
         seen(render(pose), picks=[replace(picks[0], edge="hypotenuse")])
 
@@ -490,9 +492,8 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
     truth = np.roll(np.array([0.25, 0.15]) - CORNERS, -2, axis=0) if over.pop() else CORNERS
     outline, expected = surveyed.outline, replace(SHEET, corners=truth).lengths()
     np.testing.assert_allclose(surveyed.board.corners, truth, atol=8e-4)
-    np.testing.assert_allclose(corners_of_lines(outline.lines), surveyed.board.corners, atol=1e-12)
     assert np.all(outline.line_sd < 0.002)
-    for name, length in outline.lengths.items():
+    for name, length in outline.board.lengths().items():
         assert length == pytest.approx(expected[name], abs=0.001) and outline.length_sd[name] < 0.003
     alone = survey.measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
     assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
@@ -582,20 +583,25 @@ def test_surveys_that_cannot_work(session, surveyed):
         survey.measure_outline(views, UNKNOWN, surveyed.models)
 
 
-def shown(pixels):
-    """Views of placements 0, 1, ... with those corners."""
-    return [SimpleNamespace(placement=i, pixels=own) for i, own in enumerate(pixels)]
+def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
+    """The mounting of two cameras from the corners that they see at placements 0, 1, ..., and its covariance."""
+    views = [{p: SimpleNamespace(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)]
+    views, models = (dict(enumerate(each)) for each in (views, models))
+    board = SimpleNamespace(pattern=pattern)
+    return stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))[1:]
 
 
-def test_stereo_check_recovers_the_mounting_and_its_covariance_tells_the_error():
+def test_stereo_reference_recovers_the_mounting_and_its_covariance_tells_the_error():
     poses, mount, chi2 = view_poses(6, seed=8), pose_of(0.02, (0.01, -0.02), (-0.12, 0.002, 0.004), (0, 0)), []
     for seed in range(16):
-        first = shown(pixels_of(poses, 0.2, 2 * seed))
-        second = shown(pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1))
-        chi2.append(score(*survey.stereo_check(first, second, PATTERN, [MODEL, MODEL])[:2], mount))
+        first = pixels_of(poses, 0.2, 2 * seed)
+        second = pixels_of([mount * p for p in poses], 0.2, 2 * seed + 1)
+        chi2.append(score(*stereo(first, second), mount))
     assert 0.6 < np.mean(chi2) < 1.5
     with pytest.raises(ValueError, match="no placement shows the pattern to both cameras"):
-        survey.stereo_check(first[:2], second[3:], PATTERN, [MODEL, MODEL])
+        stereo(first, [])
+    with pytest.raises(ValueError, match="needs two cameras and a pattern"):
+        stereo(first, first, pattern=None)
 
 
 # --- boards without pattern ----------------------------------------------------------------------------------------
@@ -625,9 +631,9 @@ def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector(
     corners = on_board(pose, TRIANGLE.corners, project)
     picks = {name: corners[[i, (i + 1) % 3]] for i, name in enumerate(TRIANGLE.edges)}
     view = view_board(render(pose, TRIANGLE), TRIANGLE, MODEL, picks={"bc": picks["bc"]})
-    assert view.edge("bc").picked and worst_edge(view, pose, TRIANGLE) < 0.1
+    assert view.edge("bc").n_points == 2 and worst_edge(view, pose, TRIANGLE) < 0.1
     view = view_board(BLANK, TRIANGLE, MODEL, picks=picks)
-    assert view.reason == "" and all(e.picked for e in view.edges)
+    assert view.reason == "" and all(e.n_points == 2 for e in view.edges)
     np.testing.assert_allclose(nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
 
@@ -679,7 +685,7 @@ def test_real_cameras_edges_and_outline(lms400):
         names = [e.name for v in views for e in v.edges]
         assert len(names) >= 70 and len(names) - names.count("bottom") >= 58
         assert all(reason.startswith(("cut by", "no clear")) for v in views for _, reason in v.rejected)
-    for name, length in found.outline.lengths.items():
+    for name, length in found.board.lengths().items():
         assert length == pytest.approx(0.858, abs=0.004), name
         assert found.outline.length_sd[name] < 0.007
     assert np.all(found.outline.line_sd < 0.0035)
@@ -695,14 +701,8 @@ def test_real_cameras_edges_and_outline(lms400):
 
 
 def test_real_stereo(lms400):
-    found = lms400.prepared
-    given = *(list(v.values()) for v in found.views.values()), found.board.pattern, list(found.models.values())
-    transform, covariance, _ = survey.stereo_check(*given, relief=found.relief)
+    refined, covariance = stereo_reference(lms400.prepared)[1:]
     # shape-free bundle of an independent analysis, with its own uncertainty
-    assert np.linalg.norm(transform.translation) == pytest.approx(0.1200, abs=0.0006)
-    np.testing.assert_allclose(np.rad2deg(transform.rotation.as_rotvec()), [0.457, 0.479, -0.025], atol=0.12)
-    assert np.all(np.sqrt(np.diag(covariance)) < 1e-3)
-    refined, covariance, _ = survey.stereo_check(*given, relief=found.relief, refine=True)
     off = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
     sigma = np.sqrt(np.diag(covariance)) * np.repeat([np.rad2deg(1), 1000], 3)
     off -= [0.457, 0.479, -0.025, -120.0, -0.3, -0.8]
@@ -719,7 +719,6 @@ def test_opencv_stereo_pairs(real_data):
         assert result.rms_px < rms
         models += result.models
     assert models[0].fx == pytest.approx(535.9, abs=4)
-    transform, _, result = survey.stereo_check(*map(shown, corners), pattern, models, refine=True)
-    assert result.rms_px < 0.4478
+    transform, _ = stereo(*corners, pattern, models)
     # along the axis the pairs tell little: the detectors of OpenCV alone move it by 1 mm
     assert np.all(np.abs(1000 * transform.translation - [-83.606, 1.043, 1.324]) < [0.8, 0.3, 2.2])

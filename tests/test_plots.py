@@ -155,10 +155,10 @@ def test_board_plan_has_sizes_and_squares_where_they_are(ax):
 def test_outline_tells_lengths_and_exaggerated_spread(ax):
     corners = np.array([[0.0, 0.0], [0.8, 0.0], [0.8, 0.6], [0.0, 0.6]])
     board = Board("b", ("top", "right", "bottom", "left"), corners, Chessboard(3, 2, 0.1, (0.2, 0.2)))
-    spread, lengths = np.array([0.001, 0.002, np.nan, 0.001]), {"top": 0.8, "right": 0.6}
-    measured = SimpleNamespace(lines=outline_lines(corners), line_sd=spread, lengths=lengths, board=board)
+    spread = np.array([0.001, 0.002, np.nan, 0.001])
+    measured = SimpleNamespace(lines=outline_lines(corners), line_sd=spread, board=board)
     recording.outline(ax, measured, exaggerate=10)
-    assert texts(ax.texts) == ["top\n800.0 mm", "right\n600.0 mm", "bottom", "left"]
+    assert texts(ax.texts) == ["top\n800.0 mm", "right\n600.0 mm", "bottom\n800.0 mm", "left\n600.0 mm"]
     assert len(ax.patches) == 3, "no band where there is no spread"
     assert np.ptp(ax.patches[0].get_xy()[:, 1]) == pytest.approx(0.02)
 

@@ -12,13 +12,21 @@ from lrfcal_lib.model.board import Board, triangle_board
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board, fit_lines, median_filter
-from lrfcal_lib.preprocess.edges_in_scan import crossings, edge_points, sweep_edges
+from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.session.read import Sweep
 
 HEAD = RigidTransform.from_components([0.02, 0.01, 0.12], Rotation.from_rotvec([0.01, -0.02, 0.03]))
 SQUARE = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.8, 0], [0.8, 0.7], [0, 0.7]]), None,
                ("left", "top"))  # fmt: skip
 TRIANGLE = triangle_board()
+
+
+def edge_points(scan):
+    return crossings(scan)[0]["half_step"]
+
+
+def sweep_edges(scan):
+    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
 
 
 def facing(distance=1.6, roll=8.0, tilt=20.0, centre=(0.4, 0.35), x=0.0):
@@ -218,7 +226,7 @@ def test_a_post_behind_the_board_is_no_part_of_it(roll):
     for e in (edge_points(b), sweep_edges(b)):
         assert 1 <= len(e.sides) <= 3 and s.worst(e) < 0.025
         assert np.mean(np.abs(s.edge_errors(e)[0][e.side >= 0])) < 0.006
-        assert all(turned < 4 * side.angle_sigma for side, turned in directions(s, e))
+        assert all(turned < 4 * turn_sigma(side) for side, turned in directions(s, e))
 
 
 # ---------------------------------------------------------------------------------------------- filter and fit
@@ -318,12 +326,17 @@ def directions(s, e):
         yield side, np.arcsin(min(abs(along @ lines[np.bincount(edge[mine]).argmax(), :2]), 1.0))
 
 
-def test_sides_are_turned_as_little_as_their_sigma_says():
+def turn_sigma(side):
+    """Standard deviation of the direction of a side whose neighbours share their errors, and a millimetre always."""
+    return np.sqrt(12 * (2 * side.rms**2 / side.n_points + 0.001**2)) / side.length
+
+
+def test_sides_are_turned_as_little_as_their_scatter_says():
     turned = []
     for seed in range(8):
         b = found(s := noisy_triangle(seed, roll=10.0 + 40 * seed))
         for e in (edge_points(b), sweep_edges(b)):
-            turned += [angle / side.angle_sigma for side, angle in directions(s, e)]
+            turned += [angle / turn_sigma(side) for side, angle in directions(s, e)]
     assert len(turned) > 30 and max(turned) < 1.5  # a spot of no size before an even wall does better than a real one
 
 

@@ -115,21 +115,26 @@ def write_clouds(folder, calibration, method):
 
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
     """
-    session, folder = calibration.prepared.session, Path(folder)
+    return sum(spread(_write_cloud, _clouds(folder, calibration, method))[::-1], [])
 
-    def write(scene):
-        """The files of a cloud."""
-        blocks, files = cloud_blocks(calibration, method, scene), [folder / f"{'scene' if scene else 'cloud'}.ply"]
-        if method == "joint":
-            blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
-        write_ply(files[0], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
-        if scene:
-            files.append(folder / "scene.pcd")
-            write_pcd(files[1], files[0])
-        return files
 
-    clouds = [True] * bool(session.scene_placements) + [False] * bool(calibration.prepared.scans)
-    return sum(spread(write, clouds)[::-1], [])
+def _clouds(folder, calibration, method):
+    """What :func:`_write_cloud` takes, of each cloud of a session."""
+    scenes = [True] * bool(calibration.prepared.session.scene_placements)
+    return [(Path(folder), calibration, method, s) for s in scenes + [False] * bool(calibration.prepared.scans)]
+
+
+def _write_cloud(of):
+    """The files of a cloud."""
+    folder, calibration, method, scene = of
+    blocks, files = cloud_blocks(calibration, method, scene), [folder / f"{'scene' if scene else 'cloud'}.ply"]
+    if method == "joint":
+        blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
+    write_ply(files[0], blocks, [f"session {calibration.prepared.session.name}, method {method}, lrfcal {__version__}"])
+    if scene:
+        files.append(folder / "scene.pcd")
+        write_pcd(files[1], files[0])
+    return files
 
 
 def write_pcd(path, ply):
@@ -185,10 +190,19 @@ def calibrate_session(path, out=None):
         print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
     for key, why in (found.prepared.problems | found.problems).items():
         print(f"{key}: {why}")
-    judged = judge(found)
+    method, file = handed_over(found), folder / "calibration.json"
+
+    def work(cloud):
+        """Write a cloud, or else judge the calibration and write it."""
+        if cloud:
+            return _write_cloud(cloud)
+        judged = judge(found, method)
+        if method:  # otherwise nothing can be handed over
+            write_calibration(file, calibration_record(found, method, judged))
+        return judged
+
+    *files, judged = spread(work, [*(_clouds(folder, found, method) if method else ()), None])
     print(*judged.sentences(), sep="\n")
-    if judged.errors:  # otherwise nothing can be handed over
-        method, file = handed_over(found), folder / "calibration.json"
-        write_calibration(file, calibration_record(found, method, judged))
-        print("written:", *(f"{path}," for path in write_clouds(folder, found, method)), file)
+    if method:
+        print("written:", *(f"{path}," for path in sum(files[::-1], [])), file)
     return UNTRUSTED if judged.answer == NO else 0

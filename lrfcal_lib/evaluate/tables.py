@@ -370,7 +370,8 @@ def outline_table(outline):
 
     Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
     """
-    rows = [(n, 1000 * v, 1000 * outline.length_sd[n], outline.n_lengths[n]) for n, v in outline.lengths.items()]
+    lengths, sd, count = outline.board.lengths(), outline.length_sd, outline.n_lengths
+    rows = [(name, 1000 * length, 1000 * sd[name], count[name]) for name, length in lengths.items()]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
@@ -51,25 +50,23 @@ class Outline:
 
     Attributes
     ----------
+    board : Board
+        With its corners filled in.
     lines : ndarray, shape (E, 3)
         Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
-    lengths, length_sd : dict of str to float
-        Edge lengths of the outline and their standard deviation over the views that show the edge with both neighbours
-        (NaN below two), metres.
+    length_sd : dict of str to float
+        Standard deviation of an edge's length over the views that show it with both neighbours (NaN below two), metres.
     n_lengths : dict of str to int
         Views that show the edge with both neighbours.
-    board : Board
-        With its corners filled in.
     """
 
+    board: Board
     lines: np.ndarray
     line_sd: np.ndarray
-    lengths: dict
     length_sd: dict
     n_lengths: dict
-    board: Board
 
 
 def views_of(session, models=None, *, one_per_placement=False):
@@ -410,12 +407,11 @@ def measure_outline(views, board, models):
     rough = corners_of_lines([np.median(found, axis=0) for found in lines])
     ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
     fitted, line_sd = map(np.array, zip(*map(_median_line, lines, ends), strict=True))
-    measured = replace(board, corners=corners_of_lines(fitted))
     for trio in zip(np.roll(board.edges, 1), board.edges, np.roll(board.edges, -1), strict=True):
         corners = [corners_of_lines([own[name] for name in trio]) for own in seen if own.keys() >= {*trio}]
         lengths[trio[1]] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
     spread, count = ({n: f(x) for n, x in lengths.items()} for f in (_spread, len))
-    return Outline(fitted, line_sd, {n: float(x) for n, x in measured.lengths().items()}, spread, count, measured)
+    return Outline(replace(board, corners=corners_of_lines(fitted)), fitted, line_sd, spread, count)
 
 
 def _spread(values):
@@ -430,51 +426,3 @@ def _median_line(lines, ends):
     offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
     a, b = ends + np.median(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
-
-
-def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
-    """Relative pose of two cameras from the pattern's corners in views of the same placements.
-
-    Parameters
-    ----------
-    first, second : sequence of BoardView
-        Of two cameras; views with the same placement belong together.
-    pattern : Chessboard
-    models : pair of CameraModel
-        Intrinsics.
-    relief : ndarray, shape (k,), optional
-        Non-zero heights: the sheet is wavy, its shape is estimated along.
-    refine : bool
-        Estimate the intrinsics of both cameras along: the best knowledge of the mounting. Without, the result goes with
-        the given intrinsics (so does a calibration that uses them), and the covariance leaves their errors out.
-
-    Returns
-    -------
-    T_second_first : RigidTransform
-    covariance : ndarray, shape (6, 6)
-        Of ``[w, v]``.
-    adjustment : Adjustment
-
-    Raises
-    ------
-    ValueError
-        If no placement is seen by both cameras.
-    """
-    corners = [{v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0}
-               for views in (first, second)]  # fmt: skip
-    common = sorted(corners[0].keys() & corners[1].keys())
-    if not common:
-        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
-    pixels = np.array([[own[p] for p in common] for own in corners])
-    poses = [
-        RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in own])
-        for own, model in zip(pixels, models, strict=True)
-    ]
-    between = poses[1] * poses[0].inv()
-    rough = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
-    mounting = RigidTransform.concatenate([RigidTransform.identity(), rough])
-    wavy = relief is not None and np.any(relief)
-    options = {"intrinsics": refine, "basis": intrinsics.waves(pattern.points()) if wavy else None}
-    options["fixed"] = (8,) if all(m.distortion[4] == 0 for m in models) else ()
-    result = intrinsics.adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
-    return result.mounting[1], result.mounting_covariance[0], result
