@@ -52,7 +52,7 @@ def scant(request, tmp_path_factory):
 @pytest.mark.parametrize(
     ("scant", "path"),
     [pytest.param(kind, path, id=f"{kind}-{path.stem}", marks=[] if (kind, path.stem[:2]) in SAYS else campaign)
-     for kind in SCANT for path in WITH_SESSION],
+     for kind in SCANT for path in WITH_SESSION if kind != "parallel" or path.stem > "04"],  # its scans are as others
     indirect=["scant"],
 )  # fmt: skip
 def test_runs_to_the_end_and_says_what_is_not_asked(path, scant, monkeypatch, request):
