@@ -11,11 +11,12 @@ SIMULATED := sim_lms221 sim_quick
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup report test notebooks golden lab data picture bench fuzz clean
+.PHONY: help setup report test campaign notebooks golden lab data picture bench fuzz clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
 	@echo "make test                    lint and run all tests, the notebooks included"
+	@echo "make campaign                the many falsified and drawn recordings of which make test has a few"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
 	@echo "make bench                   speed and memory beside scipy, OpenCV and GTSAM, if installed: reports/bench/"
@@ -36,6 +37,9 @@ test: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
+campaign: setup
+	$(RUN) -m pytest -n 3 -m campaign
+
 notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
 
@@ -50,7 +54,6 @@ lab: setup
 
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py
-	@PYTHONPATH=tests $(RUN) tests/bench_joint.py
 
 fuzz: setup
 	@PYTHONPATH=tests $(RUN) tests/fuzz.py

@@ -29,15 +29,15 @@ def run(args):
                 print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
         case "calibrate":
             from lrfcal_lib.evaluate.export import calibrate_session
+            from lrfcal_lib.session.cache import all_processors
 
-            return calibrate_session(args.session)
+            with all_processors():
+                return calibrate_session(args.session)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
-            from lrfcal_lib.simulate.rig import SETUPS
+            from lrfcal_lib.simulate.rig import load_setup
 
-            if args.setup not in SETUPS:
-                raise ValueError(f"no set-up '{args.setup}'; there are {', '.join(SETUPS)}")
-            simulate(args.dst, SETUPS[args.setup](), workers=args.workers)
+            simulate(args.dst, load_setup(args.setup), workers=args.workers)
             print(f"{args.dst}: simulated")
         case "record":
             from lrfcal_lib.acquire.record import main
@@ -46,11 +46,11 @@ def run(args):
         case "report":
             from lrfcal_lib.report.report import main
 
-            return main(args.rest)
+            return main(args.sessions, args.out, args.jobs, args.store)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.rest)
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
     return 0
 
 
@@ -87,8 +87,17 @@ def parser():
     record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
     record.add_argument("--placements", type=how_many, metavar="N", help="record N placements of the plan")
     record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
-    verbs.add_parser("emulate", help="emulate the devices of a rig (emulate -h for more)", add_help=False)
-    verbs.add_parser("report", help="execute the notebooks on a session (report -h for more)", add_help=False)
+    emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
+    emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
+    emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
+    emulate.add_argument("--seed", type=int, default=0, help="of noise")
+    told = {"choices": ("full", "partial", "none"), "default": "full"}
+    emulate.add_argument("--feedback", **told, help="what the head tells of its position")
+    report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
+    report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the one at hand)")
+    report.add_argument("--out", help="folder of the report (default reports/<session>)")
+    report.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
+    report.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     return top
 
 
@@ -106,9 +115,7 @@ def main(argv=None):
         0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after Ctrl-C. ``record`` has
         its own: 2 after a message that says what to do; ``calibrate`` has 3 where the verdict is 'no'.
     """
-    args, args.rest = parser().parse_known_args(argv)
-    if args.rest and args.verb not in ("report", "emulate"):
-        parser().error(f"unrecognized arguments: {' '.join(args.rest)}")
+    args = parser().parse_args(argv)
     try:
         return run(args) or 0
     except ValueError as error:

@@ -124,9 +124,6 @@ class Lrf:
         self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, None, None))
         return self.readings[-1]
 
-    def newest(self, after=None, timeout=2.0):
-        return self.take(1, after)[0]
-
     def request(self):
         if self.streaming:
             raise DeviceError("the device streams; call stop() first")
@@ -197,7 +194,7 @@ def make_rig(data=None, *, feedback=True, silent_moving=False):
     stated = rig_of(json.loads(json.dumps(data or rig_data())))
     head = Head(clock, feedback, silent_moving)
     cameras = {name: Camera(name, head, clock) for name in stated.cameras}
-    rig = Rig(stated, Lrf(head, clock), head, cameras, clock=clock, host=SimpleNamespace(now=clock))
+    rig = Rig(stated, Lrf(head, clock), head, cameras, host=SimpleNamespace(now=clock, time=clock))
     rig._closing.callback(head.close)
     return rig
 

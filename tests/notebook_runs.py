@@ -11,6 +11,7 @@ from pathlib import Path
 
 import figure_checks
 import matplotlib
+import matplotlib.pyplot as plt
 import nbformat
 import pandas as pd
 import pytest
@@ -57,11 +58,11 @@ def run_nbval(path, report):
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 
-def run_plainly(path, session, folder, report):
+def run_plainly(path, session, folder, report, *, drawn=True):
     """Run the cells of a notebook on a session in this process, without a kernel; what it printed.
 
-    After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures must be
-    legible, with titles and units. Of its files only the tables are written.
+    After them the solutions of its exercises. Where nothing else can be asked it ends there. Its figures, if they are
+    drawn, must be legible, with titles and units. Of its files only the tables are written.
     """
     ended, complaints = [], []
 
@@ -77,7 +78,8 @@ def run_plainly(path, session, folder, report):
         variables = {"LRFCAL_SESSION": session, cache.VARIABLE: folder, "LRFCAL_REPORT": report}
         for name, value in (variables | {"LRFCAL_NOTEBOOK": path.stem}).items():
             patch.setenv(name, str(value))
-        patch.setattr("lrfcal_lib.report.notebook.save", figure_checks.checked(save, complaints))
+        shown = figure_checks.checked(save, complaints) if drawn else lambda fig, *args, **options: plt.close(fig)
+        patch.setattr("lrfcal_lib.report.notebook.save", shown)
         patch.setattr("lrfcal_lib.report.notebook.asked", heard)
         patch.setattr("lrfcal_lib.report.notebook.report_file", tables_only)
         for number, cell in enumerate(code_cells(read(path))):

@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "data"
 QUICK = DATA / "sim_quick"
+campaign = pytest.mark.campaign  # see pyproject.toml
 FOLDER = "LRFCAL_TESTS"  # environment variable, set by conftest.py
 STRINGS = int(os.environ.get("LRFCAL_FUZZ", 20_000))  # random byte strings for each parser; a million in make fuzz
 

@@ -11,7 +11,7 @@ from lrfcal_lib.evaluate.monte_carlo import joint_truth
 from lrfcal_lib.evaluate.tables import range_residuals, view_residuals
 from lrfcal_lib.evaluate.uncertainty import beams_to, information
 from lrfcal_lib.evaluate.verdict import diagnose, verdict
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, apply_pose
+from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import CORNERS, bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
@@ -113,14 +113,6 @@ def test_only_poses_that_all_see(good):
     assert ((bearing > VIEW[0]) & (bearing < VIEW[1]) & (np.abs(pitch) < np.radians(30))).all()
 
 
-def test_cameras_on_the_base_need_no_pitch():
-    rng = np.random.default_rng(2)
-    rig = bench(rng, mount="platform")
-    found = next_placement.suggest_placement(solve(rig, board_poses(rng, 6), rng), models_of(rig), places=COARSE)
-    assert 0 < found.median_gain < found.gain < 1
-    assert found.pitches is None and "images at" not in found.words()
-
-
 def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
     near = COARSE | {"distances": (0.1,)}
@@ -130,23 +122,6 @@ def test_suggestions_refuse_bad_input(good):
         next_placement.suggest_placement(solution, models_of(rig), places=near)
     last = verdict(solution, models_of(rig), places=near).sentences()[-1]
     assert last.startswith("No placement can be suggested: none of")
-
-
-def test_observability_lists_what_is_known_least_first(good):
-    directions = next_placement.observability(good[2])
-    sigmas = [d.sigma for d in directions if d.words]
-    assert sigmas == sorted(sigmas, reverse=True) and len(sigmas) == 18  # all but the softness of the edges
-    assert 1e-4 < sigmas[0] < 0.05
-
-
-@pytest.mark.parametrize(("direction", "words"), [
-    ({"left_tx": 0.9, "right_tx": 0.9, "range_offset": 1.0}, "the range offset with shift along x of all cameras"),
-    ({"left_tx": 0.9, "range_offset": 0.1}, "shift along x of camera 'left'"),
-])  # fmt: skip
-def test_directions_in_words(direction, words):
-    names = ["offset_in_scan_plane", "range_offset", *(f"{c}_{p}" for c in ("left", "right") for p in POSE_NAMES)]
-    x = [direction.get(name, 0.0) for name in names]
-    assert next_placement.direction_words(x, names, ("left", "right")) == words
 
 
 def test_a_good_recording_is_trusted(good):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.model import board as b
+from lrfcal_lib.model.geometry import triangle_angle
 
 
 def test_the_exact_right_angle_makes_the_third_edge_493_58_mm():
@@ -31,3 +32,10 @@ def test_an_unmeasured_outline_is_refused():
 def test_pattern_points_run_along_the_rows():
     points = b.Chessboard(3, 2, 0.1, (1.0, 2.0)).points()
     np.testing.assert_allclose(points[[0, 1, 3]], [[1, 2, 0], [1.1, 2, 0], [1, 2.1, 0]])
+
+
+def test_the_papers_board_is_not_quite_right_angled():
+    assert np.degrees(triangle_angle(3.0, 4.0, 5.0)) == pytest.approx(90.0)
+    assert np.degrees(triangle_angle(0.315, 0.380, 0.491)) == pytest.approx(89.4, abs=0.05)
+    with pytest.raises(ValueError, match="1.0, 1.0 and 3.0 make no triangle"):
+        triangle_angle(1.0, 1.0, 3.0)

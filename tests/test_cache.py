@@ -1,8 +1,8 @@
 """Stages are worked out once, and again as soon as anything that they depend on is different."""
 
 import os
-import pickle
 import shutil
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from shared import QUICK
 
-from lrfcal_lib.preprocess.prepared import prepare_scans
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
 
@@ -140,7 +139,52 @@ def test_what_was_made_of_a_session_can_be_the_first_argument(folder, session):
     assert stage.calls == 2
 
 
-def test_a_kept_stage_is_the_stage_itself(folder, session):
-    fresh, (_, kept) = prepare_scans.__wrapped__(session), (prepare_scans(session), prepare_scans(session))
-    assert kept is not fresh and pickle.dumps(kept) == pickle.dumps(pickle.loads(pickle.dumps(fresh)))
-    assert prepare_scans.__doc__.startswith("The board in every sweep") and list(kept.scans) == list(fresh.scans)
+@pytest.fixture
+def two(monkeypatch):
+    """Loops are shared by two processes, whatever this machine has and whoever asks."""
+    monkeypatch.setattr(cache, "_processes", 2)
+
+
+def test_a_loop_is_shared_in_order(two):
+    found = cache.spread(lambda i: (time.sleep(0.02), i, os.getpid())[1:], range(10))
+    assert [i for i, _ in found] == list(range(10)) and len({pid for _, pid in found}) == 2
+    assert cache.spread(lambda i: cache.spread(lambda k: k + i, range(3)), range(2)) == [[0, 1, 2], [1, 2, 3]]
+    assert cache.spread(abs, []) == [] and cache.spread(abs, [-1]) == [1] and cache._processes == 2
+
+
+def test_results_do_not_hang_on_who_worked_them_out(two, monkeypatch):
+    """Nor does the layout of their arrays, on which the last digit of sums hangs."""
+    every = [np.asfortranarray(np.arange(12.0).reshape(3, 4)), np.arange(12.0)[::2], np.arange(12.0).reshape(3, 4).T]
+    shared = cache.spread(lambda i: every[i], range(3))
+    monkeypatch.setattr(cache, "_processes", 1)
+    for one, other in zip(shared, cache.spread(lambda i: every[i], range(3)), strict=True):
+        assert np.array_equal(one, other) and one.strides == other.strides and one.flags.owndata == other.flags.owndata
+
+
+def test_what_another_process_cannot_do_is_done_here(two):
+    here = os.getpid()
+
+    def work(i):
+        time.sleep(0.01)
+        if os.getpid() != here:
+            os._exit(1)  # as if the kernel had ended it
+        return i
+
+    def fail(i):
+        time.sleep(0.01)
+        raise ValueError(f"item {i}")
+
+    assert cache.spread(work, range(6)) == list(range(6))
+    with pytest.raises(ValueError, match="item 0"):
+        cache.spread(fail, range(6))
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, 0)  # none is left
+
+
+def test_a_process_with_threads_stays_alone():
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(int).result()
+        with cache.all_processors():
+            assert cache._processes == 1
+    with cache.all_processors():
+        assert cache._processes == (len(os.sched_getaffinity(0)) if threading.active_count() == 1 else 1)

@@ -9,11 +9,9 @@ import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations, numeric
 
-from lrfcal_lib.evaluate.tables import rms
 from lrfcal_lib.fit.least_squares import whiten
-from lrfcal_lib.fit.residuals import edge_residuals_px, line_block, plane_residuals_m, sight_normals
+from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
-from lrfcal_lib.model.camera import line_distance, pinhole
 from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block, start_from_lines, start_from_scene
@@ -95,25 +93,22 @@ def test_every_method_refuses_one_placement_only(name):
         ("lines", "scene_", 2, "unknown method 'lines': use one of line_printed, line_last_beam, line,"),
     ],
 )
+
+
 def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words):
     with pytest.raises(ValueError, match=words):
         solve_camera(rows_of(camera_case(6)[1], prefix, slice(count)), name)
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_error_falls_with_more_placements_and_agrees_with_the_covariance(name):
-    errors, scores = {}, []
-    for count in (6, 30):
-        rig, obs = camera_case(5, count)
-        rng = np.random.default_rng(6)
-        poses, errors[count] = [RigidTransform.from_matrix(m) for m in obs.board_poses], []
-        for _ in range(10):
-            found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
-            e = increment(found.transform, rig.T_camera_lrf)
-            errors[count].append(np.linalg.norm(e[3:]))
-            known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
-            scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
-    assert rms(errors[30]) < 0.75 * rms(errors[6])
+def test_errors_agree_with_the_covariance(name):
+    rig, obs = camera_case(5, 12)
+    rng, scores, poses = np.random.default_rng(6), [], [RigidTransform.from_matrix(m) for m in obs.board_poses]
+    for _ in range(10):
+        found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
+        e = increment(found.transform, rig.T_camera_lrf)
+        known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
+        scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
     assert 0.6 < np.mean(scores) < 1.6
 
 
@@ -139,6 +134,8 @@ def test_corrected_jacobians_are_the_gradient_of_chi_square(name):
     ("name", "weighted"),
     [("line", True), ("line", False), ("wasielewski_strauss", True), ("wasielewski_strauss", False), ("planes", False)],
 )
+
+
 def test_scipy_agrees(name, weighted):
     rig, obs = camera_case(10, noise=1.0, source="platform" if name == "planes" else "lrf")
     start, options = pose_array(rig.T_camera_lrf), dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
@@ -157,51 +154,6 @@ def test_scipy_agrees(name, weighted):
     assert ours.n_observations == len(obs.plane_points if name == "planes" else obs.crossing_points)
 
 
-def test_residuals_are_pixels_with_their_sign():
-    rig, obs = camera_case(7)
-    np.testing.assert_allclose(edge_residuals_px(obs, rig.T_camera_lrf), 0, atol=1e-9)
-    np.testing.assert_allclose(plane_residuals_m(obs, rig.T_camera_lrf), 0, atol=1e-12)
-    outside = replace(obs, crossing_lines=obs.crossing_lines + [0, 0, 2.5])
-    np.testing.assert_allclose(edge_residuals_px(outside, rig.T_camera_lrf), 2.5, atol=1e-9)
-    np.testing.assert_array_equal(np.isnan(plane_residuals_m(obs.select([2]), rig.T_camera_lrf)), False)
-    unknown = replace(obs, plane_placement=obs.plane_placement + 100)
-    assert np.isnan(plane_residuals_m(unknown, rig.T_camera_lrf)).all()
-
-
-def test_trials_of_lines_at_once_equal_single_ones():
-    rig, obs = camera_case(2, noise=1.0)
-    shifts = np.random.default_rng(0).normal(0, 0.01, (3, 1, 3))
-    poses = move_pose(pose_array(rig.T_camera_lrf), np.random.default_rng(1).normal(0, 0.02, (3, 6)))
-    at_once = line_block(poses, replace(obs, crossing_points=obs.crossing_points + shifts))
-    for i, (pose, shift) in enumerate(zip(poses, shifts, strict=True)):
-        one = line_block(pose, replace(obs, crossing_points=obs.crossing_points + shift))
-        for name in ("residuals", "jacobian", "whitener", "corrected"):
-            np.testing.assert_array_equal(getattr(at_once, name)[i], getattr(one, name))
-        uv = pinhole(pose_transform(pose).apply(obs.crossing_points + shift), obs.model)
-        np.testing.assert_allclose(one.residuals, line_distance(uv, obs.crossing_lines), atol=1e-9)
-    assert line_block(poses[0], rows_of(obs, "crossing_", slice(0))).jacobian.shape == (0, 6)
-
-
-def test_lines_move_with_other_intrinsics():
-    rig, obs = camera_case(8)
-    other = rig.model.with_parameters(rig.model.parameters + [0, 0, 0, 0, 0.02, 0, 0, 0, 0])
-    same, plain = edge_residuals_px(obs, rig.T_camera_lrf, rig.model), edge_residuals_px(obs, rig.T_camera_lrf)
-    np.testing.assert_allclose(same, plain, atol=1e-6)
-    assert np.abs(edge_residuals_px(obs, rig.T_camera_lrf, other)).max() > 0.05
-
-
-def test_a_distance_from_the_plane_of_sight_is_the_pixel_distance_scaled_by_depth():
-    rig, obs = camera_case(1, 15, noise=1.0)
-    pose, length = pose_array(rig.T_camera_lrf * OFF), sight_normals(obs.crossing_lines, obs.model)[1]
-    depth = obs.crossing_points @ pose[2, :3] + pose[2, 3]
-    metres = distance_block(pose, obs).residuals
-    pixels = edge_residuals_px(obs, rig.T_camera_lrf * OFF)
-    np.testing.assert_allclose(metres * length / depth, pixels, rtol=1e-9, atol=1e-9)
-    lines = solve_camera(obs, "line", rig.T_camera_lrf)
-    sight = solve_camera(obs, "wasielewski_strauss", rig.T_camera_lrf, weighted=True)
-    assert (np.abs(sight.parameters - lines.parameters) / lines.sigma).max() < 0.1
-
-
 def test_robust_loss_resists_wrong_edges():
     rig, obs = camera_case(15, count=20, noise=1.0)
     lines = obs.crossing_lines.copy()
@@ -209,15 +161,6 @@ def test_robust_loss_resists_wrong_edges():
     spoiled = replace(obs, crossing_lines=lines)
     plain, robust = (miss(solve_camera(spoiled, loss=loss), rig)[1] for loss in (None, "cauchy"))
     assert robust < 0.03 and robust < 0.5 * plain
-
-
-def test_robust_loss_resists_wrong_points_without_a_guess():
-    rig, obs = camera_case(4, 10, noise=1.0)
-    pixels = obs.scene_pixels.copy()
-    pixels[::9] += 150.0
-    found = solve_camera(replace(obs, scene_pixels=pixels), "bauermann", loss="cauchy", scale="auto")
-    assert miss(found, rig)[1] < 0.03
-    assert found.weights.reshape(-1, 2)[::9].max() < 0.05
 
 
 @pytest.mark.parametrize("start", [start_from_planes, start_from_lines, start_from_scene])

@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_scan import HEAD, SQUARE, scene
+from test_scan import HEAD, SQUARE, edge_points, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
+from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.edges_in_scan import background_odds, edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
 LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)
 
 
-def cells_of(made, reach=2, lrf=LRF, change=None):
+def cells_of(made, change=None):
     sweep = made.sweep if change is None else replace(made.sweep, ranges=change(made.sweep.ranges.copy()))
     board = board_in_scan.find_board(sweep, made.board, HEAD)
-    along, swept = edges_in_scan.edge_points(board), edges_in_scan.sweep_edges(board)
-    return board, edge_cells(board, along, swept, lrf, reach)
+    along, swept = edge_points(board), sweep_edges(board)
+    return board, edge_cells(board, along, swept, LRF)
 
 
 def outside(made, cells):
@@ -82,10 +82,8 @@ def test_background_follows_from_its_distance(made, found):
     assert (cells.background < wall + 0.05).all() and (cells.background > wall - 0.6).all()
 
 
-def test_reach_and_spot_are_taken_as_given(made):
-    assert len(cells_of(made, reach=1)[1]) < 0.7 * len(cells_of(made, reach=2)[1])
-    np.testing.assert_allclose(cells_of(made, lrf=None)[1].radius, 0.005)
-    _, cells = cells_of(made)
+def test_the_spot_is_taken_as_given(found):
+    cells = found[1]
     np.testing.assert_allclose(cells.radius, (0.01 + 0.004 * cells.range_m) / 2)
 
 
@@ -110,11 +108,6 @@ def test_clouds_cut_to_the_board_have_no_background(made):
     np.testing.assert_array_equal(cells.hit, made.on[cells.line, cells.beam])
 
 
-def test_a_reach_below_one_is_refused(made):
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        cells_of(made, reach=0)
-
-
 def test_odds_of_backgrounds():
     np.testing.assert_allclose(background_odds(1.0, [2.0, 1.5, np.inf]), [-2 * np.log(2.0), 0.0, 0.0])
 
@@ -122,5 +115,5 @@ def test_odds_of_backgrounds():
 def test_single_shot_gives_cells_at_both_ends():
     made = scene(pitch=(0, 0.001), sigma=0.002)
     board = board_in_scan.find_board(made.sweep, SQUARE, HEAD)
-    cells = edge_cells(board, edges_in_scan.edge_points(board), None, LRF)
+    cells = edge_cells(board, edge_points(board), None, LRF)
     assert set(cells.side) == {0, 1} and not cells.across.any()

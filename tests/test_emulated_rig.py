@@ -8,28 +8,28 @@ import time
 import urllib.request
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import serial
 
-from lrfcal_lib.drivers.port import ask
+from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.emulators.line import Clock
-from lrfcal_lib.emulators.rig import EmulatedRig, main, summary
+from lrfcal_lib.emulators.rig import EmulatedRig, main
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
-from lrfcal_lib.session.lms2xx_codec import REASONS, split_stream
+from lrfcal_lib.session.lms2xx_codec import split_stream
 from lrfcal_lib.session.stated import parse_session
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import world_of
-from lrfcal_lib.simulate.rig import Placement, placements_of, sim_quick
+from lrfcal_lib.simulate.rig import Placement, load_setup, placements_of
 
 DEADLINE = 180.0  # s, against hanging
 QUARTERS = np.arange(160, 561)
-SETUP = sim_quick()
-SMALL = replace(SETUP, rig=scaled(SETUP.rig, 64))
+SETUP = load_setup("sim_quick")
+SMALL = replace(SETUP, rig=scaled(replace(SETUP.rig, platform=replace(SETUP.rig.platform, settle=0.1)), 64))
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,13 @@ def placements():
 
 @pytest.fixture
 def world(placements):
-    return EmulatedWorld(SETUP, Clock(), placements=placements)
+    return EmulatedWorld(SETUP, placements=placements)
 
 
 @pytest.fixture
 def small(placements):
     """A world whose images are small."""
-    return EmulatedWorld(SMALL, Clock(), placements=placements)
+    return EmulatedWorld(SMALL, placements=placements)
 
 
 def until(condition, what):
@@ -71,13 +71,6 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(worl
     assert abs(np.nanmean(error)) < 5 * beam.sigma_range / np.sqrt(error.size)
 
 
-def test_what_gives_no_range_has_its_reason(world):
-    world.put(None)
-    world.head = Head(pitch=np.radians(35))  # into the lamps
-    _, reasons, _ = world.scan(0, QUARTERS, np.full(401, 1.0))
-    assert set(np.unique(reasons)) <= {REASONS.index(r) for r in ("valid", "not valid", "dazzled", "noise")}
-
-
 def test_places(world, placements):
     world.put(2)
     assert world.place.T_platform_board is placements[1].T_platform_board
@@ -86,7 +79,7 @@ def test_places(world, placements):
     assert SETUP.rig.shows(SETUP.rig.cameras[0], close, SETUP.rig.board.pattern.points())
     assert 0.1 < close.translation[2] < 1.0 and not world.place.stand
     world.put(None)
-    assert world.truth()["place"] == ["placement", None] and set(world.truth()["boards"]) == {1, 2, 3, 4}
+    assert world.place.key == ("placement", None)
     for call, message in (
         (lambda: world.put(9), "no placement 9; there are 1, 2, 3, 4, and none"),
         (lambda: world.hold_close("left", 99), "no view 99 of camera 'left'"),
@@ -107,7 +100,7 @@ def test_images_of_another_width_show_the_same():
 
 @pytest.fixture(scope="module")
 def rig(placements):
-    with EmulatedRig(SETUP, placements=placements, image_width=64, platform={"settle": 0.1}) as rig:
+    with EmulatedRig(SMALL, placements=placements) as rig:
         yield rig
     assert rig.error() is None and not rig.folder.exists()
 
@@ -123,20 +116,15 @@ def test_cameras_open_as_any_stream_and_show_the_place(rig):
     video.release()
 
 
-def test_wrong_names_of_cameras(rig):
-    with pytest.raises(urllib.error.HTTPError, match="404"):
-        urllib.request.urlopen(rig.camera_urls["right"].replace("right", "up"), timeout=DEADLINE)
-
-
 def test_no_image_while_the_head_moves(rig):
     """A new one afterwards, which shows the new pitch."""
-    cameras, head, clock = rig.camera_server, rig.world.head, rig.clock
+    cameras, head, now = rig.camera_server, rig.world.head, rig.host.now
     until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
     before = cameras.image("left", timeout=DEADLINE)[0]
-    head.move(clock.now(), head.measured(clock.now()) + 0.2, 0.2)
+    head.move(now(), head.measured(now()) + 0.2, 0.2)
     assert cameras.image("left", timeout=0.3) == (None, None)
     after = cameras.image("left", timeout=DEADLINE)[0]
-    assert after[2] == pytest.approx(before[2] + 0.2, abs=0.01) and head.settled(rig.clock.now())
+    assert after[2] == pytest.approx(before[2] + 0.2, abs=0.01) and head.settled(rig.host.now())
 
 
 @pytest.fixture
@@ -145,7 +133,7 @@ def drawing(small):
     servers = []
 
     def drawing(**options):
-        server, asked = CameraServer(small, small.setup, **options), []
+        server, asked = CameraServer(small, **options), []
         server._pool.submit = lambda function, index, place, pitch, *_: asked.append((pitch, Future())) or asked[-1][1]
         servers.append(server)
         return server, asked
@@ -158,7 +146,7 @@ def drawing(small):
 def test_an_image_begun_before_a_move_is_not_sent(small, drawing):
     server, asked = drawing()
     until(lambda: server.image("left", timeout=0.05) == (None, None) and asked, "the wish for an image")
-    small.head.go(small.clock.now(), 0.05, 2.0)
+    small.head.go(small.host.now(), 0.05, 2.0)
     asked[0][1].set_result(b"old")
     until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1, "the wish for a new one")
     asked[-1][1].set_result(b"new")
@@ -168,42 +156,34 @@ def test_an_image_begun_before_a_move_is_not_sent(small, drawing):
 @pytest.mark.parametrize(("rest_s", "drawn"), [(1e6, False), (0.0, True)])
 def test_an_image_is_drawn_only_where_the_head_rests_long_enough(small, drawing, rest_s, drawn):
     server, asked = drawing(rest_s=rest_s)
-    small.head.go(small.clock.now(), 0.01, 2.0)
-    until(lambda: small.head.settled(small.clock.now()), "rest")
+    small.head.go(small.host.now(), 0.01, 2.0)
+    until(lambda: small.head.settled(small.host.now()), "rest")
     assert server.image("left", timeout=0.3) == (None, None) and bool(asked) == drawn
 
 
-def test_the_end_of_the_drawing_process_is_told(placements, caplog):
-    with EmulatedRig(SMALL, placements=placements) as rig:
-        until(lambda: rig.camera_server.image("left")[0] is not None, "an image")
-        for process in rig.camera_server._pool._processes.values():
-            process.kill()
-        rig.world.put(2)
-        until(lambda: rig.camera_server.image("left") == (None, None) and rig.error() is not None, "the error")
-    assert "the process that draws the images ended" in caplog.text
+def obeyed(url, command):
+    return urllib.request.urlopen(f"{url}/{command}", timeout=DEADLINE).status == 204
 
 
-def test_control_socket(rig):
-    assert ask(rig.control, "place 2") == {} and rig.world.truth()["place"] == ["placement", 2]
-    assert ask(rig.control, {"command": "place", "arguments": ["none"]}) == {} == ask(rig.control, "place")
-    assert ask(rig.control, "close right 1") == {} and rig.world.place.key == ("close", "right", 1)
-    assert ask(rig.control, "fault head mute 2") == {"armed": ["mute"]}
-    assert ask(rig.control, "clear") == {} and not rig.faults["head"].armed
-    assert ask(rig.control, "faults")["counts"] == {"lrf": {}, "head": {}}
-    assert [p["number"] for p in ask(rig.control, "placements")["placements"]] == [1, 2, 3, 4]
-    assert ask(rig.control, "status")["lrf"]["baudrate"] == rig.lrf.baudrate
-    assert "T_head_lrf" in ask(rig.control, "truth")["truth"] and len(ask(rig.control, "help")["commands"]) == 9
+def test_the_board_is_put_elsewhere(world):
+    server = CameraServer(world)
+    server.start()
+    for command, key in (("place/2", ("placement", 2)), ("place/none", ("placement", None)),
+                         ("close/right/1", ("close", "right", 1))):  # fmt: skip
+        assert obeyed(server.url, command) and world.place.key == key
+    server.close()
 
 
 @pytest.mark.parametrize(
-    ("line", "match"),
-    [("dance", "no command 'dance'"), ("place 9", "no placement 9"), ("place x", "invalid literal"),
-     ("fault wheel drop", "no device 'wheel'"), ("fault lrf stall", "no fault 'stall'"), ("{", "Expecting property"),
-     ("close left", "missing"), ('{"arguments": []}', "command")],
+    ("command", "match"),
+    [("dance", "404.*there are left.mjpg, right.mjpg, place/NUMBER"), ("place/9", "400.*no placement 9"),
+     ("place/x", "400.*invalid literal"), ("close/left", "404"), ("close/left/99", "400.*no view 99")],
 )  # fmt: skip
-def test_control_refuses(rig, line, match):
-    with pytest.raises(ValueError, match=match):
-        ask(rig.control, line)
+
+
+def test_what_cannot_be_is_refused(rig, command, match):
+    with pytest.raises(urllib.error.HTTPError, match=match):
+        obeyed(rig.camera_server.url, command)
 
 
 def test_the_devices_share_one_world(rig):
@@ -211,7 +191,7 @@ def test_the_devices_share_one_world(rig):
     rig.world.put(1)
     head, port = serial.Serial(rig.pan_tilt.path, 2400), serial.Serial(rig.lrf.path, 9600, timeout=0.2)
     head.write(bytes.fromhex("FF 01 00 4D 01 F4 43"))  # 5 deg down
-    until(lambda: rig.world.head.settled(rig.clock.now()) and rig.pitch() < -0.08, "the move")
+    until(lambda: rig.world.head.settled(rig.host.now()) and rig.pan_tilt.pitch() < -0.08, "the move")
     before, data, end = len(rig.scans), b"", time.monotonic() + DEADLINE
     while not len(split_stream(data).offset) and time.monotonic() < end:
         port.write(bytes.fromhex("02 00 02 00 30 01 31 18"))
@@ -219,7 +199,8 @@ def test_the_devices_share_one_world(rig):
     record = rig.scans[before]
     assert record.telegram in data
     assert np.degrees(record.pitch_rad) == pytest.approx(-5.0, abs=0.2)
-    assert rig.pitch(record.time_s) == pytest.approx(record.pitch_rad[0])
+    instant = record.time_s - REAL.time() + REAL.now()
+    assert rig.pan_tilt.pitch(instant) == pytest.approx(record.pitch_rad[0])
     head.close()
     port.close()
 
@@ -240,35 +221,31 @@ def test_rig_file_states_what_a_session_states(rig, tmp_path):
 
 def test_own_placements_and_unknown_setups(tmp_path):
     mine = [Placement(7, placements_of(SETUP)[0].T_platform_board, (-0.1, 0.1), (0.0,))]
-    with EmulatedRig(SETUP, placements=mine, cameras=False, folder=tmp_path / "rig", time_scale=4) as rig:
+    with EmulatedRig(SETUP, placements=mine, folder=tmp_path / "rig") as rig:
         rig.world.put(7)
-        assert rig.rig_file()["rig"]["cameras"] == {} and (tmp_path / "rig" / "lrf").is_symlink()
-        assert "4 times as fast: for stop-and-go, not for continuous sweeps" in summary(rig)
+        assert (tmp_path / "rig" / "lrf").is_symlink()
     EmulatedRig(SETUP, folder=tmp_path / "rig").close()  # what was not started can be closed
     assert list((tmp_path / "rig").iterdir()) == []
-    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
-        EmulatedRig("x")
     before = signal.getsignal(signal.SIGHUP)
-    with pytest.raises(ValueError, match="time_scale is 16.0"):
-        main(["sim_quick", "--no-cameras", "--time-scale", "16"])
+    with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
+        main("x")
     assert signal.getsignal(signal.SIGHUP) is before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_command_line_cleans_up(tmp_path, number):
-    file, folder = tmp_path / "rig.json", tmp_path / "ports"
-    code = "import sys; from lrfcal_lib.emulators.rig import main; sys.exit(main(sys.argv[1:]))"
-    call = [sys.executable, "-c", code, "--no-cameras", "--rig-file", str(file), "--folder", str(folder)]
+def test_the_command_line_cleans_up(tmp_path):
+    file = tmp_path / "rig.json"
+    call = [sys.executable, "-m", "lrfcal_lib", "emulate", "--rig-file", str(file)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
     until(lambda: file.exists() or run.poll() is not None, "the rig file")
     said = "".join(iter(run.stdout.readline, f"  rig file {file}   python -m lrfcal_lib record --help\n"))
-    assert "one command a line" in said and "times as fast" not in said
+    assert "place/NUMBER puts it at 1, 2" in said
     devices = json.loads(file.read_text())["devices"]
+    folder = Path(devices["lrf"]["port"]).parent
     port = serial.Serial(devices["lrf"]["port"], 9600, timeout=DEADLINE)
     port.write(bytes.fromhex("02 00 01 00 3A 1E 12"))
     assert port.read(30)[5:6] == b"\xba"
-    assert ask(devices["control"], "place 1") == {}
-    run.send_signal(number)
+    assert obeyed(devices["control"], "place/1")
+    run.send_signal(signal.SIGTERM)
     assert "the emulated rig is gone" in run.communicate(timeout=DEADLINE)[0] and run.returncode == 0
-    assert not file.exists() and list(folder.iterdir()) == []
+    assert not file.exists() and not folder.exists()
     port.close()

@@ -20,11 +20,6 @@ def observed():
     return {noise: camera_observations(rng, rig, poses, noise=noise) for noise in (0.0, 1.0)}
 
 
-def test_rms_ignores_what_is_missing():
-    assert tables.rms([3.0, np.nan, -3.0]) == 3.0
-    assert np.isnan(tables.rms([np.nan]))
-
-
 def left_out(obs, method, full=None):
     """Residuals of every placement under a calibration from the others: crossings and face points."""
     return tables.left_out_residuals(tables.left_out(obs, obs, method, full or solve_camera(obs, method)))
@@ -39,12 +34,6 @@ def test_placements_without_which_too_little_is_left_do_not_count(observed):
     obs = observed[0.0]
     some = obs.select(obs.placements[:3])
     assert [len(found) for found in left_out(some, "zhang_pless", solve_camera(obs, "zhang_pless"))] == [0, 0]
-
-
-def test_poses_under_the_same_intrinsics_stay(observed):
-    obs = observed[0.0]
-    assert tables.poses_under(obs, None) is obs.board_poses
-    np.testing.assert_allclose(tables.poses_under(obs, obs.model), obs.board_poses, atol=1e-6)
 
 
 def test_stereo_check_is_zero_for_exact_cameras():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from falsified import FALSIFIED
 from joint_draws import draw, rng
+from shared import campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.evaluate.verdict import contradicts_stated, verdict
@@ -36,7 +37,13 @@ def judged(change, seed, mount="head", stated=True):
     return reasons, state_errors(solution.state, truth, solution.unknowns)[:16] if whole else None, solution
 
 
-@pytest.mark.parametrize("name", FALSIFIED)
+LIVE = (  # what test_alternatives does not falsify; the others in make campaign
+    "board and squares 5 % too large", "ranges 60 mm too long", "pitch 3 % too small", "noise of images stated a tenth",
+    "scans of two placements exchanged", "spot stated 0.4 times too narrow", "three placements",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in LIVE else campaign) for n in FALSIFIED])
 def test_what_is_falsified_is_named(name):
     change, kinds = FALSIFIED[name]
     reasons, errors, solution = judged(change, 7)
@@ -47,15 +54,18 @@ def test_what_is_falsified_is_named(name):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("bearings mirrored", "other sense"), ("pitch reversed", "other sense"), ("cameras exchanged", "folders?")],
-)
+    [pytest.param("bearings mirrored", "other sense", marks=campaign),
+     pytest.param("pitch reversed", "other sense", marks=campaign), ("cameras exchanged", "folders?")],
+)  # fmt: skip
 def test_what_is_named_where_no_platform_and_no_guess_is_stated(name, words):
     reasons, *_ = judged(FALSIFIED[name][0], 7, "platform", stated=False)
     assert words in "".join(reason.words for reason in reasons)
 
 
-@pytest.mark.parametrize("mount", ["head", "platform"])
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize(
+    ("seed", "mount"), [(11, "head"), (12, "platform"), *(pytest.param(s, m, marks=campaign) for s in range(13, 19)
+                                                           for m in ("head", "platform"))],
+)  # fmt: skip
 def test_an_honest_recording_gives_no_alarm(seed, mount):
     reasons, errors, solution = judged(lambda obs: obs, seed, mount)
     assert [reason.kind for reason in reasons if reason.kind not in ("error", "distance")] == []

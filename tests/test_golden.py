@@ -7,7 +7,7 @@ from shared import QUICK, stages
 
 @pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
 def test_tables_of_the_small_session(path, tmp_path):
-    run_plainly(path, QUICK, stages(), tmp_path)
+    run_plainly(path, QUICK, stages(), tmp_path, drawn=False)  # figures are looked at on both larger sessions
     check_tables(tmp_path, "sim_quick", path)
 
 

@@ -196,8 +196,3 @@ def test_the_recording_rebuilds_the_independent_recovery(lms400_session, real_da
         assert np.linalg.norm(cloud - importers.LASERSETERO_CLOUD.apply(theirs), axis=1).max() < 1e-6
         published = read_pcd(real_data / "lms400_zed" / f"plane_{placement:02d}.pcd")
         assert np.linalg.norm(cloud - published, axis=1).max() < 1.5e-6
-
-
-def test_the_recording_alternates_its_sweep_direction(lms400_session):
-    session = open_session(lms400_session)
-    assert [session.sweep_direction(p) for p in session.placements] == [1, -1] * 10

@@ -10,13 +10,13 @@ from shared import QUICK
 
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
-from lrfcal_lib.calibrate.outline import edge_on_plane, fused_outline_of
+from lrfcal_lib.calibrate.outline import fused_outline_of
 from lrfcal_lib.evaluate import scenes, tables
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.simulate.draw import board_poses
-from lrfcal_lib.solvers.joint import solve_again, solve_joint
+from lrfcal_lib.solvers.joint import solve_joint
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +66,6 @@ def test_edges_sharper_than_beams_can_show_are_known_as_well_as_their_scores_say
     assert 0.5 < square < 1.6
 
 
-def test_pitch_noise_asks_for_errors_of_every_sweep(joint):
-    for noise, sweep in (((0.005, 0.0), "offset"), ((0.005, 0.04), "offset_stretch")):
-        loose = replace(joint.prepared, pitch_noise=pipeline.PitchNoise(*noise))
-        assert pipeline.joint_settings(loose, joint.observations)["sweep"] == sweep
-
-
 def test_errors_agree_with_their_sigma(joint, truth):
     table = tables.joint_errors(joint, truth)
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
@@ -82,12 +76,6 @@ def test_errors_agree_with_their_sigma(joint, truth):
 def test_every_placement_is_left_out_once(joint):
     assert set(joint.without) == set(joint.solution.boards)
     assert all(placement not in solution.boards for placement, solution in joint.without.items())
-
-
-def test_all_placements_again_change_nothing(joint):
-    again = solve_again(joint.observations, joint.solution)
-    step = (again.solution.parameters - joint.solution.solution.parameters) / joint.solution.solution.sigma
-    assert np.abs(step).max() < 0.05
 
 
 def test_corrections_undo_what_the_estimate_found(joint):
@@ -208,22 +196,10 @@ def test_what_is_known_of_a_board_is_differentiated_exactly(joint):
     assert own > 6 and J.any() and np.abs(numeric - J).max() < 2e-2 * np.abs(J).max()
 
 
-def test_an_image_edge_on_a_plane_projects_onto_itself(quick):
-    camera, views = next(iter(quick.prepared.views.items()))
-    edge = next(iter(views.values())).edges[0]
-    model = quick.prepared.models[camera]
-    T = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.3]))
-    centre, normal = T.inv().apply([0.1, 0.0, 1.7]), T.inv().rotation.apply([0.2, 0.1, -0.97])
-    points = edge_on_plane(edge, model, T.inv(), centre, normal)
-    np.testing.assert_allclose((points - centre) @ normal, 0, atol=1e-12)
-    q = T.apply(points)
-    uv = q[:, :2] / q[:, 2:] * [model.fx, model.fy] + [model.cx, model.cy]
-    np.testing.assert_allclose(uv @ edge.line[:2] + edge.line[2], 0, atol=1e-9)
-
-
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
     problems = {placement: "a dog ran through" for placement in quick.prepared.scans}
-    again = pipeline.with_joint(replace(quick, prepared=replace(quick.prepared, problems=problems), joint=None))
+    lost = pipeline.joint_or_words(replace(quick.prepared, problems=problems))
+    again = pipeline.with_joint(replace(quick, joint=None), lost)
     assert again.joint is None and "no placement" in again.problems["rig", "joint"]
     assert again.solutions is quick.solutions

@@ -73,21 +73,6 @@ def test_the_checksum_is_that_of_the_manual(length):
     assert [crc16(row.tobytes()) for row in rows] == expected
 
 
-def test_single_flips_are_seen_and_pairs_unless_on_a_diagonal():
-    """Bit j of a byte and bit j + 1 of the next weigh the same, a weakness of this checksum."""
-    raw = np.frombuffer(encode_scan(np.linspace(1, 8, 181)), np.uint8)[:-2]
-    bits = np.arange(8 * len(raw))
-    flips = np.zeros((len(bits), len(raw)), np.uint8)
-    flips[bits, bits // 8] = 1 << (bits % 8)
-    changes = crc16(raw ^ flips) ^ np.uint16(crc16(raw.tobytes()))
-    diagonal = bits % 8 - bits // 8
-    assert np.all(changes > 0)
-    first, second = np.random.default_rng(1).integers(0, len(bits), (2, 100_000))
-    same = diagonal[first] == diagonal[second]
-    np.testing.assert_array_equal(changes[first] == changes[second], same)
-    assert 0 < same.mean() < 0.01
-
-
 REFUSED = [
     (codec.parse_telegram, b"", "begins with 02.*got none"),
     (codec.parse_telegram, A0[:3], "begins with 02.*got 02 80 03"),
@@ -189,27 +174,6 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
         np.testing.assert_array_equal(codec.encode_values(values, unit=unit, mode=mode, **how), words[known])
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("unit", ["cm", "mm"])
-def test_ranges_come_back_to_half_a_count(mode, unit):
-    count = {"cm": 0.01, "mm": 0.001}[unit]
-    largest = MODES[mode].largest * count
-    sent = np.random.default_rng(3).uniform(0, largest, 401)
-    sent[:4] = np.nan, np.inf, largest + count, largest
-    scan = decode_scan(encode_scan(sent, unit=unit, mode=mode), mode)
-    np.testing.assert_allclose(scan.ranges[0, 3:], sent[3:], atol=count / 2 * 1.0001)
-    assert np.isnan(scan.ranges[0, 0]) and np.all(np.isinf(scan.ranges[0, 1:3]))
-    assert scan.reasons[0, :4].tolist() == [1, 6, 6, 0]
-
-
-def test_bearings_are_those_of_the_variant():
-    for first, last, step in ((40, 140, 1), (40, 140, 0.5), (40, 140, 0.25), (0, 180, 1), (0, 180, 0.5)):
-        bearings = np.arange(first, last + step / 2, step)
-        np.testing.assert_array_equal(codec.scan_quarters(len(bearings)) / 4, bearings)
-    parts = np.concatenate([codec.scan_quarters(181 - (p > 0), p) for p in range(4)])
-    np.testing.assert_array_equal(np.sort(parts), np.arange(721))
-
-
 # ---------------------------------------------------------------------------------------------------- streams
 
 
@@ -246,15 +210,6 @@ def test_telegrams_are_found_between_garbage():
     assert np.all(np.diff(stream.offset) >= stream.length[:-1])
 
 
-def test_a_damaged_telegram_is_named_and_its_neighbours_live():
-    raw = encode_scan(np.full(181, 3.0))
-    data = bytearray(raw * 5)
-    data[2 * len(raw) + 100] ^= 1
-    stream = split_stream(data)
-    np.testing.assert_array_equal(stream.offset, len(raw) * np.array([0, 1, 3, 4]))
-    assert stream.rejected.tolist() == [2 * len(raw)] and stream.skipped == len(raw)
-
-
 @pytest.mark.parametrize("cut", range(1, 16))
 def test_an_unfinished_telegram_is_kept_for_later(cut):
     raw = encode_scan([1.0, 2.0, 3.0])
@@ -287,11 +242,6 @@ def test_configuration_survives_and_says_its_mode():
     assert again.changed(measuring_mode=4, unit="mm", realtime_indices=False) == read
     factory = codec.Configuration()  # of an outdoor device
     assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
-
-
-def test_the_type_is_told():
-    by_code = {raw[4]: raw for raw in REPLIES}
-    assert codec.parse_type(by_code[0xBA]) == ("LMS221", "302063", "X01.27")
 
 
 # --------------------------------------------------------------------------------------------- real recordings

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from joint_draws import draw, none
+from joint_draws import MOUNTS, draw, none
 from notebook_runs import GOLDEN
+from shared import campaign
 from test_joint import random_problem
 
 from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, spread, state_errors
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
-from lrfcal_lib.fit.residuals import Unknowns, gather, move_state, named_blocks
+from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns, gather, move_state, named_blocks
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -80,8 +81,8 @@ def test_refused_draws_are_counted_not_hidden():
             raise DegenerateGeometry("too few")
         return solve_joint(obs, sensor=SENSOR)
 
-    found = monte_carlo(lambda rng: draw(rng, int(rng.integers(2, 8)))[:2], refuse, range(12))
-    assert set(found.failed.values()) == {"too few"} and len(found.seeds) + len(found.failed) == 12
+    found = monte_carlo(lambda rng: draw(rng, int(rng.integers(2, 5)), pitch_step=0.05)[:2], refuse, range(16))
+    assert set(found.failed.values()) == {"too few"} and len(found.seeds) + len(found.failed) == 16
     assert set(consistency(found).failed) == {len(found.failed)}
     with pytest.raises(ValueError, match="all 1 draws were refused, the last one: too few"):
         monte_carlo(lambda rng: draw(rng, 2)[:2], refuse, [0])
@@ -141,19 +142,32 @@ def draw_plainly(rng, mount):
 
 @pytest.mark.parametrize("mount", ["cameras pitch along", "cameras stand still"])
 def test_errors_reach_the_bound_and_are_as_stated(mount):
-    """In the draws of notebook 08, which are drawn and solved again wherever it runs. Limits that a correct estimator
-    passes in all but one of a thousand runs, widened by the 7 % that twelve placements make the softness of the edges
-    look smaller than it is."""
+    """In the draws of notebook 08, which are drawn and solved again wherever it runs, within the limits of chance."""
     table = pd.read_csv(GOLDEN / "sim_lms221" / "consistency.csv").set_index(["cameras", "group"]).loc[mount]
+    pooled = table.loc["all"]
+    assert (table.failed == 0).all() and (table.trials >= 12).all()
+    for name in ("rmse_over_crb", "coverage", "nees"):
+        assert pooled[f"{name}_low"] <= pooled[name] <= pooled[f"{name}_high"]
+
+
+@campaign
+@MOUNTS
+def test_errors_of_a_hundred_sessions_reach_the_bound_and_are_as_stated(mount):
+    """Limits that a correct estimator passes in all but one of a thousand runs, widened by the 7 % that the softness of
+    the edges may look smaller than it is."""
+    settings = {"mount": mount, "pitch_step": np.radians(0.5), "floor": LEAST_STEP}
+    found = monte_carlo(lambda rng: draw(rng, 20, **settings)[:2], solve_joint, range(1000, 1100))
+    table = consistency(found).set_index("group")
     judged, pooled = table.drop(index=["edge softness", "all"]), table.loc["all"]
-    assert (table.failed == 0).all() and (table.trials >= 30).all() and judged.rmse_over_crb.between(0.7, 1.375).all()
+    print(table.round(3).to_string())
+    assert (table.failed == 0).all() and judged.rmse_over_crb.between(0.8, 1.25).all()
     assert 0.9 < pooled.rmse_over_crb < 1.18 and 0.80 < pooled.coverage < 0.97 and 0.8 < pooled.nees < 1.35
 
 
 @pytest.mark.parametrize("mount", ["head", "platform"])
 def test_the_stated_covariance_is_the_bound(mount):
     ratios = []
-    for seed in range(5):
+    for seed in range(3):
         obs, truth = draw_plainly(np.random.default_rng(seed), mount)
         found = solve_joint(obs)
         ratios.append(np.diag(found.solution.covariance) / np.diag(bound(obs, truth, found.unknowns)))

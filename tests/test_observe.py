@@ -38,20 +38,3 @@ def test_beams_flip_where_the_bias_says(bias):
     assert abs(hit[used].sum() - expected) < 4 * spread + 1
     certain = np.where(hit, chance[True], chance[False])[used]
     assert np.mean(certain > 0.5) > 0.95
-
-
-def test_single_shots_and_images():
-    obs, *_ = draw(rng(0), 4, see_span=0.0, see_images=1)
-    assert set(obs.direction) == {0} and len(obs.view_pitch) == 8
-    for p in range(4):
-        mine = obs.face_placement == p
-        assert len(np.unique(obs.face_pitch[mine])) == 1
-        assert np.allclose(obs.view_pitch[obs.view_placement == p], obs.face_pitch[mine][0])
-    assert draw(rng(0), 3, see_images=0)[0].view_pose.shape == (0, 4, 4)
-    assert set(draw(rng(0), 3)[0].direction) == {-1, 1}
-
-
-def test_one_seed_gives_one_draw():
-    one, two, other = (draw(rng(seed), 3)[0] for seed in (1, 1, 2))
-    assert np.array_equal(one.face_range, two.face_range) and np.array_equal(one.beam_hit, two.beam_hit)
-    assert len(one.face_range) != len(other.face_range) or not np.array_equal(one.face_range, other.face_range)

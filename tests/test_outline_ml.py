@@ -11,7 +11,6 @@ from lrfcal_lib.calibrate.outline import EdgeModel, face_surface, measure_outlin
 from lrfcal_lib.fit.residuals import edge_shift
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
-from lrfcal_lib.preprocess.edges_in_scan import EdgeCells
 
 HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
 BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))
@@ -36,9 +35,9 @@ def sweep(pose, rng, sigma=0.003, bend=0.0):
     radius = 0.008 + 0.006 * r
     hit = u.max(axis=1) - edge_shift(-0.8, radius)[0] < 0.05 * radius * rng.standard_normal(len(r))
     some = np.flatnonzero((np.abs(u.max(axis=1)) < 0.02) & (np.sort(inside, axis=1)[:, -2] < -0.025))
-    zero, number = np.zeros(len(some)), np.arange(len(some))
-    cells = EdgeCells(1, number, number, bearing[some], pitch[some], hit[some], u[some].argmax(axis=1), r[some],
-                      radius[some], zero, zero > 0, zero + STEP)  # fmt: skip
+    zero = np.zeros(len(some))
+    columns = bearing[some], pitch[some], hit[some], u[some].argmax(axis=1), r[some], radius[some], zero, zero + STEP
+    cells = np.rec.fromarrays(columns, names="bearing,pitch,hit,side,range_m,radius,background,step")
     face = np.flatnonzero(inside.max(axis=1) < -0.03)
     ranges = r[face] + 0.004 + sigma * rng.standard_normal(len(face))
     return cells, (polar_to_points(ranges, bearing[face]), pitch[face], sigma), dict(enumerate(BOARD.edges))
@@ -101,4 +100,4 @@ def test_sides_that_were_not_seen_have_no_length():
 def test_what_nothing_was_seen_of_is_named():
     cells, face, names = sweep(poses(1)[0], np.random.default_rng(9))
     with pytest.raises(DegenerateGeometry, match="no side has 8 beams"):
-        measure_outline(cells.select(np.arange(6)), face, names, BOARD.edges, MODEL)
+        measure_outline(cells[:6], face, names, BOARD.edges, MODEL)

@@ -5,7 +5,6 @@ import logging
 import threading
 import time
 
-import cv2
 import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, raising, rig_data
@@ -151,16 +150,6 @@ def test_one_thing_at_a_time(connected, monkeypatch):
     assert connected.finished == (1,)
 
 
-def test_closing_stops_the_head_whatever_happened(connected):
-    head = connected.rig.head
-    head.fail = LineLost("the line to the head is lost: check its plug")
-    with pytest.raises(LineLost, match="check its plug"):
-        connected.capture()
-    stops = head.stops
-    connected.close()
-    assert head.stops > stops and not connected.connected and connected.finished == ()
-
-
 def test_advice_is_asked_from_the_third_placement_on(connect):
     made = connect(count=9)
     lights = [made.capture() for _ in range(4)]
@@ -169,13 +158,6 @@ def test_advice_is_asked_from_the_third_placement_on(connect):
 
 
 # ----------------------------------------------------------------------------------------------- the live view
-
-
-def test_a_look_shows_scan_images_and_where_the_head_is(connected):
-    assert connected.move_to(0.05) == pytest.approx(0.05)
-    view = connected.look()
-    assert view.ranges.shape == view.bearings.shape and list(view.frames) == ["left"] and view.trouble == ""
-    assert view.pitch == pytest.approx(0.05) and view.measured
 
 
 def test_a_lost_line_is_looked_for(connected):
@@ -203,6 +185,8 @@ def test_nothing_works_without_a_rig():
     ("missing.json", RigFileError, "No such file.*emulate"),
     ("rig.json", PortError, "head: .*fake_head"),
 ])  # fmt: skip
+
+
 def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.json").write_text(json.dumps(rig_data(cameras=())))
@@ -238,14 +222,6 @@ def test_a_scan_from_above_is_drawn_where_it_is():
     assert painted[0][0] < painted[1][0]  # straight ahead is up
 
 
-@pytest.mark.parametrize("near, far, same", [(0.5, 1.9, True), (0.5, 3.5, False), (81.0, 300.0, True)])
-def test_the_view_reaches_as_far_as_the_points(near, far, same):
-    bearing = np.full(20, np.pi / 2)
-    circles = [(page.scan_picture(np.full(20, r), bearing, VIEW)[:, 250:] for r in (near, far))]
-    assert all(np.array_equal(*pair) == same for pair in circles)
-    assert page.scan_picture(np.full(20, far), bearing, VIEW).shape == (300, 400, 3)
-
-
 def test_a_sweep_grows_line_by_line():
     bearings, ranges = np.linspace(*VIEW, 101), np.full(101, 4.0)
     ranges[80:] = 1.0  # near at the large bearings, which are on the left
@@ -261,13 +237,6 @@ def test_a_sweep_grows_line_by_line():
     assert np.nonzero((low != empty).any(axis=2))[0].min() > 200
     nothing = drawn({0.0: np.full(101, np.nan)})
     assert (np.ptp(nothing[(nothing != empty).any(axis=2)], axis=1) == 0).all()  # grey
-
-
-def test_images_become_files_no_wider_than_asked():
-    image = np.zeros((30, 40, 3), np.uint8)
-    for width, expected in ((20, (15, 20, 3)), (400, (30, 40, 3))):
-        assert cv2.imdecode(np.frombuffer(page.jpeg(image, width), np.uint8), 1).shape == expected
-    assert (cv2.imdecode(np.frombuffer(page.png(image + 7), np.uint8), 1) == 7).all()
 
 
 # ------------------------------------------------------------------------------------------------------- words
@@ -383,33 +352,6 @@ def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypa
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
     assert panel.notes not in logging.getLogger("lrfcal_lib").handlers
-
-
-def test_stop_ends_what_a_button_began(panel):
-    panel.connect()
-    begun, lrf = threading.Event(), panel.collector.rig.lrf
-
-    def wait():
-        if threading.current_thread().name != "panel view":
-            begun.set()
-            panel.collector.stopped.wait(WAIT_S)
-
-    lrf.wait = wait
-    panel.parts.capture.click()
-    assert begun.wait(WAIT_S)
-    panel.parts.stop.click()
-    panel.job.result(WAIT_S)
-    assert "does not count" in panel.parts.error.value and panel.collector.finished == ()
-
-
-def test_shown_with_words_for_those_who_do_not_run_it(panel, monkeypatch):
-    import IPython.display
-
-    shown = []
-    monkeypatch.setattr(IPython.display, "display", lambda data, raw: shown.append(data))
-    panel.show()
-    assert shown[0]["text/plain"].startswith("The data collection panel")
-    assert shown[0]["application/vnd.jupyter.widget-view+json"]["model_id"] == panel.parts.root.model_id
 
 
 def test_the_emulated_rigs_are_those_that_there_are():

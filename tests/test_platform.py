@@ -10,7 +10,6 @@ import synthetic
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import CORNERS, TRIANGLE, edge_sweeps, numeric, sweep_boards
 
-from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import move_head, prior_terms
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -113,13 +112,6 @@ def test_platform_jacobians_against_numeric_ones():
         np.testing.assert_allclose(block.jacobian[used], J[used], atol=2e-6)
 
 
-def test_platform_gradient_includes_the_noise():
-    blocks = platform_problem(9, 3, TRUTH, 0.0, 0.0)
-    gradient = sum(np.einsum("pn,pnk->k", *whiten(b))[:4] for b in blocks(np.zeros(12)))
-    cost = numeric(lambda s: 0.5 * sum(np.sum(whiten(b)[0] ** 2) for b in blocks(np.r_[s, np.zeros(8)])), 4)
-    np.testing.assert_allclose(gradient, cost, rtol=1e-4, atol=1e-3)
-
-
 def test_prior_jacobian_against_a_numeric_one():
     prior, head = PlatformPrior(TRUTH, 0.01, 0.02), pose_array(ROUGH)
     J = numeric(lambda s: prior_terms(move_head(head, s), prior)[0], 4)
@@ -142,14 +134,14 @@ def test_error_agrees_with_the_predicted_covariance(faces, monkeypatch):
     monkeypatch.setattr(platform, "SIGMA_GAP", 1e-4)
     rng = np.random.default_rng(11)
     boards, scores, errors = sweep_boards(rng, 20), [], []
-    for _ in range(16):
+    for _ in range(10):
         obs = swept(rng, boards, noise=1.0)
         found = solve_platform(obs if faces else without_faces(obs), ROUGH)
         e, covariance = chart_error(found.T_head_lrf), found.solution.covariance
         scores.append(e @ np.linalg.solve(covariance, e) / 4)
         errors.append(e / np.sqrt(np.diag(covariance)))
     assert 0.6 < np.mean(scores) < 1.5
-    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(16)
+    assert np.abs(np.mean(errors, axis=0)).max() < 4.5 / np.sqrt(10)
 
 
 def test_one_edge_with_a_face_serves_too():
@@ -186,6 +178,8 @@ def test_one_placement_leaves_the_axis_uncertain():
     ("face_points", np.nan, "face_points holds 3 values that are not finite"),
     ("edge_number", 3, r"edge_number must be 1 or 2 \(the two perpendicular edges\), got \[1 2 3\]"),
 ])  # fmt: skip
+
+
 def test_what_cannot_be_is_refused(field, value, message):
     obs = make(18, count=2)
     values = getattr(obs, field).copy()
@@ -279,16 +273,6 @@ def test_pitch_jacobians_against_numeric_ones(name):
     k = pitch_solver.pitch_blocks(state, data, name)[0].jacobian.shape[-1]
     for i, block in enumerate(blocks(np.zeros(k))):
         np.testing.assert_allclose(block.jacobian, numeric(lambda s, i=i: blocks(s)[i].residuals, k), atol=1e-7)
-
-
-def test_corrected_pitch_makes_the_scans_fit():
-    _, sweeps = pitched(26, np.radians(0.3) * ALTERNATING, 0.0)
-    model = estimate_pitch_errors(*sweeps).models["direction"]
-    obs = sweeps[0]["left"]
-    p = geometry.tilt(obs.plane_points, model.offset[obs.plane_placement - 1])
-    boards = obs.board_poses[obs.plane_placement - 1]
-    q = model.transforms["left"].apply(p)
-    assert np.abs(np.sum(boards[:, :3, 2] * (q - boards[:, :3, 3]), axis=1)).max() < 1e-9
 
 
 def test_sweeps_all_one_way_have_no_direction_offset():

@@ -15,16 +15,15 @@ import cv2
 import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, picture, rig_data, telegram
-from shared import QUICK
+from shared import QUICK, campaign
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.acquire import record
-from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan, edge_rise
+from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan
 from lrfcal_lib.acquire.record import Recording, RecordingError, main, record_session
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.port import DeviceError
-from lrfcal_lib.drivers.rig import Moved, Scanned
-from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.drivers.rig import Scanned
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
@@ -121,15 +120,6 @@ def test_a_continuous_sweep_is_written_with_its_track_and_a_scene_as_one(path):
     assert all(float(row[1]) == 8 for row in told[2:]) and len(told) == 2 + len(rig.head.track) and scenes == (1,)
 
 
-def test_every_event_is_on_the_disk_when_it_is_seen(path, rig):
-    recording = Recording(rig, path)
-    for event in recording.run(recording.to_do()[0]):
-        if isinstance(event, Scanned):
-            assert (path / "lrf" / "telegrams.bin").read_bytes().endswith(event.readings[0].telegrams[0])
-        elif isinstance(event, Moved):
-            assert float(rows(path, "platform.csv")[-1][0]) == pytest.approx(event.time_s)
-
-
 def test_interlaced_telegrams_share_their_pitch(path, rig):
     recording, reading = Recording(rig, path), rig.lrf.request()
     recording.writer.begin_placement(1)
@@ -196,6 +186,8 @@ def test_a_row_that_was_cut_off_does_no_harm(path, rig, file):
     (("rig", "lrf", "sigma_range_m"), 0.02, r"rig\.lrf\.sigma_range_m is 0\.01, not 0\.02, unlike the rig now"),
     (("board", "corners_m", 1), [0.5, 0], "board.corners_m"),
 ])  # fmt: skip
+
+
 def test_only_the_same_rig_goes_on(path, rig, way, value, message):
     write(rig, path, count=1)
     other, (part, key, at) = listed(-4, 0, 4), way
@@ -275,10 +267,11 @@ def record_and_die(data, path, told, writes):
         os.write(told, bytes([placement.number]))
 
 
-def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(path):
+@pytest.mark.parametrize("kills", [6, pytest.param(20, marks=campaign)])
+def test_kills_of_two_writers_lose_nothing_that_was_finished(path, kills):
     data = listed(*np.linspace(-50, 40, 120).round(1).tolist(), cameras=("left", "right"))
     rng, rig, known, lost = np.random.default_rng(5), make_rig(data), set(), 0
-    for _ in range(20):
+    for _ in range(kills):
         read_end, write_end = os.pipe()
         children = [in_child(record_and_die, data, path, write_end, int(n)) for n in rng.integers(60, size=2)]
         os.close(write_end)
@@ -294,7 +287,7 @@ def test_twenty_kills_of_two_writers_lose_nothing_that_was_finished(path):
             known = finished
             for number in finished:
                 assert contents(path, number, session) == expected(rig, number)
-    assert 5 < len(known) < len(rig.stated.plan.to_do()) and lost > 3
+    assert kills // 4 < len(known) < len(rig.stated.plan.to_do()) and lost > kills // 6
     recording = write(rig, path, resume=True, count=max(known) + 1)
     recording.finish()
     assert validate(path) == [] and len(recording.finished) == max(known) + 1
@@ -542,6 +535,8 @@ def test_a_session_removed_amid_a_recording_is_not_called_safe(run, rig, path, r
     ("head", "pitch_limits_deg", [0, 1], "pitch_limits_deg are 0 to 1: ask for less"),
     ("plan", "mode", "fast", "plan.mode is 'fast'"),
 ])  # fmt: skip
+
+
 def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, path, capsys, part, name, value, message):
     data = listed(-4)
     {**data, **data["devices"]}[part][name] = value
@@ -560,9 +555,9 @@ def test_the_command_line_passes_everything_on(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         command_line.main(["record", "rig.json", "s", "--placements", "0"])
     assert "1 or more are needed" in capsys.readouterr().err
-    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda rest: got.update(rest=rest) or 0)
+    monkeypatch.setattr("lrfcal_lib.emulators.rig.main", lambda *args, **options: got.update(options, args=args) or 0)
     assert command_line.main(["emulate", "sim_quick", "--rig-file", "x.json"]) == 0
-    assert got["rest"] == ["sim_quick", "--rig-file", "x.json"]
+    assert got["args"] == ("sim_quick", "x.json") and (got["seed"], got["feedback"]) == (0, "full")
 
 
 # ---------------------------------------------------------------------------------------------------------- lights
@@ -593,6 +588,8 @@ def test_a_scene_is_checked_for_returns_alone(quick):
     (lambda sweep: some(sweep, slice(None, len(sweep.pitch) // 2)), "warn", "line hits it: sweep farther"),
     (lambda sweep: some(sweep, slice(0, None, 10)), "warn", "take a smaller step"),
 ])  # fmt: skip
+
+
 def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick, change, state, text):
     first, *rest = check_scan(change(quick.sweep(2)), quick.board, quick.T_head_lrf)
     assert first.state == state and text in first.text and bool(rest) == (state == "warn")
@@ -624,16 +621,6 @@ def test_a_board_without_a_pattern_needs_intrinsics(quick):
     assert check_image(image, bare).state == "warn"
     light = check_image(np.zeros_like(image), bare, CameraModel(640, 480, 670.0, 670.0, 320.0, 240.0, np.zeros(5)))
     assert light.state == "bad" and light.text
-
-
-@pytest.mark.parametrize("sigma", [0.8, 1.5, 2.5, 4.0])
-def test_the_rise_of_edges_is_that_of_a_gaussian(sigma):
-    size, pattern = 40, Chessboard(4, 5, 0.03)
-    cells = np.indices((pattern.rows + 1, pattern.columns + 1)).sum(axis=0) % 2
-    picture = cv2.GaussianBlur(np.kron(cells, np.ones((size, size))).astype(np.float32) * 180 + 40, (0, 0), sigma)
-    v, u = np.mgrid[1 : pattern.rows + 1, 1 : pattern.columns + 1] * size - 0.5
-    grid = np.stack([u, v], axis=-1).astype(float)
-    assert edge_rise(picture.astype(np.uint8), grid) == pytest.approx(2.563 * sigma, abs=0.6)
 
 
 def test_a_camera_without_images_is_red(path):

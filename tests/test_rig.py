@@ -5,11 +5,10 @@ import json
 import math
 import operator
 import os
-import socketserver
 import threading
-import time
 from dataclasses import replace
 from functools import partial, reduce
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import numpy as np
 import pytest
@@ -17,10 +16,10 @@ from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, r
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
-from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, host_clock, unchanged
+from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, unchanged
 from lrfcal_lib.drivers.rig_file import HeadSettings, Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.drivers.video import find_source
-from lrfcal_lib.session.lms2xx_codec import CONFIGURATION, Configuration, parse_configuration
+from lrfcal_lib.session.lms2xx_codec import Configuration
 
 # ------------------------------------------------------------------------------------------------------ rig file
 
@@ -145,6 +144,8 @@ NO_FILES = (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero"))
     *((lambda path, text=text: path.write_bytes(text), "not JSON") for text in NO_JSON),
     *((make, "no file, or one of more than") for make in NO_FILES),
 ])  # fmt: skip
+
+
 def test_no_rig_file(tmp_path, made, message):
     path = tmp_path / "rig.json"
     made(path)
@@ -264,17 +265,6 @@ def test_interlaced_scans_are_streamed():
     assert not rig.lrf.streaming
 
 
-def test_nothing_is_held_back():
-    rig = make_rig()
-    events = begun(rig)
-    for _ in range(3):
-        at = rig.head.at
-        assert isinstance(next(events), Moved) and rig.head.at != at
-        made = len(rig.lrf.readings)
-        assert isinstance(next(events), Scanned) and len(rig.lrf.readings) == made + 1
-    events.close()
-
-
 def scans(moving, noise, step=0.0):
     """Ranges of 40 scans of a wall, 361 beams, while a head moves by 20 deg or not; a person walks by."""
     rng, pitch = np.random.default_rng(5), np.linspace(-10, 10, 40) * moving
@@ -356,24 +346,18 @@ def test_scans_of_a_sweep_have_the_pitch_of_their_instant(heads):
     assert np.ptp(pitch) > math.radians(38)
 
 
-def test_scans_of_a_sweep_are_handed_out_while_it_goes_on():
-    rig = make_rig(rig_data(mode="continuous", pitch_deg=[-10, 50, 1]))
-    shares = [e.share for e in events_of(rig, kind=Scanned)]
-    assert len(shares) > 2 and shares == sorted(shares) and shares[0] < 0.7 and shares[-1] == 1.0
-
-
 def test_a_sweep_without_scans_is_given_up(monkeypatch):
     monkeypatch.setattr(rig_module, "GAP_S", 0.05)
     monkeypatch.setattr(rig_module, "BATCH_S", 0.02)
     rig = make_rig(rig_data(mode="continuous"))
-    newest = rig.lrf.newest
+    take = rig.lrf.take
 
-    def once(**options):
-        found = newest(**options)
+    def once(*args, **options):
+        found = take(*args, **options)
         rig.lrf.silent = True
         return found
 
-    rig.lrf.newest = once
+    rig.lrf.take = once
     rig.head.speed = 1e-6
     rig.head.move_to = lambda pitch: setattr(rig.head, "at", pitch) or pitch
     with pytest.raises(NoReply, match=r"no scan for 0\.05 s of the sweep"):
@@ -389,7 +373,7 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
     clock, made = Clock(), []
     head = Head(clock)
     lrf, camera = Lrf(head, clock), Camera("left", head, clock)
-    camera.settings = {"size": {"asked": SIZE, "got": size}}
+    camera.size = size
 
     def make(driver, fake, *_, **__):
         made.append(driver)
@@ -402,27 +386,14 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
     return made
 
 
-def test_the_clock_of_a_rig_is_not_set_by_others(monkeypatch):
-    clock = host_clock()
-    before, wall = clock(), time.time()
-    assert before == pytest.approx(wall, abs=1.0)
-    monkeypatch.setattr(time, "time", lambda: wall + 1e6)
-    assert 0 <= clock() - before < 100
-
-
-def test_all_devices_are_closed_again(monkeypatch):
-    made = fake_drivers(monkeypatch)
-    with Rig.open(rig_of(rig_data())) as rig:
-        assert sorted(made) == ["Camera", "LMS2xx", "PanTilt"] and list(rig.cameras) == ["left"]
-    assert made == []
-
-
 @pytest.mark.parametrize(("options", "error", "message"), [
     ({"LMS2xx": PortError("there is no port")}, PortError, "lrf: there is no port"),
     ({"Camera": PortError("there is no port")}, PortError, "camera 'left': there"),
     ({"LMS2xx": ValueError("an LMS2xx has 9600 Bd, got 300")}, RigFileError, r"rig\.json: lrf: an LMS2xx has 9600 Bd"),
     ({"size": (16, 12)}, RigFileError, r"camera 'left': it gives 16 x 12 .*rig\.cameras\.left states 32 x 24"),
 ])  # fmt: skip
+
+
 def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
     made = fake_drivers(monkeypatch, **options)
     with pytest.raises(error, match=message):
@@ -443,28 +414,22 @@ def test_what_the_device_says_about_itself_counts():
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
 
 
-def test_a_recording_begins_with_the_configuration():
-    (raw,) = make_rig().begin_telegrams()
-    assert raw[4] == CONFIGURATION and parse_configuration(raw).measuring_mode == 0
+class Control(BaseHTTPRequestHandler):
+    """An emulated rig that has eight placements."""
+
+    def do_GET(self):
+        self.send_response(204 if int(self.path[-1]) < 9 else 400, f"no placement {self.path[-1]}")
+        self.end_headers()
 
 
-class Control(socketserver.StreamRequestHandler):
-    """The control socket of a rig that has eight placements."""
-
-    def handle(self):
-        number = json.loads(self.rfile.readline())["arguments"][0]
-        answer = {"ok": True} if number < 9 else {"ok": False, "error": f"no placement {number}"}
-        self.wfile.write(json.dumps(answer).encode() + b"\n")
-
-
-def test_the_board_of_an_emulated_rig_is_moved(tmp_path):
-    rig, path = make_rig(), str(tmp_path / "control")
+def test_the_board_of_an_emulated_rig_is_moved():
+    rig = make_rig()
     assert rig.move_board(1) is False and rig.hold_close("left", 0) is False
-    rig = make_rig(changed("devices.control", path))
-    with socketserver.ThreadingUnixStreamServer(path, Control) as server:
+    with HTTPServer(("127.0.0.1", 0), Control) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        rig = make_rig(changed("devices.control", f"http://127.0.0.1:{server.server_port}"))
         assert rig.move_board(3) is True
-        with pytest.raises(DeviceError, match="control socket .*: .*no placement 9"):
+        with pytest.raises(DeviceError, match="control http:.*: no placement 9"):
             rig.move_board(9)
         server.shutdown()
     with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):

@@ -4,11 +4,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from test_scan import edge_points, sweep_edges, turn_sigma
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
-from lrfcal_lib.preprocess.edges_in_scan import edge_points, sweep_edges
 from lrfcal_lib.report.notebook import ROOT
 from lrfcal_lib.session.read import open_session
 
@@ -67,7 +67,7 @@ def test_each_edge_gives_one_side_with_its_direction(name, placement):
             along = np.linalg.svd(mine - mine.mean(axis=0))[2][0]
             turned = np.arcsin(np.minimum(np.abs(lines[:, :2] @ along), 1.0))
             edge = int(turned.argmin())
-            assert turned[edge] < 4 * side.angle_sigma
+            assert turned[edge] < 4 * turn_sigma(side)
             assert np.abs(np.median(mine @ lines[edge, :2] + lines[edge, 2])) < WIDEST
             assert number_of.setdefault(edge, side.side) == side.side
             here.append(edge)

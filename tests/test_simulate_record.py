@@ -21,10 +21,10 @@ from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import transform_from_json
 from lrfcal_lib.simulate import record
 from lrfcal_lib.simulate.beam import LMS221
-from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, pairs, sim_lms221, sim_quick
+from lrfcal_lib.simulate.rig import SETUPS, Platform, check_size, held_close, load_setup, pairs
 from lrfcal_lib.simulate.scene import Exposure, Imager, World
 
-FULL = sim_quick()
+FULL = load_setup("sim_quick")
 
 
 @pytest.fixture(scope="module")
@@ -54,29 +54,8 @@ def test_backlash_depends_on_the_direction():
     np.testing.assert_allclose(measured, commanded, atol=1e-12)
 
 
-def test_the_encoder_rounds_and_the_head_does_not_rest_exactly():
-    platform = Platform(noise=1e-4, encoder_step=2e-3)
-    true, measured = platform.stop(np.full(4000, 0.1234), 1, np.random.default_rng(0))
-    assert np.std(true) == pytest.approx(1e-4, rel=0.05)
-    np.testing.assert_allclose(measured / 2e-3, np.round(measured / 2e-3), atol=1e-9)
-
-
-def test_stops_are_multiples_of_the_step():
-    np.testing.assert_allclose(record.step_angles(0.11, 0.39, 0.1), [0.1, 0.2, 0.3, 0.4])
-    np.testing.assert_allclose(record.step_angles(0.39, 0.11, 0.1), [0.4, 0.3, 0.2, 0.1])
-
-
-def test_the_scan_plane_meets_a_point_at_the_sweep_pitch():
-    points = np.array([[0.3, 1.8, 0.2], [-0.4, 2.0, -0.5]])
-    pitch, bearing = FULL.rig.sweep_pitch(points)
-    start, end = (lrf_to_platform(polar_to_points(np.full(2, r), bearing), pitch, FULL.rig.T_head_lrf) for r in (0, 4))
-    along = np.sum((points - start) * (end - start), axis=1) / 16
-    assert np.all(along > 0)
-    np.testing.assert_allclose(start + along[:, None] * (end - start), points, atol=1e-9)
-
-
 def test_placements_come_in_near_perpendicular_pairs_in_view():
-    setup = sim_lms221()
+    setup = load_setup("sim_lms221")
     *found, room = record.placements_of(setup)
     assert [p.number for p in found] == list(range(1, 25)) and (room.number, room.T_platform_board) == (25, None)
     assert [len(p.image_pitch) for p in found] == [3, 1] * 12
@@ -193,6 +172,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, after):
     (FULL, {"intrinsics_views": -1}, "-1 intrinsics views"),
     (FULL, {"room_sweep": (0.0, 1.0)}, "room_sweep is"),
 ])  # fmt: skip
+
+
 def test_impossible_settings(given, change, message):
     with pytest.raises(ValueError, match=message):
         replace(given, **change)
@@ -222,13 +203,3 @@ def test_what_cannot_be_simulated(tmp_path, tiny):
         with pytest.raises(ValueError, match=message):
             refused()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_set_up_takes_over_what_it_does_not_say():
-    quick, full = sim_quick(), sim_lms221()
-    assert quick.rig.beam == full.rig.beam and quick.rig.platform == full.rig.platform and quick.step == full.step
-    assert (quick.pairs, full.pairs, quick.quality, full.quality) == (2, 12, 90, 95)
-    for small, large in zip(quick.rig.cameras, full.rig.cameras, strict=True):
-        assert (small.model.width, small.model.height, large.model.width) == (640, 480, 1024)
-        assert small.model.fx / small.model.width == pytest.approx(large.model.fx / large.model.width)
-        np.testing.assert_array_equal(small.guess.as_matrix(), large.guess.as_matrix())

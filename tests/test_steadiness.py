@@ -1,6 +1,5 @@
 """A camera on the base stood still or did not: synthetic backgrounds that are turned, scaled, dimmed and covered."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -9,13 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.evaluate import diagnosis
 from lrfcal_lib.evaluate.diagnosis import motion_words, pitch_words
-from lrfcal_lib.model.camera import CameraModel, distort, project
+from lrfcal_lib.model.camera import CameraModel, distort
 from lrfcal_lib.plots.results import background_motion
 from lrfcal_lib.preprocess import steadiness
-from lrfcal_lib.preprocess.bend import BoardBends
-from lrfcal_lib.preprocess.steadiness import Steadiness, Step, find_steps, fit_motion, motion_misses, pixel_metric
+from lrfcal_lib.preprocess.steadiness import Steadiness, Step, find_steps, fit_motion, motion_misses, pixel_root
 from lrfcal_lib.session.read import open_session
 
 MODEL = CameraModel(480, 320, 300.0, 302.0, 241.0, 158.0, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
@@ -55,8 +52,14 @@ def series(texture, turns, seed=1, **more):
     ]
 
 
-def judge(images, reference=4):
-    return steadiness.steadiness_of("left", images, dict(images)[reference], reference, MODEL)
+def judge(images, mount="platform"):
+    records, pictures = [SimpleNamespace(placement=p) for p, _ in images], dict(images)
+    session = SimpleNamespace(
+        cameras={"left": SimpleNamespace(mount=mount)}, images=lambda camera, purpose: records,
+        placements=list(pictures), read_image=lambda record: pictures[record.placement],
+    )  # fmt: skip
+    made = SimpleNamespace(session=session, views={"left": {}}, models={"left": MODEL})
+    return steadiness.camera_steadiness(made, "left")
 
 
 def motion(rotvec, sigma=1e-6, seed=0):
@@ -64,7 +67,7 @@ def motion(rotvec, sigma=1e-6, seed=0):
     rng = np.random.default_rng(seed)
     rotvec = np.asarray(rotvec, float) + sigma * rng.standard_normal((len(rotvec), 3))
     covariance = np.tile(sigma**2 * np.eye(3), (len(rotvec), 1, 1))
-    return np.arange(1, len(rotvec) + 1), rotvec, covariance, pixel_metric(MODEL)
+    return np.arange(1, len(rotvec) + 1), rotvec, covariance, pixel_root(MODEL)
 
 
 def step_at(k, n=20, size=(0.001, -0.0008, 0.0003)):
@@ -95,18 +98,18 @@ def test_a_turn_is_recovered_among_features_that_went_elsewhere(scale):
     start, end = in_pixels(bare), in_pixels(scale * rays[:, :2] / rays[:, 2:])
     start, end = (p + 0.05 * rng.standard_normal(p.shape) for p in (start, end))
     end[:100] += rng.uniform(-6, 6, (100, 2))
-    found, its, covariance, count = fit_motion(start, end, MODEL)
+    found, its, covariance = fit_motion(start, end, MODEL)
     error = np.r_[found - turn, its - scale]
     assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all()
-    assert np.abs(error).max() * MODEL.fx < 0.03 and 220 < count < 340
+    assert np.abs(error).max() * MODEL.fx < 0.03
 
 
 def test_the_covariance_is_that_of_many_draws():
     rng = np.random.default_rng(2)
     pixels = in_pixels(rng.uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.66])
     draws = [fit_motion(pixels, pixels + 0.1 * rng.standard_normal(pixels.shape), MODEL) for _ in range(60)]
-    spread = np.std([np.r_[turn, scale] for turn, scale, _, _ in draws], axis=0)
-    stated = np.sqrt(np.mean([np.diag(covariance) for _, _, covariance, _ in draws], axis=0))
+    spread = np.std([np.r_[turn, scale] for turn, scale, _ in draws], axis=0)
+    stated = np.sqrt(np.mean([np.diag(covariance) for _, _, covariance in draws], axis=0))
     np.testing.assert_allclose(stated / spread, 1.0, atol=0.35)
 
 
@@ -124,7 +127,7 @@ def test_a_nudge_is_found_where_it_happened(texture):
     assert (step.before, step.after) == (5, 6)
     np.testing.assert_allclose(step.rotvec, turn, atol=1.5e-4)
     assert step.angle == pytest.approx(np.linalg.norm(turn), rel=0.05) and step.angle_sigma < 0.1 * step.angle
-    assert step.size_px == pytest.approx(steadiness.turn_px(turn, pixel_metric(MODEL)), rel=0.05)
+    assert step.size_px == pytest.approx(np.linalg.norm(pixel_root(MODEL) @ turn), rel=0.05)
     assert "camera left moved by 0.1" in motion_words({"left": found})[0]
 
 
@@ -147,7 +150,8 @@ def test_an_image_of_something_else_is_named(texture):
 def test_a_plain_wall_is_refused():
     with pytest.raises(steadiness.BackgroundLost, match="40 in 10 are needed"):
         fit_motion(np.full((5, 2), 100.0), np.full((5, 2), 100.0), MODEL)
-    assert steadiness.find_features(np.full((50, 60), 90, np.uint8)).shape == (0, 2)
+    plain = [(p, np.full((50, 60), 90, np.uint8)) for p in PLACEMENTS]
+    assert len(judge(plain).problems) == len(plain) - 1
 
 
 @pytest.mark.parametrize("n", [6, 10, 20])
@@ -185,33 +189,16 @@ def test_what_is_no_step(what):
     assert find_steps(*motion(*NO_STEP[what])) == ()
 
 
-def test_a_camera_on_the_head_is_not_judged(texture):
-    session = SimpleNamespace(cameras={"left": SimpleNamespace(mount="head", model=None)})
-    found = steadiness.camera_steadiness(session, "left")
+def test_a_camera_on_the_head_is_not_judged():
+    found = judge([], mount="head")
     assert "rides on the head" in found.reason and len(found.placements) == 0 and not found.steps
     assert motion_words({"left": found}) == []
     with pytest.raises(ValueError, match="rides on the head"):
         background_motion(None, {"left": found})
 
 
-def test_unknown_camera_and_missing_intrinsics_are_named():
-    session = SimpleNamespace(cameras={"left": SimpleNamespace(mount="platform", model=None)})
-    with pytest.raises(ValueError, match="no camera 'top'; the session has left"):
-        steadiness.camera_steadiness(session, "top")
-    with pytest.raises(ValueError, match="no intrinsics in the session: give model"):
-        steadiness.camera_steadiness(session, "left")
-    session.images = lambda camera, purpose: ()
-    session.placements = ()
-    assert "0 images" in steadiness.camera_steadiness(session, "left", model=MODEL).reason
-
-
-def test_the_hull_of_a_board_holds_its_pattern_and_edges():
-    corners = np.array([[-0.3, -0.2, 2.0], [0.3, -0.2, 2.0], [0.3, 0.2, 2.0], [-0.3, 0.2, 2.0]])
-    ends = project(corners, replace(MODEL, distortion=np.zeros(5)))
-    view = SimpleNamespace(pixels=None, edges=[SimpleNamespace(ends=ends[[0, 1]]), SimpleNamespace(ends=ends[[2, 3]])])
-    hull = steadiness.board_hull(view, MODEL).astype(np.float32)
-    assert all(cv2.pointPolygonTest(hull, p.astype(np.float32), False) > 0 for p in project(corners, MODEL))
-    assert steadiness.board_hull(SimpleNamespace(pixels=None, edges=[]), MODEL) is None
+def test_without_images_there_is_nothing_to_compare():
+    assert "0 images" in judge([]).reason
 
 
 def test_cameras_that_turn_alike_are_one_rig():
@@ -236,13 +223,6 @@ def test_pitch_is_put_in_words():
     assert pitch_words(None) == [] and pitch_words(SimpleNamespace(wanted="none")) == []
 
 
-def test_problems_name_their_placement_and_a_faultless_recording_has_no_findings():
-    problems = {6: "camera left: its plane is 90 mm off the scan", "6 2": "placement 6: crooked"}
-    named = ["placement 6: camera left: its plane is 90 mm off the scan", "placement 6: crooked"]
-    assert diagnosis.problem_words(problems) == named
-    assert diagnosis.findings_in_words(diagnosis.Diagnosis({}, BoardBends({}), None, {})) == []
-
-
 def test_the_figure_marks_the_step():
     n, fig = 20, plt.figure()
     ax, size = fig.subplots(), np.where(np.arange(20) < 10, 0.0, 0.9)
@@ -258,7 +238,9 @@ def test_the_figure_marks_the_step():
 def nudged(lms400_session):
     session, rough = open_session(lms400_session), np.array([-0.17, 0.02, 0.0, 0.0, 0.0])
     model = CameraModel(1280, 720, 700.0, 700.0, 640.0, 360.0, rough)
-    return {camera: steadiness.camera_steadiness(session, camera, model=model) for camera in session.cameras}
+    views, models = (dict.fromkeys(session.cameras, each) for each in ({}, model))
+    made = SimpleNamespace(session=session, views=views, models=models)
+    return {camera: steadiness.camera_steadiness(made, camera) for camera in session.cameras}
 
 
 def test_the_nudge_of_a_real_rig_is_found(nudged):

@@ -118,12 +118,6 @@ def test_interlaced_scans_become_dense_lines(recorded):
     np.testing.assert_allclose(sweep.pitch, [0, 0, 0.1])
 
 
-def test_half_degree_parts_make_half_degree_lines(recorded):
-    sent = [raw for line in room(2, 721) for raw in interlaced(line)[::2]]
-    sweep = recorded((1, sent, 0.2)).sweep(1)
-    assert sweep.ranges.shape == (2, 361) and np.degrees(sweep.bearings[1]) == pytest.approx(0.5)
-
-
 def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(recorded):
     a, b, c = room(3, 721, seed=2)
     a[3:6] = 5.0

@@ -61,12 +61,6 @@ def test_the_evidence_of_all_images_decides():
     np.testing.assert_array_equal(partner[np.arange(len(true)), chosen], true)
 
 
-def test_an_image_of_no_placement_stands_alone():
-    first, partner = alike([RECTANGLE] * 3, [-1, -1, 2], ["left"] * 3)
-    np.testing.assert_array_equal(first, [0, 1, 2])
-    np.testing.assert_array_equal(partner, np.tile(np.arange(4), (3, 1)))
-
-
 @pytest.fixture(scope="module")
 def centred(tmp_path_factory):
     return open_session(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import campaign
 from synthetic import CORNERS, camera_case, camera_observations, numeric, random_board_poses, random_rig
 
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m
@@ -32,13 +33,6 @@ def test_closed_form_is_exact_on_exact_data(source):
     assert planes.common_plane(triangles)[1] == (source == "lrf")
     found = pose_transform(planes.closed_form(triangles, sets.boards, np.arange(12)[None], source == "platform"))
     assert max(transform_difference(found, rig.T_camera_lrf)) < 1e-9
-
-
-@pytest.mark.parametrize("count", [3, 4])
-def test_single_scan_lines_on_few_boards(count):
-    rig, obs = camera_case(2, count)
-    found = solve_camera(obs, "zhang_pless")
-    assert np.abs(plane_residuals_m(obs, found.transform)).max() < 1e-9
 
 
 def test_compression_keeps_every_sum_of_squares():
@@ -124,14 +118,6 @@ def test_joint_solution_agrees_with_scipy(monkeypatch):
     np.testing.assert_allclose(theirs.x[:6], 0, atol=0.02 * ours.sigma[:6].max())
 
 
-def test_joint_refinement_skips_corners_that_were_not_seen():
-    rig, obs = camera_case(15)
-    pixels = obs.pattern_pixels.copy()
-    pixels[::3, ::4] = np.nan
-    found = solve_camera(replace(obs, pattern_pixels=pixels), "zhang_pless_joint")
-    assert transform_difference(found.transform, rig.T_camera_lrf)[1] < 1e-9
-
-
 def test_joint_refinement_bears_errors_common_to_a_placement(monkeypatch):
     """Boards that bend by some millimetres must not bend the intrinsics."""
     rig, obs = camera_case(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
@@ -181,7 +167,7 @@ def test_too_few_placements_are_refused():
         solve_camera(obs.select([1, 2]), "zhang_pless")
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, pytest.param(4, marks=campaign)])
 def test_single_lines_near_by_are_no_sweeps(seed):
     """36 lines at 0.4 to 0.9 m: 4 mm of noise are 4 % of their length, yet they leave the scan plane nowhere."""
     rng, poses, corners = np.random.default_rng(seed), [], 0.5 * CORNERS
@@ -204,7 +190,7 @@ def test_single_lines_near_by_are_no_sweeps(seed):
 def test_any_start_value_reaches_the_best_minimum(method, source):
     rng, (_, obs) = np.random.default_rng(5), camera_case(6, 20, source=source, noise=1.0)
     best = solve_camera(obs, method).transform
-    for turn in Rotation.random(12, rng=rng):
+    for turn in Rotation.random(6, rng=rng):
         far = RigidTransform.from_components(best.translation + rng.normal(0, 0.5, 3), turn * best.rotation)
         assert transform_difference(solve_camera(obs, method, far).transform, best)[0] < 1e-6
 

@@ -6,11 +6,9 @@ import threading
 from functools import partial
 
 import numpy as np
+from faults import FaultyHead, FaultyLms
 
 from lrfcal_lib.drivers.port import PortError
-from lrfcal_lib.emulators.head import EmulatedHead
-from lrfcal_lib.emulators.line import Clock
-from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.session.lms2xx_codec import Configuration, split_stream
 
 LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
@@ -162,7 +160,7 @@ class Memory:
     """
 
     def __init__(self, device):
-        self.port, self.device, self.machine, self.wake = device.path, device, device.clock.machine, device.advance
+        self.port, self.device, self.machine, self.wake = device.path, device, device.host, device.advance
         self.open, self.lost, self.data = False, False, b""
 
     there = property(lambda self: self.port in self.machine.ports)
@@ -233,13 +231,12 @@ class Source:
 
 def lms(source=None, host=None, **options):
     """An emulated LMS2xx on a virtual host of its own, with its port."""
-    clock = Clock(machine=host or VirtualHost())
-    return EmulatedLms(source or Source(), path="lrf", clock=clock, **options).start()
+    return FaultyLms(source or Source(), path="lrf", host=host or VirtualHost(), **options).start()
 
 
 def head(host=None, **options):
     """An emulated head on a virtual host of its own, with its port."""
-    return EmulatedHead(path="head", clock=Clock(machine=host or VirtualHost()), **options).start()
+    return FaultyHead(path="head", host=host or VirtualHost(), **options).start()
 
 
 def telegrams(data):
@@ -252,7 +249,7 @@ class Bench:
     """A program at the other end of a device's line; its rate is the device's unless one is given."""
 
     def __init__(self, device, rate=None):
-        self.device, self.rate, self.machine, self.out = device, rate, device.clock.machine, []
+        self.device, self.rate, self.machine, self.out = device, rate, device.host, []
         self.port, put = self.machine.port(device.path, rate or device.baudrate, timeout=0), device.port.put
 
         def noted(data):
@@ -261,7 +258,7 @@ class Bench:
 
         device.port.put = noted
 
-    now = property(lambda self: self.device.clock.now())
+    now = property(lambda self: self.machine.now())
     heard = property(lambda self: bytes(byte for _, byte in self.out))
 
     def ask(self, raw):

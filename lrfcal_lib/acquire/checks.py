@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lrfcal_lib.preprocess import board_in_scan, edges_in_scan
+from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
+from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
 from lrfcal_lib.session.stated import SessionError
 
@@ -93,8 +94,9 @@ def check_scan(sweep, board, T_head_lrf=None, lrf=None):
 
 def _edges(found):
     """How many straight sides of the board the scans cross, and how."""
-    sides = {side.side: side for side in edges_in_scan.edge_points(found).sides}
-    for side in edges_in_scan.sweep_edges(found).sides if np.ptp(found.sweep.pitch) > 0 else ():
+    along, known = crossings(found)
+    sides = {side.side: side for side in along["half_step"].sides}
+    for side in crossings(found, True, known)[0]["half_step"].sides if np.ptp(found.sweep.pitch) > 0 else ():
         sides.setdefault(side.side, side)
     good = [side for side in sides.values() if side.n_points >= FEWEST_CROSSINGS]
     told = ", ".join(f"{s.n_points} crossings at {np.degrees(s.angle):.0f} deg" for s in good)

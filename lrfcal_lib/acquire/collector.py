@@ -175,15 +175,15 @@ class Collector(Closed):
             if str(rig) in PRACTICE_RIGS:
                 from lrfcal_lib.emulators.rig import emulated
 
-                made, data, clock = emulated(str(rig))
+                made, data = emulated(str(rig))
                 stack.enter_context(made)
                 stated = rig_of(data(), Path(f"emulated {made.setup.name}"))
             elif not Path(rig).suffix and not Path(rig).exists():
                 known = ", ".join(PRACTICE_RIGS)
                 raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
             else:
-                stated, clock = read_rig_file(rig), time.time
-            opened = stack.enter_context(Rig.open(stated, clock=clock))
+                stated = read_rig_file(rig)
+            opened = stack.enter_context(Rig.open(stated))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig, self.recording, self._closing = opened, recording, stack.pop_all()
             self.view, self.lights, self._told = View(), {}, ""

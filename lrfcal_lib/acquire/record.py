@@ -6,11 +6,12 @@ import contextlib
 import errno
 import logging
 import math
-import shutil
 import signal
 import sys
 import time
 from pathlib import Path
+
+from tqdm import tqdm
 
 from lrfcal_lib.acquire.checks import check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
@@ -186,50 +187,34 @@ class Recording(Closed):
             raise RecordingError(f"{self.path}: cannot be written ({error.strerror}): {remedy}; {safe}") from error
 
 
-class Terminal:
-    """Plain lines; on a terminal one more that is rewritten while the head moves (by carriage returns alone)."""
+def ask(text):
+    """What the user at the terminal answers; RecordingError if nobody can."""
+    try:
+        return input(text).strip().lower()
+    except EOFError:
+        hint = "run record in a terminal, or with an emulated rig"
+        raise RecordingError(f"nobody is there to move the board: {hint}") from None
 
-    def __init__(self):
-        self._width = 0
 
-    def say(self, text):
-        """A line of its own, instead of the one that is rewritten."""
-        if self._width:
-            print("\r" + " " * self._width, end="\r", flush=True)
-            self._width = 0
-        if text:
-            print(text, flush=True)
-
-    def ask(self, text):
-        """What the user answers; RecordingError if nobody can."""
-        self.say("")
-        try:
-            return input(text).strip().lower()
-        except EOFError:
-            hint = "run record in a terminal, or with an emulated rig"
-            raise RecordingError(f"nobody is there to move the board: {hint}") from None
-
-    def follow(self, placement, number, of, events):
-        """Show the recording of a placement while it runs."""
-        ends = " to ".join(f"{math.degrees(p):.2f}" for p in placement.pitch[[0, -1]])
-        self.say(f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch {ends} deg")
-        begun, scans, images, stop, pitch = time.monotonic(), 0, 0, "", 0.0
+def follow(placement, number, of, events):
+    """Show the recording of a placement while it runs; the line that is rewritten is for terminals only."""
+    ends = " to ".join(f"{math.degrees(p):.2f}" for p in placement.pitch[[0, -1]])
+    print(f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch {ends} deg", flush=True)
+    begun, scans, images, stop, pitch = time.monotonic(), 0, 0, "", 0.0
+    with tqdm(bar_format="  {desc}", file=sys.stdout, leave=False, disable=None) as line:
         for event in events:
             if isinstance(event, Moved):
                 stop, pitch = f"stop {event.number} of {event.of}, ", event.pitch
             elif isinstance(event, Scanned):
                 scans, pitch = scans + len(event.readings), event.pitch[-1]
             images += isinstance(event, Photographed)
-            counted = f"{scans} scans, {images} images"
-            if sys.stdout.isatty():
-                text = f"  {stop}{math.degrees(pitch):+.2f} deg, {counted}"[: shutil.get_terminal_size().columns - 1]
-                print("\r" + text.ljust(self._width), end="", flush=True)
-                self._width = len(text)
-        self.say(f"  {counted} in {time.monotonic() - begun:.0f} s")
+            line.set_description_str(f"{stop}{math.degrees(pitch):+.2f} deg, {scans} scans, {images} images")
+    print(f"  {scans} scans, {images} images in {time.monotonic() - begun:.0f} s", flush=True)
 
-    def light(self, light, name=None):
-        """What a check found."""
-        self.say(f"{MARKS[light.state]}  {name or light.name}: {light.text}")
+
+def show(light, name=None):
+    """What a check found."""
+    print(f"{MARKS[light.state]}  {name or light.name}: {light.text}", flush=True)
 
 
 def record_session(rig, path, *, resume=False, count=None):
@@ -244,13 +229,12 @@ def record_session(rig, path, *, resume=False, count=None):
     ------
     DeviceError, SessionError, RecordingError
     """
-    terminal = Terminal()
     with Recording(rig, path, resume=resume, count=count) as recording:
         if recording.finished:
-            terminal.say(f"{path}: going on, {recording.safe()}")
+            print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
-            _close_views(recording, terminal)
-            _placements(recording, terminal)
+            _close_views(recording)
+            _placements(recording)
             recording.finish()
         except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal
             error.add_note(recording.safe(resume=True))
@@ -258,7 +242,7 @@ def record_session(rig, path, *, resume=False, count=None):
     return recording
 
 
-def _close_views(recording, terminal):
+def _close_views(recording):
     """Images for the intrinsics; by hand each until it shows the pattern."""
     wanted = recording.rig.stated.plan.intrinsics_images
     for camera, view in recording.close_views_to_do():
@@ -266,13 +250,13 @@ def _close_views(recording, terminal):
         while not kept:
             emulated = recording.rig.hold_close(camera, view)
             if not emulated:
-                terminal.ask(f"{title}: hold the board close, tilted otherwise than before; Enter ")
+                ask(f"{title}: hold the board close, tilted otherwise than before; Enter ")
             light = recording.run_close(camera)
-            terminal.light(light, title)
+            show(light, title)
             kept = emulated or light.state != "bad"
 
 
-def _placements(recording, terminal):
+def _placements(recording):
     """Each placement that is missing; the user may have the one before again (r), or end (q)."""
     before, of = None, len(recording.plan)
     while todo := recording.to_do():
@@ -281,7 +265,7 @@ def _placements(recording, terminal):
             again = "" if before is None else f", r: placement {before} again"
             what = "take the board away" if placement.purpose == "scene" else "put the board"
             text = f"placement {placement.number}: {what}, then press Enter{again} (q: end here) "
-            while (answer := terminal.ask(text)) not in ("", "q", "r" if again else ""):
+            while (answer := ask(text)) not in ("", "q", "r" if again else ""):
                 pass
         if answer == "q":
             return
@@ -289,10 +273,10 @@ def _placements(recording, terminal):
             recording.drop(before)
             before = None
             continue
-        terminal.follow(placement, of - len(todo) + 1, of, recording.run(placement))
+        follow(placement, of - len(todo) + 1, of, recording.run(placement))
         before = placement.number
         for light in recording.check(before):
-            terminal.light(light)
+            show(light)
 
 
 def main(rig_file, path, *, resume=False, count=None, mode=None):

@@ -12,8 +12,8 @@ from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import pinhole, pinhole_jacobian
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.board_in_image import line_misses
 
 STILL = 1e5  # information roots of what moves board and sides together, which changes no length
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
@@ -80,8 +80,9 @@ def combined_outlines(joint):
             except (DegenerateGeometry, np.linalg.LinAlgError):  # what is left open, as by single scans, has no answer
                 del cases[placement]
                 continue
-            r, J = whiten(sight_block(found[placement], case, scale))
-            total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
+            if case.images:
+                r, J = whiten(sight_block(found[placement], case, scale))
+                total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
         scale = max(scale * np.sqrt(total[0] / total[1]) if total[1] > 0 else 1.0, LEAST_SCALE)
     return measured
 
@@ -181,8 +182,6 @@ def sight_block(state, case, scale):
     """Distances (undistorted pixels) of two points of a side from the line in which an image shows it, whitened."""
     found, lines, _ = state
     view, unknowns = case.data.view, case.unknowns
-    if not case.images:
-        return Block(np.zeros((1, 0)), np.zeros((1, 0, case.width)), np.ones((1, 0)))
     off = residuals.view_block(found, case.data, unknowns).residuals.reshape(1, -1, 6)
     here = np.concatenate([geometry.move_pose(view["pose"][..., :3, :], off), view["pose"][..., 3:, :]], axis=-2)
     by_all = residuals.view_block(found, replace(case.data, view=view | {"pose": here}), unknowns).jacobian
@@ -190,14 +189,9 @@ def sight_block(state, case, scale):
     for (row, number, edge, model), reach in zip(case.images, case.reach, strict=True):
         line = lines[number]
         flat = -line[2] * line[:2] + reach[:, None] * np.array([-line[1], line[0]])
-        turned = geometry.rotate_points(here[0, row, :3], np.column_stack([flat, np.zeros(2)]))
-        p = turned + here[0, row, :3, 3]
-        uv = pinhole(p, model)
-        J = geometry.gradient_by_pose(turned, edge.line[:2] @ pinhole_jacobian(p, model)) @ by_all[row]
-        lever = np.stack([np.ones(2), (uv - edge.centre) @ [edge.line[1], -edge.line[0]]], axis=1)
-        white = np.linalg.inv(np.linalg.cholesky(lever @ edge.covariance @ lever.T)) / scale
-        J = np.hstack([J, side_columns(J, np.full(2, number), state, case)])
-        out.append((white @ (uv @ edge.line[:2] + edge.line[2]), white @ J))
+        off, by_pose = line_misses([edge], np.pad(flat, ((0, 0), (0, 1)))[None], model, here[0, row, :3])
+        J = by_pose[0] @ by_all[row]
+        out.append((off[0] / scale, np.hstack([J, side_columns(J, np.full(2, number), state, case)]) / scale))
     r, J = (np.concatenate(part)[None] for part in zip(*out, strict=True))
     return Block(r, J, np.ones(r.shape))
 

@@ -13,6 +13,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_sourc
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
+from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
@@ -37,7 +38,7 @@ def stack(prefix, parts):
 
 def observe(
     prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
-    faces=FACE_POINTS,
+    faces=FACE_POINTS, made=None,
 ):
     """Pair what the LRF and one camera saw of the board.
 
@@ -54,7 +55,9 @@ def observe(
         ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
     crossings, faces : int
-        Kept of each edge and of the face of a placement, evenly spread.
+        Kept of each edge and of the face of a placement, evenly spread; without `faces` only crossings are paired.
+    made : dict, optional
+        Filled with what other calls with the same `T_head_lrf`, `correct` and `faces` need not work out again.
 
     Returns
     -------
@@ -62,23 +65,24 @@ def observe(
     """
     board, model, T_head_lrf = prepared.board, prepared.models[camera], platform_of(prepared, T_head_lrf)
     posed = {p: view for p, view in prepared.views[camera].items() if view.T_camera_board is not None}
-    pattern = np.zeros((0, 3)) if board.pattern is None else board.pattern.points()
-    if prepared.relief is not None:
-        pattern[:, 2] += prepared.relief  # the waves of the sheet
+    pattern = np.zeros((0, 3)) if board.pattern is None else raised_points(board.pattern, prepared.relief)
     n, k = len(posed), len(pattern)
     pixels = [np.full((k, 2), np.nan) if view.pixels is None else view.pixels for view in posed.values()]
-    planes, crossed, one_scan = [], [], variant == ONE_SCAN
+    planes, crossed, one_scan, made = [], [], variant == ONE_SCAN, {} if made is None else made
     variant = "last_beam" if one_scan else variant
     for placement, scan in prepared.scans.items():
         view = prepared.views[camera].get(placement)
         if view is None:
             continue
         turn = source_of(prepared, camera, placement, T_head_lrf, correct)
-        if placement in posed:
-            points, pitch, covariance = face_points(scan, faces)
-            R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
-            points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-            planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
+        if placement in posed and faces:
+            if (camera, placement) not in made:
+                points, pitch, covariance = face_points(scan, faces)
+                R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
+                points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
+                face = {"points": points, "covariance": covariance, "pitch": pitch, "placement": number}
+                made[camera, placement] = face
+            planes.append(made[camera, placement])
         crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
     return CameraObservations(
         camera=camera,
@@ -92,14 +96,14 @@ def observe(
         pattern_sigma_px=max(model.rms_px or 0.0, 0.05),
         **stack("plane_", planes),
         **stack("crossing_", crossed),
-        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf)),
+        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf, made) if faces else ()),
     )
 
 
 def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
-    keys = [(camera, variant) for camera in prepared.views for variant in (*VARIANTS, ONE_SCAN)]
-    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
+    keys, made = [(camera, variant) for camera in prepared.views for variant in (*VARIANTS, ONE_SCAN)], {}
+    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, made=made) for camera, variant in keys}
 
 
 def source_of(prepared, camera, placement, T_head_lrf, correct=as_recorded):
@@ -152,14 +156,16 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf):
+def _corners(prepared, camera, variant, T_head_lrf, made):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges meet."""
     edges, mount = prepared.board.edges, prepared.session.cameras[camera].mount
     for placement in prepared.names:
         view = prepared.views[camera].get(placement)
         if view is None or placement not in prepared.scans or placement not in prepared.swept[variant]:
             continue
-        board, _ = outline_of(prepared, placement, variant, T_head_lrf)
+        if (placement, variant) not in made:  # the same for all cameras
+            made[placement, variant] = outline_of(prepared, placement, variant, T_head_lrf)[0]
+        board = made[placement, variant]
         for before, name in zip(edges[-1:] + edges[:-1], edges, strict=True):
             seen = view.edge(name), view.edge(before)
             if name not in board.corners or None in seen:
@@ -187,29 +193,25 @@ def platform_observations(prepared, variant="half_step"):
     Of each sweep the longest pair of perpendicular sides; a sweep with only one side gives that one.
     """
     edges, faces = [], []
+
+    def cosine(pair):
+        u, v = (s.ends[1] - s.ends[0] for _, s in pair)
+        return u @ v / (np.linalg.norm(u) * np.linalg.norm(v))
+
     for placement, swept in prepared.swept[variant].items():
-        for number, (found, side) in enumerate(_perpendicular(prepared.edges[variant][placement], swept), 1):
-            rows = thin(np.flatnonzero(found.side == side), PLATFORM_POINTS)
+        along = prepared.edges[variant][placement]
+        known = {s.side for s in along.sides}
+        sides = [(along, s) for s in along.sides] + [(swept, s) for s in swept.sides if s.side not in known]
+        pairs = [pair for pair in combinations(sides, 2) if abs(cosine(pair)) < RIGHT_ANGLE]
+        best = max(pairs or zip(sides, strict=True), key=lambda some: np.prod([s.length for _, s in some]), default=())
+        for number, (found, side) in enumerate(best, 1):
+            rows = thin(np.flatnonzero(found.side == side.side), PLATFORM_POINTS)
             points = {key: getattr(found, key)[rows] for key in ("points", "covariance", "pitch")}
             edges.append(points | {"placement": np.full(len(rows), placement), "number": np.full(len(rows), number)})
         points, pitch, covariance = face_points(prepared.scans[placement], FACE_POINTS)
         face = {"points": points, "covariance": covariance, "pitch": pitch}
         faces.append(face | {"placement": np.full(len(pitch), placement)})
     return PlatformObservations(**stack("edge_", edges), **stack("face_", faces))
-
-
-def _perpendicular(along, swept):
-    """The longest pair of perpendicular sides of a sweep, or the longest side: (edges, side number) each."""
-    known = {s.side for s in along.sides}
-    sides = [(along, s) for s in along.sides] + [(swept, s) for s in swept.sides if s.side not in known]
-
-    def cosine(pair):
-        u, v = (s.ends[1] - s.ends[0] for _, s in pair)
-        return u @ v / (np.linalg.norm(u) * np.linalg.norm(v))
-
-    pairs = [pair for pair in combinations(sides, 2) if abs(cosine(pair)) < RIGHT_ANGLE]
-    best = max(pairs or zip(sides, strict=True), key=lambda some: np.prod([s.length for _, s in some]), default=())
-    return [(edges, s.side) for edges, s in best]
 
 
 def name_sides(prepared):
@@ -272,7 +274,11 @@ def nearest_edges(board, sides):
     cost = np.array([np.median(d, axis=0) for d in distances]).reshape(-1, len(lines))
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
         number, edge, off = numbers[row], board.edges[column], 1000 * cost[row, column]
-        turned, allowed = _angle_to_line(sides[number], lines[column])
+        turned, allowed, points = 0.0, NAME_ANGLE, sides[number]
+        if len(points) > 2:  # what noise may turn the line through them is allowed
+            _, direction, rms = fit_line(points)
+            turned = np.arcsin(min(abs(direction[:2] @ lines[column, :2]) / np.linalg.norm(direction[:2]), 1.0))
+            allowed = np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction))
         if off > 1000 * NAME_DISTANCE:
             problems[number] = f"a side of the scan is {off:.0f} mm from the edge '{edge}': not used"
         elif turned > allowed:
@@ -281,16 +287,6 @@ def nearest_edges(board, sides):
         else:
             names[number] = edge
     return names, problems
-
-
-def _angle_to_line(points, line):
-    """Angle between the line through board-frame points and a board line, and how large noise lets it be, radians."""
-    if len(points) < 3:
-        return 0.0, NAME_ANGLE
-    _, direction, rms = fit_line(points)
-    angle = float(np.arcsin(min(abs(direction[:2] @ line[:2]) / np.linalg.norm(direction[:2]), 1.0)))
-    length = np.ptp(points @ direction)
-    return angle, float(np.hypot(NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / length))
 
 
 def observe_joint(prepared, views=None):
@@ -330,9 +326,9 @@ def _beams(prepared, placements):
     for row, placement in enumerate(placements):
         cells = cells_of(prepared, placement)
         for side, name in prepared.names.get(placement, {}).items():
-            some = cells.select(thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE))
+            some = cells[thin(np.flatnonzero(cells.side == side), CELLS_PER_EDGE)]
             n, edge = len(some), prepared.board.edges.index(name)
-            own = {key: getattr(some, key) for key in ("bearing", "pitch", "hit", "radius", "background")}
+            own = {key: some[key] for key in ("bearing", "pitch", "hit", "radius", "background")}
             yield own | {
                 "step": some.step * some.range_m, "edge": np.full(n, edge), "placement": np.full(n, row)
             }  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -15,6 +15,7 @@ from lrfcal_lib.fit.residuals import beam_terms, edge_shift, flip_sigma, pad
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_platform, polar_to_points, tilt
+from lrfcal_lib.preprocess.bend import quadratic
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_scan import edge_cells
 
@@ -88,15 +89,6 @@ def plane_frame(points):
     return pose
 
 
-def corners_and_lengths(lines, edges):
-    """Corners where two neighbouring sides were found (..., 2), and lengths between them (...), by edge."""
-    pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
-    both = {after: np.stack([lines[k], lines[after]], axis=-2) for k, after in pairs if k in lines and after in lines}
-    corners = {name: corners_of_lines(sides)[..., 1, :] for name, sides in both.items()}
-    known = [(name, after) for name, after in pairs if name in corners and after in corners]
-    return corners, {name: np.linalg.norm(corners[after] - corners[name], axis=-1) for name, after in known}
-
-
 def measure_board(face, sides, edges, each=1):
     """Measure a board's outline in a cloud: plane through the face, lines through its sides, corners where they meet.
 
@@ -124,8 +116,13 @@ def sized(lines, middle, covariance, names, edges):
     """
 
     def outline(lines):
+        """Sides, corners where two neighbours were found (..., 2), and lengths between these (...), by edge."""
         sides = dict(zip(names, np.moveaxis(lines, -2, 0), strict=True))
-        return sides, *corners_and_lengths(sides, edges)
+        pairs = list(zip(edges, edges[1:] + edges[:1], strict=True))
+        both = {after: [sides[k], sides[after]] for k, after in pairs if k in sides and after in sides}
+        corners = {name: corners_of_lines(np.stack(two, axis=-2))[..., 1, :] for name, two in both.items()}
+        ends = {k: (corners[k], corners[after]) for k, after in pairs if k in corners and after in corners}
+        return sides, corners, {name: np.linalg.norm(b - a, axis=-1) for name, (a, b) in ends.items()}
 
     sides, corners, size = outline(lines)
     steps = 1e-6 * np.eye(len(covariance)).reshape(len(covariance), -1, 2)
@@ -139,9 +136,8 @@ def sized(lines, middle, covariance, names, edges):
 
 def _flat_line(points):
     """The line ``a x + b y + c = 0`` (3,) through points (n, 2) of a plane, and their middle."""
-    middle, direction, _ = fit_line(np.column_stack([points, np.zeros(len(points))]))
-    normal = np.array([direction[1], -direction[0]])
-    return np.r_[normal, -normal @ middle[:2]], middle[:2]
+    middle, (x, y), _ = fit_line(points)
+    return np.array([y, -x, x * middle[1] - y * middle[0]]), middle
 
 
 def named_sides(prepared, placement, variant="half_step", stretch=0.0):
@@ -150,8 +146,8 @@ def named_sides(prepared, placement, variant="half_step", stretch=0.0):
     numbers, length = np.unique(along.side), prepared.board.lengths() if stretch else {}
     for side, name in prepared.names.get(placement, {}).items():
         found = along if side in numbers else swept
-        seen = 0.0 if found is None else next((s.length for s in found.sides if s.side == side), 0.0)
-        if found is not None and seen >= stretch * length.get(name, 0.0):
+        seen = next((s.length for s in found.sides if s.side == side), 0.0)
+        if seen >= stretch * length.get(name, 0.0):
             yield name, found, side, found is not along
 
 
@@ -179,7 +175,7 @@ def platform_of(prepared, T_head_lrf=None):
 
 
 def cells_of(prepared, placement):
-    """Beams about the edges in the sweep of a placement, an EdgeCells."""
+    """Beams about the edges in the sweep of a placement, see :func:`edge_cells`."""
     along, swept = prepared.edges["half_step"][placement], prepared.swept["half_step"].get(placement)
     return edge_cells(prepared.scans[placement], along, swept, prepared.session.lrf)
 
@@ -194,7 +190,7 @@ def likely_outline_of(prepared, placement, model):
     face = points, model.correct(placement, points, pitch)[1], scan.sigma_range
     cells = cells_of(prepared, placement)
     on_board = polar_to_points(cells.range_m, cells.bearing)
-    cells = replace(cells, pitch=model.correct(placement, on_board, cells.pitch)[1])
+    cells.pitch = model.correct(placement, on_board, cells.pitch)[1]
     names = {side: name for name, _, side, _ in sides}
     measured = measure_outline(cells, face, names, prepared.board.edges, model)
     return measured, frozenset(name for name, _, _, swept in sides if swept)
@@ -203,14 +199,14 @@ def likely_outline_of(prepared, placement, model):
 def measure_outline(cells, face, names, edges, model):
     """Measure a board of unknown size in one sweep.
 
-    `cells` are its beams about the edges (EdgeCells), `face` points on it (LRF frame, metres), their pitch (radians)
+    `cells` are its beams about the edges, `face` points on it (LRF frame, metres), their pitch (radians)
     and the standard deviation of a range (metres), `names` the edge of each side, `edges` all edges in order around the
     board. Raises DegenerateGeometry if the face does not span a plane, or no side has enough cells.
     """
     pose, bend = face_surface(face, model)
     found = {side: name for side, name in names.items() if np.sum(cells.side == side) >= FEWEST_CELLS}
     if not found:
-        raise DegenerateGeometry(f"placement {cells.placement}: no side has {FEWEST_CELLS} beams about it")
+        raise DegenerateGeometry(f"no side has {FEWEST_CELLS} beams about it")
     rays = rays_about(cells, list(found), pose, bend, model)
     lines, middle = start_lines(rays)
     lines, information = fit_sides(rays, lines, middle, model)
@@ -238,28 +234,24 @@ def face_surface(face, model):
     p = lrf_to_platform(points - model.sensor["range_offset"] * rays, pitch, model.T_head_lrf)
     pose = plane_frame(p)
     p = (p - pose[:3, 3]) @ pose[:3, :3]
-    A, freedom = _quadratic(p[:, 0], p[:, 1]), max(len(p) - 6, 1)
+    A, freedom = quadratic(p[:, :2]), max(len(p) - 6, 1)
     flat, bent = (np.linalg.lstsq(A[:, :k], p[:, 2], rcond=None)[0] for k in (3, 6))
     before, after = np.sum((p[:, 2] - A[:, :3] @ flat) ** 2), np.sum((p[:, 2] - A @ bent) ** 2)
     asked = (before - after) / 3 / (after / freedom) > fdtri(3, freedom, 0.999)
     return pose, bent if asked else np.zeros(6)
 
 
-def _quadratic(x, y):
-    return np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
-
-
 def rays_about(cells, sides, pose, bend, model):
     """Cells of some sides as rays in the plane's frame, padded by side (s, n), and where they meet the face."""
-    cells = cells.select(np.isin(cells.side, sides))
+    cells = cells[np.isin(cells.side, sides)]
     p_lrf = polar_to_points(np.ones(len(cells)), cells.bearing)
     direction = tilt(p_lrf @ model.T_head_lrf.rotation.as_matrix().T, cells.pitch) @ pose[:3, :3]
     origin = (tilt(model.T_head_lrf.translation, cells.pitch) - pose[:3, 3]) @ pose[:3, :3]
     height = 0.0
     for _ in range(4):  # intersect with the height of the bent face at the last place
         at = origin + ((height - origin[:, 2]) / direction[:, 2])[:, None] * direction
-        height = _quadratic(at[:, 0], at[:, 1]) @ bend
-    rays = {name: getattr(cells, name) for name in ("hit", "radius", "background")}
+        height = quadratic(at[:, :2]) @ bend
+    rays = {name: cells[name] for name in ("hit", "radius", "background")}
     rays |= {"at": at[:, :2], "direction": direction, "step": cells.range_m * cells.step}
     return pad(rays | {"placement": np.array([sides.index(side) for side in cells.side])}, len(sides))
 
@@ -358,16 +350,12 @@ def edges_in_cloud(solution, prepared, placement):
         if view is None or camera not in solution.transforms:
             continue
         T_platform_camera = solution.camera_at(camera, solution.correct(placement, np.zeros(3), view.pitch)[1]).inv()
-        for edge in view.edges:
-            points = edge_on_plane(edge, prepared.models[camera], T_platform_camera, pose[:3, 3], pose[:3, 2])
+        lens, o = prepared.models[camera], T_platform_camera.translation
+        for edge in view.edges:  # where lines of sight of a few of its points meet the plane
+            ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]
+            uv = ends[0] + ALONG[:, None] * (ends[1] - ends[0])
+            rays = np.column_stack([(uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy], np.ones(len(uv))])
+            d = T_platform_camera.rotation.apply(rays)
+            points = o + ((pose[:3, 3] - o) @ pose[:3, 2] / (d @ pose[:3, 2]))[:, None] * d
             sides.setdefault(edge.name, []).append(points)
     return face, {name: np.concatenate(points) for name, points in sides.items()}
-
-
-def edge_on_plane(edge, model, T_platform_camera, centre, normal):
-    """Points (k, 3) of an image edge where its lines of sight meet a plane, platform frame."""
-    ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]
-    uv = ends[0] + ALONG[:, None] * (ends[1] - ends[0])
-    rays = np.column_stack([(uv - [model.cx, model.cy]) / [model.fx, model.fy], np.ones(len(uv))])
-    d, o = T_platform_camera.rotation.apply(rays), T_platform_camera.translation
-    return o + ((centre - o) @ normal / (d @ normal))[:, None] * d

@@ -16,9 +16,10 @@ from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
-from lrfcal_lib.preprocess.survey import stereo_check
-from lrfcal_lib.session.cache import cached
+from lrfcal_lib.preprocess.survey import all_views
+from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
@@ -158,10 +159,16 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     Calibration
     """
     prepared = prepare(session)
+    together = [partial(joint_or_words, prepared, all_views(prepared))] if joint and prepared.views else []
+    *together, found = spread(lambda stage: stage(), [*together, partial(_by_themselves, prepared, methods)])
+    return with_joint(found, *together) if together else found
+
+
+def _by_themselves(prepared, methods):
+    """Calibrate the platform, then every camera."""
     platform = calibrate_platform(prepared, prepared.pitch_noise.offset)
     observations = observe_all(prepared, platform.transform("combined"))
-    found = Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
-    return with_joint(found) if joint and prepared.views else found
+    return Calibration(prepared, platform, observations, *calibrate_cameras(observations, methods))
 
 
 @cached
@@ -316,29 +323,35 @@ def joint_settings(prepared, observations):
 
 
 @cached
-def calibrate_jointly(prepared):
-    """Estimate everything about a session's rig at once.
+def calibrate_jointly(prepared, views=None):
+    """Estimate everything about a session's rig at once, from all its images or from `views` (see `observe_joint`).
 
     What the session does not determine is in `unobservable` and `warnings` of the solution, in words. Raises
     DegenerateGeometry when there is no start value, or most placements contradict each other.
     """
-    observations = observe_joint(prepared)
+    observations = observe_joint(prepared, views)
     settings = joint_settings(prepared, observations)
     return JointCalibration(prepared, solve_joint(observations, required=False, **settings), settings, {})
 
 
-def with_joint(calibration):
+def joint_or_words(prepared, views=None):
+    """The joint estimate, or in words why there is none."""
+    try:
+        return calibrate_jointly(prepared, views)
+    except DegenerateGeometry as error:
+        return str(error)
+
+
+def with_joint(calibration, joint):
     """Add the joint estimate to a calibration: its axis, its cameras, and observations made with them.
 
-    Where the session does not determine the whole rig, only a problem is added.
+    Where the session does not determine the whole rig (`joint` says why), only a problem is added.
     """
     platform = calibration.platform
-    try:
-        joint = calibrate_jointly(calibration.prepared)
-    except DegenerateGeometry as error:
-        return replace(calibration, problems=calibration.problems | {("rig", "joint"): str(error)})
-    cameras = joint.observations.cameras
-    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
+    if isinstance(joint, str):
+        return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
+    cameras, made = joint.observations.cameras, {}
+    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance
@@ -364,17 +377,29 @@ def leave_out(joint, groups=8):
 
 
 def stereo_reference(prepared):
-    """Relative pose of the first two cameras from the chessboard in both images.
+    """Relative pose of the first two cameras from the chessboard in both images: the best knowledge of the mounting.
 
-    Returns their names, ``T_second_first`` and its covariance (6, 6). Raises ValueError with fewer than two cameras,
-    without a pattern, or when no placement is seen by both.
+    The intrinsics of both are estimated along, and the shape of a wavy sheet. Returns the names of the cameras,
+    ``T_second_first`` and its covariance (6, 6) of ``[w, v]``. Raises ValueError with fewer than two cameras, without a
+    pattern, or when no placement is seen by both.
     """
     pattern, pair = prepared.board.pattern, tuple(prepared.views)[:2]
     if len(pair) < 2 or pattern is None:
         raise ValueError(f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras")
-    views, models = [list(prepared.views[c].values()) for c in pair], [prepared.models[c] for c in pair]
-    T_second_first, covariance, _ = stereo_check(*views, pattern, models, relief=prepared.relief, refine=True)
-    return pair, T_second_first, covariance
+    seen = [{p: v.pixels for p, v in prepared.views[c].items() if v.pixels is not None} for c in pair]
+    common = sorted(seen[0].keys() & seen[1].keys())
+    if not common:
+        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
+    pixels, models = np.array([[own[p] for p in common] for own in seen]), [prepared.models[c] for c in pair]
+    rough = [[board_pose(p, pattern, model)[0] for p in own] for own, model in zip(pixels, models, strict=True)]
+    poses = [RigidTransform.concatenate(own) for own in rough]
+    between = poses[1] * poses[0].inv()
+    second = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
+    mounting = RigidTransform.concatenate([RigidTransform.identity(), second])
+    basis = waves(pattern.points()) if np.any(prepared.relief) else None
+    fixed = (8,) if all(m.distortion[4] == 0 for m in models) else ()
+    found = adjust_robust(pixels, pattern.points(), models, poses[0], mounting, basis=basis, fixed=fixed)
+    return pair, found.mounting[1], found.mounting_covariance[0]
 
 
 def color_cloud(calibration, method="line", scene=False):

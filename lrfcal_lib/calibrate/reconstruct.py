@@ -22,7 +22,8 @@ SHARE = 1 << 15  # of them that a thread takes at a time
 WORKERS = min(os.cpu_count() or 1, 8)
 WINDOW = 4  # beams and scan lines on either side of a point that make its normal
 PULSE = 1.0  # metres; surfaces farther apart give two echoes and no mixed pixel (see simulate.beam)
-SIGMAS = 2.5  # by which a reading must miss the surfaces on both sides
+SIGMAS = 2.2  # by which a reading must miss the surfaces on both sides
+ROUGH = 1.2  # residuals of the planes that readings lie on, standard deviations of a range
 GAIN_POINTS = 30_000  # that compare the exposures of images
 FRAME = "frame: platform (x = tilt axis, y ahead, z up at pitch 0)"
 UNITS = "units: metres, radians; sigma in metres, image is the number of the image that counts most (-1: none)"
@@ -329,8 +330,10 @@ def mixed(ranges, steps, lrf):
     A spot that meets two surfaces within one pulse reads between them. A reading is asked about where, half a spot or
     a spot away, both sides are at other ranges, one of them within a pulse. It is sound if it lies on a plane (straight
     in inverse range) about as wide as the spot both ways, in the middle, on a side or in a corner of it; or on a narrow
-    long one that does not rise like a ramp. Readings a little before the one plane on both sides of them are not: what
-    is narrower than the spot. Then planes are fitted without all these: readings that lie on one are sound after all.
+    long one, or a small one, that does not rise like a ramp. Readings a little before the one plane on both sides of
+    them are not: what is narrower than the spot. Then planes are fitted without all these: readings that lie on one are
+    sound after all. Mixtures are as wide as the spot: where that covers two samples both ways, a reading alone is
+    noise, and one among mixed ones is mixed.
 
     Parameters
     ----------
@@ -359,10 +362,11 @@ def mixed(ranges, steps, lrf):
     odd[at] = ~_on_surface(table, ranges[at], at, spots, lrf, 0.6)
     at = np.nonzero(dent)
     odd[at] |= _thin(table, ranges, at, spots, lrf)
-    at, found = np.nonzero(odd), np.zeros(r.shape)
-    sound = _on_surface(_table(np.where(odd, np.nan, ranges)), ranges[at], at, spots, lrf, 0.5)
-    found[at] = np.where(sound, 0.0, np.maximum(nearer[at], 1e-6))
-    return found
+    at = np.nonzero(odd)
+    odd[at] = ~_on_surface(_table(np.where(odd, np.nan, ranges)), ranges[at], at, spots, lrf, 0.5)
+    others = np.rint(9 * uniform_filter(odd.astype(float), 3, mode="constant")) - odd
+    alike = np.where(odd, others > 1, (others > 4) & np.isfinite(ranges))
+    return np.where(np.where(np.minimum(*spots) > 2, alike, odd), np.maximum(nearer, 1e-6), 0.0)
 
 
 def _samples(spots, share, fewest):
@@ -373,17 +377,20 @@ def _samples(spots, share, fewest):
 def _on_surface(table, readings, at, spots, lrf, share):
     """Which readings at (line, beam) lie on a plane of a window about them, of which that `share` is there."""
     wide, long, sound = _samples(spots, 0.375, 1), _samples(spots, 1.0, 2), np.zeros(len(readings), bool)
-    for half, narrow in ((wide, None), ((long[0], wide[1].clip(max=1)), 1), ((wide[0].clip(max=1), long[1]), 0)):
+    thin = [half.clip(max=1) for half in wide]
+    # reach of windows; directions in which, and by how many sigma over a spot, they rise no more; what of them is there
+    kinds = [(wide, (), 0, ROUGH, share), ((long[0], thin[1]), (1,), 4, ROUGH, share)]
+    kinds += [((thin[0], long[1]), (0,), 4, ROUGH, share), (thin, (0, 1), 10, 1.0, 0.9)]
+    for half, narrow, steep, rough, part in kinds:
         for place in sorted(np.ndindex(3, 3), key=lambda each: each != (1, 1)):  # most lie on the one about them
             rest = np.flatnonzero(~sound)
             own = tuple(index[rest] for index in at)
             reach = [h[own] for h in half]
             sums, number = _sums(table, [i + (k - 1) * h for i, k, h in zip(own, place, reach, strict=True)], reach)
-            slope, there, good = _planes(sums, own, 1.3 * lrf.sigma_range)
-            good &= sums[:, 0, 0] >= share * number
-            if narrow is not None:  # no ramp
-                rise = np.abs(slope[narrow]) * there**2
-                good &= rise < 4 * lrf.sigma_range / spots[narrow][own]
+            slope, there, good = _planes(sums, own, rough * lrf.sigma_range)
+            good &= sums[:, 0, 0] >= part * number
+            for d in narrow:  # no ramp
+                good &= np.abs(slope[d]) * there**2 < steep * lrf.sigma_range / spots[d][own]
             sound[rest] = good & (np.abs(readings[rest] - there) <= SIGMAS * lrf.sigma_range)
     return sound
 

@@ -36,8 +36,8 @@ class Motion:
     measured, and dead reckoning before that was known.
     """
 
-    def __init__(self, line, settings, log, clock):
-        self.line, self.settings, self._log, self._clock, self._now = line, settings, log, clock, line.host.now
+    def __init__(self, line, settings):
+        self.line, self.settings, self._now = line, settings, line.host.now
         self.abort, self.feedback, self.rows, self._misses = line.host.event(), False, [], 0
         self.calibrated = settings.degrees_per_second is not None
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
@@ -100,7 +100,7 @@ class Motion:
             self._misses = 0 if reading else self._misses + 1
         now = self._now()
         instant, pitch, reckoned = reading or (now, self.estimate(now), self.estimate(now))
-        self.rows.append((self._clock() - (now - instant), pitch, reading is not None, reckoned))
+        self.rows.append((self.line.host.time() - (now - instant), pitch, reading is not None, reckoned))
 
     # ------------------------------------------------------------------------------------------ start and stop
 
@@ -212,7 +212,7 @@ class Motion:
             self._obeys = False
             if self.settings.absolute is True:
                 raise Refused("the head does not obey set-tilt (4D): state absolute false to use up and down")
-            self._log.warning("the head does not obey set-tilt (4D): it is moved by up and down")
+            LOG.warning("the head does not obey set-tilt (4D): it is moved by up and down")
         return self.steer(target, deadline)
 
     @staticmethod
@@ -312,8 +312,6 @@ class PanTilt(port.Closed):
     path : str or Path
         Of the port.
     settings : rig_file.HeadSettings
-    clock : callable, optional
-        Host clock, s; time.time() of the host by default.
 
     Attributes
     ----------
@@ -330,10 +328,10 @@ class PanTilt(port.Closed):
         If something else answers.
     """
 
-    def __init__(self, path, settings, *, log=LOG, clock=None, host=REAL):
-        self.settings, self._log, self._lock = settings, log, threading.Lock()
-        self._line, self._thread, self._error = HeadLine(path, settings, log, host), None, None
-        self.motion = Motion(self._line, settings, log, clock or host.time)
+    def __init__(self, path, settings, *, host=REAL):
+        self.settings, self._lock = settings, threading.Lock()
+        self._line, self._thread, self._error = HeadLine(path, settings, host), None, None
+        self.motion = Motion(self._line, settings)
         try:
             self._probe()
         except BaseException:
@@ -352,14 +350,14 @@ class PanTilt(port.Closed):
         if settings.echo is True and not line.counts["echoed"]:
             raise NoReply(f"{line.path} does not echo what is sent: check the adapter and its power")
         if settings.echo is False and line.counts["echoed"]:
-            self._log.warning("%s echoes what is sent, which was not expected: echoes are removed", line.path)
+            LOG.warning("%s echoes what is sent, which was not expected: echoes are removed", line.path)
         if reading is None and settings.feedback is True:
             raise NoReply(self._silence())
         self.has_feedback = self.motion.feedback = reading is not None
         if not self.has_feedback:
             self.motion.know(start)
             how = "stated" if self.motion.calibrated else "assumed, state degrees_per_second"
-            self._log.warning("the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
+            LOG.warning("the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
                               "its pitch is not measured", *(settings.degrees_per_second or ASSUMED),
                               how, settings.start_pitch_deg)  # fmt: skip
 
@@ -375,7 +373,7 @@ class PanTilt(port.Closed):
         try:
             self.stop()
         except DeviceError as error:
-            self._log.error("the head could not be stopped (%s): cut its power if it moves", error)
+            LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
         finally:
             port.release(self)
             line, self._line = self._line, None

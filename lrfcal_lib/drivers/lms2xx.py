@@ -4,7 +4,7 @@ import logging
 import math
 
 from lrfcal_lib.drivers import lms2xx_link as wire
-from lrfcal_lib.drivers.lms2xx_link import POINTS, RATES, Assembler, Link, ScanClock, ScanReader
+from lrfcal_lib.drivers.lms2xx_link import POINTS, POWER_ON, RATES, Assembler, Link, ScanClock
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
@@ -14,15 +14,18 @@ INSTALLATION, STREAM, INTERLACED = b"\x00", b"\x24", b"\x2a"  # data of MODE
 ALL_VALUES = b"\x01"  # data of VALUES
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
+KEPT = 256  # scans that can be asked for by their instant
+LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
+RECOVERY_S = 8.0  # one attempt to find a lost device; there are more until the stream is stopped
 REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
-COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
+COUNTS = ("dropped", "stale", "reconnects")
 
 
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
-    Every call returns or raises a DeviceError within its deadline. While the device streams, only `newest`, `take`,
-    `counts`, `stop` and `close` may be called.
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only `take`, `counts`,
+   , `stop` and `close` may be called.
 
     Parameters
     ----------
@@ -37,8 +40,6 @@ class LMS2xx(Closed):
         To be set, see :meth:`set_variant`.
     find_s : float
         Longest time to find the rate.
-    clock : callable, optional
-        Seconds, for the instants of scans; time.time() of the host by default.
     host : Host
         Machine that the driver runs on; tests have one of their own.
     **configuration
@@ -64,16 +65,16 @@ class LMS2xx(Closed):
     """
 
     def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", variant=None, find_s=FIND_S,
-                 clock=None, log=LOG, host=REAL, **configuration):  # fmt: skip
+                 host=REAL, **configuration):  # fmt: skip
         if baudrate not in (None, *RATES):
             raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
-        self.port, self._password, self._host, self._log = str(port), bytes(password), host, log
-        self._clock, self._counts, self._interrupted = clock or host.time, dict.fromkeys(COUNTS, 0), host.event()
-        self._options = {"address": address, "clock": clock, "interrupted": self._interrupted, "host": host}
-        self._link = self._assembler = self._settled = self._scan_clock = self._reader = None
-        self._interlaced = False
+        self.port, self._password, self._host = str(port), bytes(password), host
+        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
+        self._options = {"address": address, "interrupted": self._interrupted, "host": host}
+        self._link = self._assembler = self._settled = self._scan_clock = self._thread = None
+        self._interlaced, self._readings, self._trouble, self._news = False, [], None, host.event()
         try:
             self._connect(baudrate or 38400, host.now() + find_s)
             if baudrate is not None and baudrate != self.baudrate:
@@ -90,7 +91,7 @@ class LMS2xx(Closed):
         try:
             self.stop()
         except DeviceError as error:
-            self._log.warning("%s: closed without the device's consent: %s", self.port, error)
+            LOG.warning("%s: closed without the device's consent: %s", self.port, error)
         finally:
             self._release()
 
@@ -106,9 +107,8 @@ class LMS2xx(Closed):
     def counts(self):
         """How often what happened since the device was opened, a dict.
 
-        'telegrams': sound ones; 'crc_errors': damaged ones; 'resyncs': stray bytes skipped; 'dropped': scans that the
-        mirror made between two that came (needs real-time indices), most of them because the line is slow; 'stale':
-        scans that were not newer than the one before; 'reconnects'.
+        'dropped': scans that the mirror made between two that came (needs real-time indices), most of them because the
+        line is slow; 'stale': scans that were not newer than the one before; 'reconnects'.
         """
         return dict(self._counts)
 
@@ -116,7 +116,7 @@ class LMS2xx(Closed):
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
-        self._link, self._scan_clock = Link(self.port, first, self._counts, **self._options), ScanClock()
+        self._link, self._scan_clock = Link(self.port, first, **self._options), ScanClock()
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
@@ -128,7 +128,7 @@ class LMS2xx(Closed):
         self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
         self._read_configuration()
         told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
-        self._log.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
+        LOG.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
 
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
@@ -155,7 +155,7 @@ class LMS2xx(Closed):
             raise WrongDevice(text) from error
 
     def _idle(self):
-        if self._reader is not None:
+        if self._thread is not None:
             raise DeviceError(f"{self.port}: the device streams; call stop() first")
 
     def reconnect(self, deadline=10.0):
@@ -187,7 +187,7 @@ class LMS2xx(Closed):
         self._prepare()
         self._link.deadline = math.inf
         self._counts["reconnects"] += 1
-        self._log.warning("%s: the device is back at %d Bd", self.port, rate)
+        LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
     # ------------------------------------------------------------------------------------------------- settings
 
@@ -243,7 +243,7 @@ class LMS2xx(Closed):
         try:
             self._opened().ask(wire.VARIANT, words)
         except NoReply as error:  # the reply may be lost and the variant set
-            self._log.warning("%s; reading the variant", error)
+            LOG.warning("%s; reading the variant", error)
         self.status = self._told(wire.STATUS, codec.parse_status)
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
@@ -274,7 +274,7 @@ class LMS2xx(Closed):
             self._mode(INSTALLATION + self._password, "the password of the installation mode")
             self._link.ask(wire.CONFIGURE, wanted.block)
         except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
-            self._log.warning("%s; reading the configuration", error)
+            LOG.warning("%s; reading the configuration", error)
         finally:
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
@@ -311,40 +311,49 @@ class LMS2xx(Closed):
         if interlaced:
             self.set_variant(100, 0.25)
         self._stream()
+        self._readings, self._trouble, self._thread = [], None, self._host.thread(self._run, "LMS2xx reader")
+        self._thread.start()
 
-        def receive():
-            return [(one.code, self._scan(one)) for one in self._opened().receive()]
-
-        def recover(seconds):
-            self._mend(seconds)
-            self._stream()
-
-        interval_s = (4 if interlaced else 1) * self._assembler.interval_s
-        self._reader = ScanReader(receive, recover, interval_s, self._interrupted, self._log, self._host)
+    interval_s = property(lambda self: (4 if self._interlaced else 1) * self._assembler.interval_s,
+                          doc="Seconds between two scans of the stream.")  # fmt: skip
 
     def _stream(self):
         self._prepare(self._interlaced)
         self._mode(INTERLACED if self._interlaced else STREAM, "to stream", sign=SCAN)
 
-    def _streaming(self):
-        if self._reader is None:
-            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
-        return self._reader
+    def _run(self):
+        """Read until the stream is to stop; whatever goes wrong with the line, find the device again."""
+        lost = False
+        while not self._interrupted.is_set():
+            try:
+                if lost:
+                    self._mend(RECOVERY_S)
+                    self._stream()
+                    lost = False
+                self._read()
+            except DeviceError as error:
+                if lost:
+                    self._interrupted.wait(AGAIN_S)
+                self._trouble, lost = str(error), True
+                LOG.warning("LMS2xx: %s; looking for the device", error)
+            except Exception as error:  # told to whoever waits, who would wait for nothing
+                self._trouble = f"the reader thread failed: {error!r}"
+                LOG.exception("LMS2xx reader thread")
+                raise
 
-    def newest(self, after=None, timeout=2.0):
-        """The newest scan of the stream, a Reading, within so many seconds.
-
-        Its first beam is later than `after` by the host's clock; by default it is one that was not handed out before
-        and is not older than the stream needs. NoReply, which tells what is wrong with the stream, if there is none.
-        """
-        reader = self._streaming()
-
-        def find(readings):
-            oldest_s = max(reader.handed_s, self._clock() - 3 * reader.interval_s - wire.LEAST_QUIET_S)
-            fresh = readings and readings[-1].time_s > (oldest_s if after is None else after)
-            return readings[-1] if fresh else None
-
-        return reader.wait(find, timeout)
+    def _read(self):
+        """Post readings until the stream falls silent, or until the end; the list is replaced, never changed."""
+        last = self._host.now()
+        while not self._interrupted.is_set():
+            found = self._opened().receive()
+            if any(one.code == POWER_ON for one in found):
+                raise NoReply("the device started anew")
+            if fresh := [reading for one in found if (reading := self._scan(one)) is not None]:
+                self._readings, self._trouble = [*self._readings, *fresh][-KEPT:], None
+                self._news.set()
+                last = self._host.now()
+            if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
+                raise NoReply("the stream fell silent")
 
     def take(self, count, after=None, timeout=None):
         """Consecutive scans of the stream, a list of Reading, later than an instant, by default that of the call.
@@ -352,25 +361,29 @@ class LMS2xx(Closed):
         The last 256 scans are kept, so that with the instant of the last scan of one call the next call goes on
         without a gap. By default it lasts as long as the line needs and 2 s.
         """
-        reader, found = self._streaming(), []
-        limit = 2 + 2 * (count + 2) * reader.interval_s if timeout is None else timeout
-        begin_s, end = self._clock() if after is None else after, self._host.now() + limit
-
-        def find(readings):
-            last_s = found[-1].time_s if found else begin_s
-            return next((one for one in readings if one.time_s > last_s), None)
-
-        while len(found) < count:
-            found.append(reader.wait(find, max(0.0, end - self._host.now())))
-        return found
+        if self._thread is None:
+            raise DeviceError(f"{self.port}: the device does not stream; call start() first")
+        limit = 2 + 2 * (count + 2) * self.interval_s if timeout is None else timeout
+        found, last_s, end = [], self._host.time() if after is None else after, self._host.now() + limit
+        while True:
+            self._news.clear()
+            alive = self._thread.is_alive()
+            found += [one for one in self._readings if one.time_s > last_s]
+            if len(found) >= count:
+                return found[:count]
+            last_s, left = found[-1].time_s if found else last_s, end - self._host.now()
+            if left <= 0 or not alive:
+                state = "the stream is silent" if alive else "the reader thread ended"
+                raise NoReply(f"no new scan within {limit:g} s: {self._trouble or state}")
+            self._news.wait(min(left, 0.2))
 
     def stop(self):
         """Stop streaming; nothing happens where the device does not."""
-        if self._reader is None:
+        if self._thread is None:
             return
         self._interrupted.set()
-        self._reader.thread.join()
-        self._reader = None
+        self._thread.join()
+        self._thread = None
         self._interrupted.clear()
         if self._link is None:
             raise LineLost(f"{self.port}: the line is lost; the device may still stream")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.drivers.port import REAL, DeviceError, NoReply, PortError, Refused, WrongDevice, line_lost
+from lrfcal_lib.drivers.port import REAL, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session import lms2xx_codec as codec
 
 ACK, NAK = 0x06, 0x15
@@ -32,7 +32,7 @@ WINDOWS_S = (0.25, 0.25, 0.6)  # to listen at a rate, in turn
 
 
 class Arrival(NamedTuple):
-    """A telegram and when its last byte came in, by the clock of the link."""
+    """A telegram and when its last byte came in, by the host's clock."""
 
     raw: bytes
     time_s: float
@@ -53,15 +53,14 @@ def interval_s(size, baudrate, scan_s):
 class Link:
     """An open port with an LMS2xx at its other end.
 
-    `counts` has the numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up; address 0 reaches any device; once
-    the event `interrupted` is set, whoever waits here gets NoReply. Replies count whose address byte is among `senders`
-    (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s` is the instant by the clock at which
-    the last one was sent for the first time, and `heard` counts bytes of any kind.
+    Address 0 reaches any device; once the event `interrupted` is set, whoever waits here gets NoReply. Replies count
+    whose address byte is among `senders` (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s`
+    is the instant by the clock at which the last one was sent for the first time, and `heard` counts bytes of any kind.
     """
 
-    def __init__(self, path, baudrate, counts, *, address=0, clock=None, interrupted=None, host=REAL):
-        self.path, self.counts, self.address, self.host = path, counts, address, host
-        self.clock, self.interrupted = clock or host.time, interrupted or host.event()
+    def __init__(self, path, baudrate, *, address=0, interrupted=None, host=REAL):
+        self.path, self.address, self.host = path, address, host
+        self.interrupted = interrupted or host.event()
         self.senders, self.deadline, self.asked_s, self.heard = None, math.inf, 0.0, 0
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
@@ -115,7 +114,7 @@ class Link:
             data += self._port.read(self._port.in_waiting)
         if not data:
             return []
-        now, self._last = self.clock(), self.host.now()
+        now, self._last = self.host.time(), self.host.now()
         self.heard += len(data)
         data = self._rest + data
         stream = codec.split_stream(data)
@@ -123,9 +122,6 @@ class Link:
         stray = data[ends[-1] if ends else 0 : stream.pending]
         self._stray = stray[-1] if stray else None if ends else self._stray
         self._rest = data[stream.pending :]
-        self.counts["telegrams"] += len(ends)
-        self.counts["crc_errors"] += int((stream.rejected < stream.pending).sum())
-        self.counts["resyncs"] += stream.skipped > 1  # one byte is an acknowledgement
         spans = zip(stream.offset.tolist(), ends, strict=True)
         found = [Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate) for begin, end in spans]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]
@@ -140,7 +136,7 @@ class Link:
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
         end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
-        said, self.asked_s = None, self.clock()
+        said, self.asked_s = None, self.host.time()
         for _ in range(TRIES):
             self.send(code, data)
             reply, said = self._await(code | 0x80, sign, again_s, end)
@@ -355,74 +351,3 @@ class Assembler:
         columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
                    for name in ("ranges", "reasons", "bearings", "beam_times_s")}  # fmt: skip
         return replace(parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns)
-
-
-KEPT = 256  # scans that can be asked for by their instant
-LEAST_QUIET_S = 0.6
-RECOVERY_S = 8.0  # one attempt; there are more until the stream is stopped
-AGAIN_S = 0.1
-
-
-class ScanReader:
-    """A thread that reads scans until the event `leave` is set; `readings`, the last 256, is replaced, never changed.
-
-    ``receive()`` waits a moment for the next telegrams and gives a list of (code, Reading or None).
-    ``recover(seconds)`` finds the device and starts the stream again, or raises DeviceError.
-    `interval_s` is that between two readings, `handed_s` the instant of the newest one that somebody waited for.
-    """
-
-    def __init__(self, receive, recover, interval_s, leave, log, host):
-        self._receive, self._recover, self.interval_s = receive, recover, interval_s
-        self._leave, self._log, self._host, self._news = leave, log, host, host.event()
-        self.readings, self.handed_s, self._trouble = [], -math.inf, None
-        self.thread = host.thread(self._run, "LMS2xx reader")
-        self.thread.start()
-
-    def wait(self, find, timeout):
-        """The reading that ``find(readings)`` gives as soon as it is not None; NoReply if there is none in time."""
-        end = self._host.now() + timeout
-        while True:
-            self._news.clear()
-            alive, found = self.thread.is_alive(), find(self.readings)
-            if found is not None:
-                self.handed_s = max(self.handed_s, found.time_s)
-                return found
-            left = end - self._host.now()
-            if left <= 0 or not alive:
-                state = "the stream is silent" if alive else "the reader thread ended"
-                raise NoReply(f"no new scan within {timeout:g} s: {self._trouble or state}")
-            self._news.wait(min(left, 0.2))
-
-    def _run(self):
-        """Read; whatever goes wrong with the line, find the device again."""
-        lost = False
-        while not self._leave.is_set():
-            try:
-                if lost:
-                    self._recover(RECOVERY_S)
-                    lost = False
-                self._read()
-            except DeviceError as error:
-                if lost:
-                    self._leave.wait(AGAIN_S)
-                self._trouble, lost = str(error), True
-                self._log.warning("LMS2xx: %s; looking for the device", error)
-            except Exception as error:  # told to whoever waits, who would wait for nothing
-                self._trouble = f"the reader thread failed: {error!r}"
-                self._log.exception("LMS2xx reader thread")
-                raise
-
-    def _read(self):
-        """Post readings until the stream falls silent, or until the end."""
-        last = self._host.now()
-        while not self._leave.is_set():
-            found = self._receive()
-            if any(code == POWER_ON for code, _ in found):
-                raise NoReply("the device started anew")
-            fresh = [reading for _, reading in found if reading is not None]
-            if fresh:
-                self.readings, self._trouble = [*self.readings, *fresh][-KEPT:], None
-                self._news.set()
-                last = self._host.now()
-            if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
-                raise NoReply("the stream fell silent")

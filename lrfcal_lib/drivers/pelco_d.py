@@ -1,11 +1,13 @@
 """Pelco-D: frames, angles and answers, and the half-duplex line to a head."""
 
 import contextlib
+import logging
 import math
 from dataclasses import dataclass
 
 from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
 
+LOG = logging.getLogger(__name__)
 SYNC = 0xFF
 FRAME, GENERAL, SHORT = 7, 4, 5  # bytes of a frame and of the kinds of reply
 UP, DOWN = 0x08, 0x10  # bits of command 2; without them, and those of the pan, it is a stop
@@ -162,8 +164,8 @@ class HeadLine:
     `counts` has frames sent, bytes echoed and skipped, and reconnects.
     """
 
-    def __init__(self, path, settings, log, host=REAL):
-        self.path, self.settings, self.log, self.host = path, settings, log, host
+    def __init__(self, path, settings, host=REAL):
+        self.path, self.settings, self.host = path, settings, host
         self.counts = dict.fromkeys(("frames", "echoed", "skipped", "reconnects"), 0)
         self.lock, self._stop, self._port = host.lock(), encode_frame(settings.address), None
         self._free, self._sent, self._late, self._acknowledges = 0.0, 0.0, False, False
@@ -229,7 +231,7 @@ class HeadLine:
                     self.opened().write(self._stop)
                     self.host.sleep(self.wire_s() + self.settings.gap_s)
         except Exception as error:  # on the way out nothing else can be done
-            self.log.error("the head could not be stopped (%s): cut its power if it moves", error)
+            LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
         finally:
             if held:
                 self.lock.release()
@@ -255,7 +257,7 @@ class HeadLine:
                         over = self.host.now() >= end or len(data) >= MOST
                         received = split_replies(data, frame[:FRAME], complete=over)
             except LineLost:
-                self.log.warning("the line %s to the head is lost", self.path)
+                LOG.warning("the line %s to the head is lost", self.path)
                 there = self._port is not None  # else it did not come back
                 self.close()
                 if not (again and there):
@@ -281,7 +283,7 @@ class HeadLine:
                     self.host.sleep(0.05)
                     continue
                 self.counts["reconnects"] += 1
-                self.log.warning("the line %s to the head is back", self.path)
+                LOG.warning("the line %s to the head is back", self.path)
                 self._port.write(self._stop * 2)
                 self.host.sleep(self.wire_s(2 * FRAME) + self.settings.gap_s)
             return self._port

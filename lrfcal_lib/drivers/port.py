@@ -2,10 +2,8 @@
 
 import atexit
 import errno
-import json
 import os
 import signal
-import socket
 import termios
 import threading
 import time
@@ -163,36 +161,19 @@ def line_lost(path):
         raise LineLost(f"the line {path} is lost ({error}): check plug and power") from error
 
 
-def ask(path, line, timeout=10.0):
-    """Send one command, str or dict, to the control socket of an emulated rig; its answer.
-
-    Raises
-    ------
-    ValueError
-        If the rig refuses, with its reason.
-    OSError
-        If nobody serves the socket.
-    """
-    line = json.dumps(line) if isinstance(line, dict) else line
-    with socket.socket(socket.AF_UNIX) as link:
-        link.settimeout(timeout)
-        link.connect(os.fspath(path))
-        link.sendall(line.encode() + b"\n")
-        answer = json.loads(link.makefile().readline())
-    if not answer.pop("ok"):
-        raise ValueError(f"the emulated rig refuses '{line}': {answer['error']}")
-    return answer
-
-
 MOMENT_S = 1e-3
 
 
 class Host:
     """What drivers have of this machine, named as in `time` and `threading`; tests have another one."""
 
-    now, time = staticmethod(time.monotonic), staticmethod(time.time)
+    now, _zero = staticmethod(time.monotonic), time.time() - time.monotonic()
     event, lock = threading.Event, staticmethod(threading.RLock)
     port, set_rate = staticmethod(open_port), staticmethod(set_rate)
+
+    def time(self):
+        """A date, s, that nobody sets while this program runs: a step would tear scans and pitch apart."""
+        return self._zero + time.monotonic()
 
     @staticmethod
     def sleep(seconds):

@@ -3,16 +3,16 @@
 import contextlib
 import logging
 import math
-import time
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
 
 import numpy as np
+import urllib3
 
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, ask
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.drivers.video import Camera
 from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of
@@ -74,38 +74,31 @@ FEWEST_SCANS, LEAST_SWEEP = 8, math.radians(10)  # of which can be told whether 
 STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
 
 
-def host_clock():
-    """A clock, time.time() at first, that nobody sets while it runs: a step would tear scans and pitch apart."""
-    zero = time.time() - time.monotonic()
-    return lambda: zero + time.monotonic()
-
-
 class Rig(Closed):
     """The devices of a RigFile, all with the same host clock, s; a context manager that stops the head and closes them.
 
     :meth:`open` opens them.
     """
 
-    def __init__(self, stated, lrf, head, cameras, *, clock=time.time, host=REAL):
-        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras, clock
+    def __init__(self, stated, lrf, head, cameras, *, host=REAL):
+        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras, host.time
         self._closing, self._now = contextlib.ExitStack(), host.now
 
     @classmethod
-    def open(cls, stated, *, log=LOG, clock=None, host=REAL, camera=None):
+    def open(cls, stated, *, host=REAL, camera=None):
         """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
 
-        The host is the machine that the drivers run on, its clock :func:`host_clock` by default; ``camera(name)`` opens
-        cameras whose images come from elsewhere than the source stated. DeviceError, with the device in the message:
-        those opened before are closed again.
+        The host is the machine that the drivers run on; ``camera(name)`` opens cameras whose images come from elsewhere
+        than the source stated. DeviceError, with the device in the message: those opened before are closed again.
         """
-        common, devices = {"log": log, "clock": clock or host_clock()}, stated.devices
+        devices = stated.devices
         skipped = {"port", "interlaced"} | ({"variant"} if devices.lrf.interlaced else set())  # it chooses its own
         asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
         openers = {
-            "head": partial(PanTilt, devices.head.port, devices.head, host=host, **common),
-            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked, **common),
+            "head": partial(PanTilt, devices.head.port, devices.head, host=host),
+            "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked),
         }
-        camera = camera or partial(_camera, stated, common)
+        camera = camera or partial(_camera, stated)
         openers |= {f"camera '{name}'": partial(camera, name) for name in stated.cameras}
         with contextlib.ExitStack() as stack:
             opened = []
@@ -120,7 +113,7 @@ class Rig(Closed):
                 stack.callback(opened[-1].close)
             head, lrf, *cameras = opened
             cameras = dict(zip(stated.cameras, cameras, strict=True))
-            rig = cls(stated, lrf, head, cameras, clock=common["clock"], host=host)
+            rig = cls(stated, lrf, head, cameras, host=host)
             rig._closing = stack.pop_all()
         return rig
 
@@ -146,22 +139,25 @@ class Rig(Closed):
 
     def move_board(self, placement):
         """Put the board of an emulated rig at a placement; False where nobody but the user can: a real rig."""
-        return self._control("place", placement)
+        return self._control(f"place/{placement}")
 
     def hold_close(self, camera, view):
         """Hold the board of an emulated rig close to a camera; as :meth:`move_board`."""
-        return self._control("close", camera, view)
+        return self._control(f"close/{camera}/{view}")
 
-    def _control(self, command, *arguments):
+    def _control(self, command):
         if (control := self.stated.devices.control) is None:
             return False
         try:
-            ask(control, {"command": command, "arguments": list(arguments)})
-        except (OSError, ValueError) as error:
+            answer = urllib3.request("GET", f"{control}/{command}", timeout=10, retries=False)
+            wrong = answer.reason if answer.status >= 400 else None
+        except urllib3.exceptions.HTTPError as error:
+            wrong = error
+        if wrong:
             raise DeviceError(
-                f"control socket {control}: {error}; is 'python -m lrfcal_lib emulate' still running? "
+                f"control {control}: {wrong}; is 'python -m lrfcal_lib emulate' still running? "
                 "Remove devices.control from the rig file to move a real board by hand"
-            ) from error
+            )
         return True
 
     # ---------------------------------------------------------------------------------------------- recording
@@ -265,7 +261,7 @@ class Rig(Closed):
             if number <= len(images):
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
         self.lrf.start()
-        held = [self.lrf.newest(timeout=SCAN_S)]
+        held = self.lrf.take(1, timeout=SCAN_S)
         heard, newest = self._now(), held[-1].time_s
         self.head.start_sweep(last, self.stated.plan.sweep_speed)
         while self.head.moving():
@@ -328,13 +324,12 @@ def _later(instant, moved, what):
         raise DeviceError(f"the {what} is {moved.time_s - instant:.3f} s older than the stop it belongs to")
 
 
-def _camera(stated, common, name):
+def _camera(stated, name):
     """A camera that gives images of the size stated."""
     asked, info = stated.devices.cameras[name], stated.cameras[name]
     size, options = (info.width, info.height), asked.model_dump(exclude_none=True, exclude={"source", "size"})
-    camera = Camera(asked.source, name=name, size=size, **options, **common)
-    got = camera.settings["size"]["got"]
-    if got is not None and tuple(got) != size:
+    camera = Camera(asked.source, name=name, size=size, **options)
+    if (got := camera.size) not in (None, size):
         camera.close()
         raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x {size[1]}: "
                          "state a size that it can do")  # fmt: skip

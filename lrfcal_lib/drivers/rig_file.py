@@ -148,7 +148,7 @@ class CameraDevice(Stated):
 
 
 class Devices(Stated):
-    """The devices of a rig, and the control socket of an emulated one."""
+    """The devices of a rig, and the address of an emulated one, which places its board."""
 
     lrf: LrfDevice
     head: HeadDevice

@@ -7,7 +7,6 @@ import os
 import re
 import select
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 import requests
 from urllib3.exceptions import HTTPError
 
-from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
 
 LOG = logging.getLogger(__name__)
 END = b"\xff\xd9"  # of a JPEG file; inside of its image data it cannot occur
@@ -211,7 +210,7 @@ class Frame:
 
 
 class Camera(Closed):
-    """A camera, set to what is asked for; what came of it is read back. A context manager.
+    """A camera, set to what is asked for; what could not be set is logged. A context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
     source again when it is lost. A recorded one (video file, images) gives its next image each time it is asked.
@@ -229,14 +228,11 @@ class Camera(Closed):
     fps : float, optional
     silence_s : float
         A stream that sends nothing for so long is taken for lost and opened again.
-    clock : callable
-        Host clock, s.
 
     Attributes
     ----------
-    settings : dict
-        'size' (width, height) in pixels, 'exposure' in s and 'fps', each a dict of 'asked' and 'got' (None where it is
-        unknown), and 'warnings', a list of str: what could not be set.
+    size : tuple of int or None
+        Width and height that it gives, pixels; None where that is unknown.
     lost : bool
         A live source gave no frame when it should have, and was not found again yet; a recorded one is at its end.
 
@@ -246,10 +242,9 @@ class Camera(Closed):
         If the source is missing, forbidden, busy, or no camera.
     """
 
-    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0, log=LOG, clock=time.time):
-        asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
-        self.name, self.lost, self._log, self._clock = name, False, log, clock
-        self.settings = {key: {"asked": value, "got": None} for key, value in asked.items()} | {"warnings": []}
+    def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
+        self._asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
+        self.name, self.lost, self._told = name, False, set()
         self._source = find_source(source, silence_s)
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
         self._capture = self._source.open(self._source)
@@ -287,7 +282,7 @@ class Camera(Closed):
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
             if self._thread is None:
-                self.lost = not self._capture.grab() or not self._keep(self._clock())
+                self.lost = not self._capture.grab() or not self._keep(REAL.time())
                 if self.lost:
                     raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: "
                                    "open it again")  # fmt: skip
@@ -321,7 +316,7 @@ class Camera(Closed):
             if self._capture is None or not self._capture.grab():
                 self._lose()
                 continue
-            now = self._clock()  # what was there at once may have come at any time since the frame before
+            now = REAL.time()  # what was there at once may have come at any time since the frame before
             self._keep(now if getattr(self._capture, "waited", True) else self._before)
             self._before = now
         self._release()
@@ -335,7 +330,7 @@ class Camera(Closed):
                 self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
                 self._count += 1
                 if self.lost:
-                    self._log.warning("camera %s is back", self.name)
+                    LOG.warning("camera %s is back", self.name)
                 self.lost = False
                 self._new.notify_all()
         return done
@@ -344,7 +339,7 @@ class Camera(Closed):
         """Forget the last frame, and look for the source."""
         with self._new:
             if not self.lost:
-                self._log.warning("camera %s is lost: %s", self.name, self._source.remedy)
+                LOG.warning("camera %s is lost: %s", self.name, self._source.remedy)
             self.lost, self._frame = True, None
         self._release()
         if not self._quit.wait(AGAIN_S):
@@ -354,8 +349,7 @@ class Camera(Closed):
 
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
-        self._before, capture, ticks = self._clock(), self._capture, 0
-        asked = {key: one["asked"] for key, one in self.settings.items() if key != "warnings"}
+        self._before, capture, asked, ticks = REAL.time(), self._capture, self._asked, 0
         if self._source.open is _open_device:
             exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
             wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
@@ -364,15 +358,13 @@ class Camera(Closed):
             done = {key: capture.set(key, value) for key, value in wanted.items() if value is not None}
             ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
         size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
-        found = {"size": size if all(size) else None, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
+        self.size = size if all(size) else None
+        found = {"size": self.size, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
                  "fps": capture.get(FPS) or None}  # fmt: skip
-        warnings = []
         for key, got in found.items():
-            self.settings[key]["got"] = got
-            if asked[key] is not None and (got is None or not np.allclose(asked[key], got, rtol=0.05, atol=0)):
-                told = "cannot be set" if got is None else f"is {got}"
-                warnings.append(f"camera {self.name}: {key} {told}, asked {asked[key]}")
-        for text in warnings:
-            if text not in self.settings["warnings"]:
-                self._log.warning(text)
-        self.settings["warnings"] = warnings
+            if asked[key] is None or got is not None and np.allclose(asked[key], got, rtol=0.05, atol=0):
+                continue
+            text = f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, asked {asked[key]}"
+            if text not in self._told:  # once, however often it is opened again
+                self._told.add(text)
+                LOG.warning(text)

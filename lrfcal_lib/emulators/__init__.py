@@ -1,4 +1,4 @@
 """Devices that are not there: LMS2xx and Pelco-D heads on pseudo-terminals, cameras over HTTP, one simulated world.
 
-``Clock(machine=...)`` of a machine with a time of its own lets a device live in that: tests of drivers are instant.
+Given a `host` with a time of its own a device lives in that: tests of drivers are instant, and faults are theirs.
 """

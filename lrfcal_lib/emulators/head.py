@@ -7,7 +7,8 @@ import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import ANSWER, DOWN, FASTEST, SYNC, UP, encode_extended
-from lrfcal_lib.emulators.line import Clock, SerialDevice
+from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.simulate.rig import Platform
 
 REACT_S = 0.04  # from a command to the motor
@@ -16,10 +17,6 @@ WOBBLE_HZ = 4.0
 KEPT = 2000  # pieces of motion; ten times as many frames
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
 FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
-SLIP_S = 0.3  # of the fault
-JUMP = 1000  # of the fault, hundredths of a degree
-FEEDBACK = ("full", "partial", "none")
-REPLIES = ("extended", "general", "five", "single", "none")
 
 
 class Head:
@@ -127,24 +124,22 @@ class EmulatedHead(SerialDevice):
         Stops when no frame came for so long.
     invert : bool
         'Up' and positive elevation lower the view.
-    seed, clock
+    seed, host
         As for :class:`EmulatedLms`. `frames` holds host time and sound frames to this address.
     """
 
     def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", reply="extended", echo=False,
-                 speeds=(0.5, 12.0), go_speed=8.0, watchdog_s=None, invert=False, seed=0, clock=None):  # fmt: skip
-        if feedback not in FEEDBACK or reply not in REPLIES:
-            raise ValueError(f"feedback is one of {FEEDBACK} and reply one of {REPLIES}, got {feedback!r}, {reply!r}")
-        super().__init__("head", path, clock or Clock(), seed)
+                 speeds=(0.5, 12.0), go_speed=8.0, watchdog_s=None, invert=False, seed=0, host=REAL):  # fmt: skip
+        super().__init__(path, host, seed)
         self.head, self.baudrate, self.address = head or Head(seed=seed), baudrate, address
         self.feedback, self.reply_kind, self.echo = feedback, "none" if feedback == "none" else reply, echo
         self.speeds, self.go_speed = np.radians(speeds), math.radians(go_speed)
         self.watchdog_s, self.sign, self.frames = watchdog_s, -1 if invert else 1, deque(maxlen=10 * KEPT)
-        self._buffer, self._absolute_until = b"", -math.inf
+        self._buffer, self.absolute_until = b"", -math.inf
 
     def pitch(self, instant=None):
-        """True pitch now, or at instants of the devices' clock, radians."""
-        return self.head.pitch(self.clock.now() if instant is None else instant)
+        """True pitch now, or at instants, radians."""
+        return self.head.pitch(self.host.now() if instant is None else instant)
 
     def receive(self, data, at):
         """Bytes of the host; the last of them arrived at an instant."""
@@ -156,55 +151,47 @@ class EmulatedHead(SerialDevice):
         self._buffer = data[pending:]
         for frame in frames:
             if frame.address == self.address:
-                self._obey(frame, at)
+                self.obey(frame, at)
         if self._buffer:
             self.at(at + FRAGMENT_S, lambda _: setattr(self, "_buffer", b""), "fragment")
 
-    def _obey(self, frame, at):
-        self.frames.append((self.clock.machine.time(), frame))
+    def obey(self, frame, at):
+        """Do what a frame says, and confirm it."""
+        self.frames.append((self.host.time(), frame))
         self.cancel("watchdog")
         if self.watchdog_s:
-            self.at(at + self.watchdog_s, self._stop, "watchdog")
+            self.at(at + self.watchdog_s, self.stop, "watchdog")
         if frame.command2 in ANSWER:
-            return self._tell(frame.command2, at)
+            return self.tell(frame.command2, at)
         head, way = self.head, {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
         if not frame.command2 & 1:
             if way is None:  # without a direction it is a stop whatever the speeds say
-                self._stop(at)
-            elif not self.faults.hit("stall"):
-                self._absolute_until = -math.inf
+                self.stop(at)
+            else:
+                self.absolute_until = -math.inf
                 speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, FASTEST) / FASTEST
                 head.move(at, way * math.tau, speed)
         elif frame.command2 == pelco_d.SET_TILT and self.feedback == "full" and frame.value < pelco_d.TURN:
-            if at >= self._absolute_until and not self.faults.hit("stall"):  # a second absolute move is lost
+            if at >= self.absolute_until:  # a second absolute move is lost
                 goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.limits))
-                self._absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
+                self.absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
                 head.go(at, goal, self.go_speed)
         answers = {"general": bytes([SYNC, self.address, 0, sum(vars(frame).values()) % 256]), "single": b"\x01"}
         if self.reply_kind in answers:
-            self.reply("confirm", answers[self.reply_kind], at + TURN_AROUND_S)
+            self.reply(answers[self.reply_kind], at + TURN_AROUND_S)
 
-    def _stop(self, at):
-        self._absolute_until = -math.inf
-        self.head.stop(at + SLIP_S * self.faults.hit("slip"))
+    def stop(self, at):
+        """Stop the motor."""
+        self.absolute_until = -math.inf
+        self.head.stop(at)
 
-    def _tell(self, opcode, at):
+    def tell(self, opcode, at):
         """Answer a query, unless the head is too busy or does not know how."""
-        busy = at < self._absolute_until or (self.feedback == "partial" and self.head.moving(at))
-        if self.reply_kind == "none" or busy or self.faults.hit("mute"):
+        busy = at < self.absolute_until or (self.feedback == "partial" and self.head.moving(at))
+        if self.reply_kind == "none" or busy:
             return
         tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at)) if opcode == pelco_d.QUERY_TILT else 0
         raw = encode_extended(self.address, ANSWER[opcode], tilt)
         if self.reply_kind == "five":
             raw = bytes([0, *raw[3:6], sum(raw[3:6]) % 256])
-        self.reply(opcode, raw, at + TURN_AROUND_S)
-
-    def prepare(self, raw):
-        """A reply with the faults that keep its checksum sound."""
-        hit = self.faults.hit
-        if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and hit("jump"):
-            raw = encode_extended(self.address, raw[3], (int.from_bytes(raw[4:6], "big") + JUMP) % pelco_d.TURN)
-        if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and hit("address"):
-            other = raw[1] % 255 + 1
-            raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
-        return encode_extended(self.address, pelco_d.ZOOM, 0x1234) + raw if hit("foreign") else raw
+        self.reply(raw, at + TURN_AROUND_S)

@@ -3,12 +3,12 @@
 import logging
 import math
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lrfcal_lib.emulators.line import Clock, SerialDevice
+from lrfcal_lib.drivers.port import REAL
+from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN, UNITS, Configuration, encode_telegram
 from lrfcal_lib.simulate.beam import VARIANTS
@@ -19,7 +19,6 @@ ACK_S = 0.003  # from the last byte of a request to ACK or NAK; the manual allow
 REPLY_S = 0.065  # to the first byte of a reply, as measured on a real device
 WRITE_S = 0.107  # the same where flash is written (measured: 0x77)
 RESET_S = 0.010
-SLOW_MODE_S = 2.8
 STOP_S = 0.52  # a change of mode while streaming takes up to so much longer (measured: 71 to 588 ms)
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
 BURST = 508  # bytes that leave in one turn of the mirror at 500000 Bd
@@ -38,7 +37,7 @@ _WORDS = {19: (95, 97, 96, 94, 96, 95, 97, 95, 90, 91, 90, 92, *(100,) * 8, *(95
 
 @dataclass(frozen=True)
 class ScanRecord:
-    """A scan that was sent, or that a fault kept from being sent."""
+    """A scan that was sent."""
 
     number: int  # running
     turn: int  # of the mirror since power-on, the first of the scan; modulo 256 it is the scan index
@@ -48,12 +47,12 @@ class ScanRecord:
     pitch_rad: np.ndarray  # (2,), true pitch of the head at the earliest and the latest beam; NaN without a head
     partial: int  # 0 to 3 for the quarters of interlaced scans, -1 for whole ones
     words: np.ndarray  # (B,) of uint16, all values of the scan, as the device counts them
-    telegram: bytes  # before any fault
+    telegram: bytes
 
 
 @dataclass
 class Memory:
-    """Settings of the device; ValueError for those that no device has."""
+    """Settings of the device."""
 
     model: str = "LMS221;302063;X01.27 "  # 21 characters, the answer to the type request
     variant: tuple[int, int] = (180, 50)  # degrees and 1/100 degree
@@ -64,14 +63,6 @@ class Memory:
     password: bytes = b"SICK_LMS"
     serial: str = "05270497"
     flash_writes: int = 0  # since the device was made; the flash endures a few thousand
-
-    def __post_init__(self):
-        if len(self.model) != 21 or not self.model.isascii():
-            raise ValueError(f"a type has 21 ASCII characters, got {self.model!r}")
-        if not self.takes_variant(self.variant):
-            raise ValueError(f"{self.model[:6]} has no variant {self.variant}; variants are {VARIANTS}")
-        if self.baudrate not in BAUD_WORD or len(self.password) != 8:
-            raise ValueError(f"rate {self.baudrate} Bd, password {self.password!r}: no LMS2xx has that")
 
     def takes_variant(self, variant):
         """Whether the device offers a variant; the LMS211 sees 100 deg only."""
@@ -108,7 +99,8 @@ class EmulatedLms(SerialDevice):
     path : path-like
         Of the port to appear.
     seed : int
-    clock : Clock, optional
+    host : Host
+        Whose time the device lives in.
     boot_s : float
         From a restart to the power-on string; a real device takes up to 60 s.
     baudrates : tuple of int
@@ -126,19 +118,19 @@ class EmulatedLms(SerialDevice):
         Scans counted since power-on.
     left_out : int
         Times that a stream left scans out, as this machine is too slow to cast them in time: a moving head needs
-        some 20 ms of its processor for a scan, and a clock that runs fast shortens the time between two.
+        some 20 ms of its processor for a scan.
     """
 
     baudrate = property(lambda self: self.memory.baudrate, doc="Of the device now.")
     streaming = property(lambda self: self.memory.mode in (STREAM, INTERLACED), doc="Whether scans come by themselves.")
 
-    def __init__(self, source, *, path, seed=0, clock=None, boot_s=2.0, baudrates=(*BAUD_WORD,), **settings):
-        super().__init__("lrf", path, clock or Clock(), seed)
+    def __init__(self, source, *, path, seed=0, host=REAL, boot_s=2.0, baudrates=(*BAUD_WORD,), **settings):
+        super().__init__(path, host, seed)
         self.memory, self.source = Memory(**settings), source
         self.boot_s, self.baudrates, self.rng = boot_s, baudrates, np.random.default_rng([seed, 1])
         self.scans, self.requests, self.telegrams, self.left_out = deque(maxlen=KEPT), deque(maxlen=KEPT), 0, 0
         self._buffer, self._turn, self._partial, self._number, self._effect = b"", 0, 0, 0, None
-        self._zero, self._booting = self.clock.now() - POWERED_S, False
+        self._zero, self._booting = host.now() - POWERED_S, False
 
     # ------------------------------------------------------------------------------------------- bytes from the host
 
@@ -149,86 +141,79 @@ class EmulatedLms(SerialDevice):
         found = codec.split_stream(raw, replies=False)
         self._buffer = raw[found.pending :]
         for offset, length in zip(found.offset.tolist(), found.length.tolist(), strict=True):
-            self._hear(raw[offset : offset + length], at)
+            self.heard(raw[offset : offset + length], at)
         if len(found.rejected) and not len(found.offset):
-            self._hear(raw[found.rejected[0] :], at, sound=False)
+            self.heard(raw[found.rejected[0] :], at, sound=False)
         if self._buffer:
-            self.at(at + GAP_S * self.clock.scale, lambda _: setattr(self, "_buffer", b""), "gap")
+            self.at(at + GAP_S, lambda _: setattr(self, "_buffer", b""), "gap")
 
-    def _hear(self, raw, at, sound=True):
+    def heard(self, raw, at, sound=True):
         """Acknowledge a telegram and do what it says; it interrupts what is being sent, and undoes no command."""
-        memory, hit = self.memory, self.faults.hit
-        if raw[1] not in (0, memory.address) or self._booting:
+        if raw[1] not in (0, self.memory.address) or self._booting:
             return None
         self.cancel("reply", "stream")
         self.abort()
-        if not sound or hit("nak"):
+        if not sound:
             return self.write(NAK, at + ACK_S, self._finish)
-        if not hit("no_ack"):
-            self.write(ACK, at + ACK_S)
-        self.requests.append((self.clock.machine.time(), raw))
-        if hit("reboot"):
-            return self.at(at + RESET_S, self._restart)
-        if hit("rate"):
-            memory.baudrate = int(self.faults.rng.choice([rate for rate in BAUD_WORD if rate != memory.baudrate]))
-        return self._answer(at, 0x92) if hit("refused") else self._obey(codec.parse_telegram(raw), at)
+        self.write(ACK, at + ACK_S)
+        self.requests.append((self.host.time(), raw))
+        return self.obey(codec.parse_telegram(raw), at)
 
-    def _obey(self, telegram, at):
+    def obey(self, telegram, at):
+        """Do what a telegram says, and answer it."""
         memory = self.memory
         match telegram.code, telegram.data:
             case 0x10, _:
-                self._answer(at, 0x91, effect=lambda end: self.at(end + RESET_S, self._restart), delay=ACK_S + 0.001)
+                self.answer(at, 0x91, effect=lambda end: self.at(end + RESET_S, self.restart), delay=ACK_S + 0.001)
             case 0x20, data:
-                self._mode(data, at)
+                self.set_mode(data, at)
             case 0x30, b"\x01":  # one scan: the one that is being measured when the ACK is out
                 first = self._turn_of(at + ACK_S + 2 * self.byte_s, 100 // memory.variant[1], math.floor)
-                self._measure(first, -1, lambda scan, instant: self._emit(scan, instant, self._finish), "reply")
+                self._measure(first, -1, lambda scan, instant: self.emit(scan, instant, self._finish), "reply")
             case 0x31, _:
-                self._answer(at, 0xB1, memory.status_data())
+                self.answer(at, 0xB1, memory.status_data())
             case 0x32, _:
-                self._answer(at, 0xB2)
+                self.answer(at, 0xB2)
             case 0x3A, _:
-                self._answer(at, 0xBA, memory.model.encode())
+                self.answer(at, 0xBA, memory.model.encode())
             case 0x3B, data if len(data) == 4:  # nothing is streamed while the variant changes
                 asked = tuple(np.frombuffer(data, "<u2").tolist())
                 taken = memory.takes_variant(asked)
                 memory.variant = asked if taken else memory.variant
-                self._answer(at, 0xBB, bytes([taken]) + np.array(memory.variant, "<u2").tobytes(), delay=WRITE_S)
+                self.answer(at, 0xBB, bytes([taken]) + np.array(memory.variant, "<u2").tobytes(), delay=WRITE_S)
             case 0x74, _:
-                self._answer(at, 0xF4, memory.configuration.block)
+                self.answer(at, 0xF4, memory.configuration.block)
             case 0x77, data if 32 <= len(data) <= 34 and memory.mode == INSTALLATION:
                 taken = memory.write_configuration(data)
-                self._answer(at, 0xF7, bytes([taken]) + memory.configuration.block, delay=WRITE_S)
+                self.answer(at, 0xF7, bytes([taken]) + memory.configuration.block, delay=WRITE_S)
             case _:
-                self._answer(at, 0x92)
+                self.answer(at, 0x92)
 
-    def _mode(self, data, at):
+    def set_mode(self, data, at):
         """The rate changes when the reply has left; a change of the mode takes its time, more so in a stream."""
         mode, memory, rng = int.from_bytes(data[:1]), self.memory, self.rng
         if mode in BAUD_COMMAND and len(data) == 1:
             if BAUD_COMMAND[mode] not in self.baudrates:
-                return self._answer(at, 0xA0, FAULT)
-            return self._answer(at, 0xA0, DONE, lambda _: setattr(memory, "baudrate", BAUD_COMMAND[mode]))
+                return self.answer(at, 0xA0, FAULT)
+            return self.answer(at, 0xA0, DONE, lambda _: setattr(memory, "baudrate", BAUD_COMMAND[mode]))
         if len(data) != {INSTALLATION: 9, DIAGNOSIS: 1, STREAM: 1, REQUEST: 1, INTERLACED: 1}.get(mode):
-            return self._answer(at, 0x92)
+            return self.answer(at, 0x92)
         if mode == INSTALLATION and data[1:] != memory.password:
-            return self._answer(at, 0xA0, WRONG)
+            return self.answer(at, 0xA0, WRONG)
         delay = REPLY_S + rng.uniform(0, 0.02) + (rng.uniform(0, STOP_S) if self.streaming else 0)
-        if not (self.streaming and self.faults.hit("stuck")):
-            memory.mode = mode
-            delay = SLOW_MODE_S if self.faults.hit("slow_mode") else delay
-        return self._answer(at, 0xA0, DONE, delay=delay)
+        memory.mode = mode
+        return self.answer(at, 0xA0, DONE, delay=delay)
 
     # ------------------------------------------------------------------------------------------- replies
 
     def _encode(self, code, data=b""):
         return encode_telegram(code, data, status=0x10, address=0x80 | self.memory.address)
 
-    def _answer(self, at, code, data=b"", effect=None, delay=REPLY_S):
+    def answer(self, at, code, data=b"", effect=None, delay=REPLY_S):
         """Send a reply after a delay; its effect comes when it is out, and streaming goes on."""
         self._effect = effect or self._effect  # of the command before, where this one interrupted its reply
         raw = self._encode(code, data)
-        self.at(at + delay, lambda instant: self.reply(code, raw, instant, self._finish), "reply")
+        self.at(at + delay, lambda instant: self.reply(raw, instant, self._finish), "reply")
 
     def _finish(self, at):
         """A reply is out: do what is left of the command, and go on streaming with the next scan that begins."""
@@ -240,21 +225,14 @@ class EmulatedLms(SerialDevice):
             self._partial, self._turn = 0, self._turn_of(at, self._turns, math.ceil)
             self._plan()
 
-    def prepare(self, raw):
-        """A reply with the faults that keep its checksum sound."""
-        hit = self.faults.hit
-        with suppress(codec.TelegramError):
-            told = codec.parse_telegram(raw)
-            status = 0xD3 if hit("status") else told.status
-            address = 0x80 | (told.address + 5) % 0x80 if hit("address") else told.address
-            raw = encode_telegram(told.code, told.data, status=status, address=address)
-        if hit("length"):
-            length = (len(raw) - 5 + int(self.faults.rng.integers(40))) % 800
-            raw = raw[:2] + length.to_bytes(2, "little") + raw[4:-2]
-            raw += codec.crc16(raw).to_bytes(2, "little")
-        return self._encode(0xB2) + raw if hit("foreign") else raw
+    def reply(self, raw, at, then=None):
+        """Send a reply; at 500000 Bd at most 508 bytes leave in one turn of the mirror."""
+        step = BURST if self.memory.baudrate == 500000 else len(raw) or 1
+        for burst, first in enumerate(range(0, len(raw), step)):
+            self.write(raw[first : first + step], at + burst * MIRROR_TURN)
+        self.write(b"", at, then)
 
-    def _restart(self, at):
+    def restart(self, at):
         """Silence; variant and rate are those of the factory, and at the end a power-on string is sent."""
         self.cancel("reply", "stream")
         self.abort()
@@ -265,7 +243,7 @@ class EmulatedLms(SerialDevice):
 
     def _ready(self, at):
         self._booting, self._buffer, self._zero, self.telegrams = False, b"", at, 0
-        self.reply(0x90, self._encode(0x90, self.memory.model.encode()), at)
+        self.reply(self._encode(0x90, self.memory.model.encode()), at)
 
     # ------------------------------------------------------------------------------------------- scans
 
@@ -284,21 +262,21 @@ class EmulatedLms(SerialDevice):
             quarters = codec.scan_quarters(181 - (partial > 0) if partial >= 0 else angle * 100 // step + 1, partial)
             times = self._zero + (turn + np.arange(len(quarters)) % turns + quarters / 1440) * MIRROR_TURN
             ranges, reasons, pitch = self.source.scan(turn, quarters, times)
-            c, times = self.memory.configuration, self.clock.host(times)
+            c, times = self.memory.configuration, times + self.host.time() - self.host.now()
             words = codec.encode_values(ranges, unit=c.unit, mode=c.measuring_mode, reasons=reasons)
             scan = ScanRecord(-1, turn, -1, float(times[0]), times, pitch, partial, words, b"")
             self.at(end, lambda instant: send(scan, instant), tag)
 
         self.at(end - AHEAD_S, ahead, tag)
 
-    def _emit(self, scan, at, then=None):
+    def emit(self, scan, at, then=None):
         """Send a scan, which is then on record."""
         c, indices = self.memory.configuration, (scan.turn, self.telegrams)
         raw = codec.encode_words(scan.words, unit=c.unit, partial=scan.partial, address=0x80 | self.memory.address,
                            indices=indices if c.realtime_indices else None)  # fmt: skip
         self.scans.append(replace(scan, number=self._number, telegram_index=self.telegrams % 256, telegram=raw))
         self.telegrams, self._number = self.telegrams + 1, self._number + 1
-        self.reply(codec.SCAN, raw, at, then, BURST if self.memory.baudrate == 500000 else None, MIRROR_TURN)
+        self.reply(raw, at, then)
 
     @property
     def _turns(self):
@@ -308,13 +286,13 @@ class EmulatedLms(SerialDevice):
     def _plan(self):
         """Measure the next scan of the stream; of one that lags, some are left out: the indices show the gap."""
         turns = self._turns
-        late = self.clock.now() - self._zero - (self._turn + turns) * MIRROR_TURN
+        late = self.host.now() - self._zero - (self._turn + turns) * MIRROR_TURN
         if late > LATE_S[self.left_out > 0]:
             if not self.left_out:
-                LOG.warning("%s: this machine casts scans too slowly for time_scale %g: %.1f s of them are left out; "
-                            "choose a smaller one, or stop-and-go", self.path, self.clock.scale, late)  # fmt: skip
+                LOG.warning("%s: this machine casts scans too slowly: %.1f s of them are left out; choose stop-and-go",
+                            self.path, late)  # fmt: skip
             self.left_out, self.telegrams, self._partial = self.left_out + 1, self.telegrams + 1, 0
-            self._turn = self._turn_of(self.clock.now(), turns, math.ceil)
+            self._turn = self._turn_of(self.host.now(), turns, math.ceil)
         partial = -1
         if self.memory.mode == INTERLACED:  # which partial scans there are depends on the resolution set
             partial, self._partial = self._partial * self.memory.variant[1] % 100 // 25, self._partial + 1
@@ -325,10 +303,10 @@ class EmulatedLms(SerialDevice):
 
         As many whole scans pass as the transfer needs (manual, table 10-17).
         """
-        if self.busy_until > at + 1e-9 or self.faults.hit("skip"):
+        if self.busy_until > at + 1e-9:
             self.telegrams += 1
         else:
-            self._emit(scan, at)
+            self.emit(scan, at)
         size = 2 * len(scan.words) + 10 + 2 * self.memory.configuration.realtime_indices
         self._turn += math.ceil(size * self.byte_s / (self._turns * MIRROR_TURN)) * self._turns
         self._plan()

@@ -1,37 +1,28 @@
 """The one simulated world that all emulated devices look at, and its cameras as MJPEG over HTTP on this machine.
 
-A process of its own draws the images, so that the serial devices keep their times. No image shows a head that moves:
-while it does none is sent, and one that was begun before a move is not sent after it.
+No image shows a head that moves: while it does none is sent, and one that was begun before a move is not sent after it.
 """
 
 import contextlib
 import itertools
-import logging
-import math
-import os
-import signal
 import threading
 import time
-from concurrent.futures import CancelledError, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import close_views, world_of
 from lrfcal_lib.simulate.rig import placements_of
 from lrfcal_lib.simulate.scene import Imager
 
-LOG = logging.getLogger(__name__)
 STILL = 1e-7  # radians within which a scan at rest is cast once
 LOOK_S = 0.05
 QUALITY = 97  # of JPEG
@@ -55,8 +46,8 @@ class EmulatedWorld:
 
     place = property(lambda self: self._scene[0], doc="Where the board is.")
 
-    def __init__(self, setup, clock, seed=0, placements=None):
-        self.setup, self.clock, self.head = setup, clock, Head(setup.rig.platform, seed)
+    def __init__(self, setup, host=REAL, seed=0, placements=None):
+        self.setup, self.host, self.head = setup, host, Head(setup.rig.platform, seed)
         self.placements = {p.number: p for p in placements or placements_of(setup)}
         self._rng, self._still = np.random.default_rng([seed, 3]), (None, None)
         self.put(None)
@@ -94,13 +85,6 @@ class EmulatedWorld:
             self._still = key, lrf.ideal_readings(rig.beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
         return *lrf.measured(rig.beam, *self._still[1], self._rng), pitch[[np.argmin(times), np.argmax(times)]]
 
-    def truth(self):
-        """What only the simulator knows, as JSON."""
-        boards = {n: transform_to_json(p.T_platform_board) for n, p in self.placements.items()}
-        pitch = math.degrees(float(self.head.pitch(self.clock.now())))
-        about = {"boards": boards, "place": list(self.place.key), "pitch_deg": pitch}
-        return {"setup": self.setup.name} | self.setup.rig.truth() | about
-
 
 def scaled(rig, width):
     """The rig with images of another width, the same field of view; ValueError for an odd number of pixels."""
@@ -116,83 +100,39 @@ def scaled(rig, width):
     return replace(rig, cameras=tuple(cameras))
 
 
-class Serving:
-    """A server of `socketserver` in a thread of its own."""
-
-    def __init__(self, server):
-        self.server, self._thread = server, threading.Thread(target=server.serve_forever, args=(0.2,), daemon=True)
-        self.start = self._thread.start
-
-    def close(self):
-        """End it, started or not."""
-        if self._thread.is_alive():
-            self.server.shutdown()
-        self.server.server_close()
-
-
-_drawing = None  # in the drawing process: the setup, its cameras' imagers, worlds by place
-
-
-def _begin(setup):
-    """Furnish the drawing process, which ends with a parent that was killed."""
-    global _drawing
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this process
-    threading.Thread(target=lambda: wait([parent_process().sentinel]) and os._exit(1), daemon=True).start()
-    cv2.setNumThreads(1)
-    imagers = [Imager(camera.model, camera.exposure) for camera in setup.rig.cameras]
-    _drawing = setup, imagers, lru_cache(2)(lambda place: world_of(setup, place.T_platform_board, stand=place.stand))
-
-
-def _draw(index, place, pitch, seed):
-    """JPEG of what a camera sees; runs in the drawing process."""
-    setup, imagers, world = _drawing
-    pose = setup.rig.camera_pose(setup.rig.cameras[index], pitch)
-    image = imagers[index].render(world(place), pose, np.random.default_rng(seed))
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-
-
 class CameraServer:
-    """The cameras of a world.
+    """The cameras of a world, and who puts its board elsewhere, over HTTP.
+
+    `url` has ``NAME.mjpg`` of all `cameras`, and obeys ``place/NUMBER`` (or none) and ``close/CAMERA/VIEW``.
 
     Parameters
     ----------
     world : EmulatedWorld
-    setup : Setup
-        Whose cameras to show, such as smaller ones than the world's.
     seed : int
     rest_s : float
-        Seconds of the devices that the head must rest before an image is drawn. Nobody tells a camera whether its
-        image is wanted; most stops of a sweep need none and are shorter.
-
-    Attributes
-    ----------
-    urls : dict of str to str
-    error : Exception or None
-        What ended the drawing process; there are no more images.
+        Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its image is wanted;
+        most stops of a sweep need none and are shorter.
     """
 
-    serving = property(lambda self: not self.quit.is_set() and self.error is None, doc="Whether images are to come.")
-
-    def __init__(self, world, setup, *, seed=0, rest_s=0.5):
-        self.world, self.seed, self.rest_s, self.error = world, seed, rest_s, None
-        self.names = [camera.name for camera in setup.rig.cameras]
+    def __init__(self, world, *, seed=0, rest_s=0.5):
+        self.world, self.seed, self.rest_s, self.quit = world, seed, rest_s, threading.Event()
+        self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
+        self._imager = lru_cache(lambda name: Imager(self.cameras[name].model, self.cameras[name].exposure))
+        self._scene = lru_cache(2)(lambda place: world_of(world.setup, place.T_platform_board, stand=place.stand))
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
-        self.quit = threading.Event()
-        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (setup,))
-        server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"cameras": self}))
-        self._serving = Serving(server)
-        self.urls = {name: f"http://127.0.0.1:{server.server_port}/{name}.mjpg" for name in self.names}
-
-    def start(self):
-        """Serve, and draw the first images ahead."""
-        self._serving.start()
-        for name in self.names:
-            self._drawn(self._key(name))
+        self._pool = ThreadPoolExecutor(1, "drawing")
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"server_of": self}))
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        self.start = self._thread.start
 
     def close(self):
-        """End the server and the drawing process."""
-        self.quit.set()
-        self._serving.close()
+        """End the server, started or not, and the drawing."""
+        with self._lock:
+            self.quit.set()
+        if self._thread.is_alive():
+            self._server.shutdown()
+        self._server.server_close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def image(self, name, timeout=1.0):
@@ -201,29 +141,20 @@ class CameraServer:
         (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
         """
         end = time.monotonic() + timeout
-        try:
-            while self.serving and time.monotonic() < end:
-                key = self._key(name)
-                if key is None:
-                    self.quit.wait(LOOK_S)
-                    continue
-                with contextlib.suppress(TimeoutError, CancelledError):
-                    data = self._drawn(key).result(LOOK_S)
-                    if self._key(name) == key:
-                        return key, data
-        except BrokenProcessPool as error:
-            if self.serving:
-                LOG.error("the process that draws the images ended: a program that makes an EmulatedRig must do so "
-                          "below 'if __name__ == \"__main__\":'; otherwise look at its memory")  # fmt: skip
-            self.error = error
-        except RuntimeError:  # a pool that was shut down is no news
-            if self.serving:
-                raise
+        while not self.quit.is_set() and time.monotonic() < end:
+            key = self._key(name)
+            if key is None:
+                self.quit.wait(LOOK_S)
+                continue
+            with contextlib.suppress(TimeoutError, CancelledError):
+                data = self._drawn(key).result(LOOK_S)
+                if self._key(name) == key:
+                    return key, data
         return None, None
 
     def _key(self, name):
         """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
-        head, now = self.world.head, self.world.clock.now()
+        head, now = self.world.head, self.world.host.now()
         if not head.settled(now) or head.resting(now)[0] < self.rest_s + head.platform.settle:
             return None
         return name, self.world.place, round(float(head.pitch(now)), 7)
@@ -235,33 +166,56 @@ class CameraServer:
             if before != key:
                 if image is not None:
                     image.cancel()
-                index = self.names.index(key[0])
-                image = self._pool.submit(_draw, index, *key[1:], [self.seed, index, next(self._count)])
+                if self.quit.is_set():
+                    raise CancelledError
+                image = self._pool.submit(self._draw, *key, [self.seed, next(self._count)])
                 self._images[key[0]] = key, image
         return image
 
+    def _draw(self, name, place, pitch, seed):
+        """JPEG of what a camera sees."""
+        pose = self.world.setup.rig.camera_pose(self.cameras[name], pitch)
+        image = self._imager(name).render(self._scene(place), pose, np.random.default_rng(seed))
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+
 
 class _Handler(BaseHTTPRequestHandler):
-    """Sends the images of a camera as a stream, NAME.mjpg."""
+    """Sends the images of a camera as a stream, or moves the board."""
 
     def do_GET(self):
         """Answer a request, see :mod:`http.server`."""
-        cameras, name = self.cameras, self.path.strip("/").removesuffix(".mjpg")
-        if name not in cameras.names:
-            return self.send_error(404, f"cameras are {', '.join(cameras.urls.values())}")
+        cameras, world = self.server_of.cameras, self.server_of.world
+        try:
+            match self.path.removesuffix(".mjpg").strip("/").split("/"):
+                case [name] if name in cameras:
+                    return self._stream(name)
+                case ["place", number]:
+                    world.put(None if number == "none" else int(number))
+                case ["close", camera, view]:
+                    world.hold_close(camera, int(view))
+                case _:
+                    known = ", ".join(f"{name}.mjpg" for name in cameras)
+                    return self.send_error(404, f"there are {known}, place/NUMBER and close/CAMERA/VIEW")
+        except ValueError as error:
+            return self.send_error(400, str(error))
+        self.send_response(204)
+        return self.end_headers()
+
+    def _stream(self, name):
+        server = self.server_of
         with contextlib.suppress(ConnectionError, TimeoutError):
             self.send_response(200)
             self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
             self.send_header("Cache-Control", "no-cache")
             self.end_headers()
-            while cameras.serving:
-                _, data = cameras.image(name)
+            while not server.quit.is_set():
+                _, data = server.image(name)
                 if data is None:
                     self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
                 else:
                     head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                     self.wfile.write(head.encode() + data + b"\r\n")
-                    cameras.quit.wait(1 / FPS)
+                    server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
         pass

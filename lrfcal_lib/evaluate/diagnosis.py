@@ -43,8 +43,7 @@ def diagnose(prepared, pitch_errors=None):
 
     `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
     """
-    session, models = prepared.session, prepared.models
-    steadiness = {c: camera_steadiness(session, c, views, models[c]) for c, views in prepared.views.items()}
+    steadiness = {camera: camera_steadiness(prepared, camera) for camera in prepared.views}
     return Diagnosis(steadiness, board_bends(prepared, board_maps(prepared)), pitch_errors, dict(prepared.problems))
 
 

@@ -16,6 +16,7 @@ from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import handed_over, joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
 
@@ -114,17 +115,25 @@ def write_clouds(folder, calibration, method):
 
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
     """
-    session, folder, files = calibration.prepared.session, Path(folder), []
-    for name, scene in (("cloud", False), ("scene", True)):
-        if session.scene_placements if scene else calibration.prepared.scans:
-            blocks = cloud_blocks(calibration, method, scene)
-            if method == "joint":
-                blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
-            files.append(folder / f"{name}.ply")
-            write_ply(files[-1], blocks, [f"session {session.name}, method {method}, lrfcal {__version__}"])
-    if session.scene_placements:
+    return sum(spread(_write_cloud, _clouds(folder, calibration, method))[::-1], [])
+
+
+def _clouds(folder, calibration, method):
+    """What :func:`_write_cloud` takes, of each cloud of a session."""
+    scenes = [True] * bool(calibration.prepared.session.scene_placements)
+    return [(Path(folder), calibration, method, s) for s in scenes + [False] * bool(calibration.prepared.scans)]
+
+
+def _write_cloud(of):
+    """The files of a cloud."""
+    folder, calibration, method, scene = of
+    blocks, files = cloud_blocks(calibration, method, scene), [folder / f"{'scene' if scene else 'cloud'}.ply"]
+    if method == "joint":
+        blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
+    write_ply(files[0], blocks, [f"session {calibration.prepared.session.name}, method {method}, lrfcal {__version__}"])
+    if scene:
         files.append(folder / "scene.pcd")
-        write_pcd(files[-1], files[-2])
+        write_pcd(files[1], files[0])
     return files
 
 
@@ -181,10 +190,19 @@ def calibrate_session(path, out=None):
         print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
     for key, why in (found.prepared.problems | found.problems).items():
         print(f"{key}: {why}")
-    judged = judge(found)
+    method, file = handed_over(found), folder / "calibration.json"
+
+    def work(cloud):
+        """Write a cloud, or else judge the calibration and write it."""
+        if cloud:
+            return _write_cloud(cloud)
+        judged = judge(found, method)
+        if method:  # otherwise nothing can be handed over
+            write_calibration(file, calibration_record(found, method, judged))
+        return judged
+
+    *files, judged = spread(work, [*(_clouds(folder, found, method) if method else ()), None])
     print(*judged.sentences(), sep="\n")
-    if judged.errors:  # otherwise nothing can be handed over
-        method, file = handed_over(found), folder / "calibration.json"
-        write_calibration(file, calibration_record(found, method, judged))
-        print("written:", *(f"{path}," for path in write_clouds(folder, found, method)), file)
+    if method:
+        print("written:", *(f"{path}," for path in sum(files[::-1], [])), file)
     return UNTRUSTED if judged.answer == NO else 0

@@ -156,9 +156,9 @@ def scene_errors(cloud, calibration, method):
     if truth is None:
         return None
     from lrfcal_lib.simulate.record import world_of
-    from lrfcal_lib.simulate.rig import SETUPS
+    from lrfcal_lib.simulate.rig import load_setup
 
-    world = world_of(SETUPS[read_json(session.path / "truth.json", session.path)["setup"]](), None)
+    world = world_of(load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None)
     T_head_lrf = calibration.platform.transform(calibration.platform.axis_with(method))
     gauge = truth.T_head_lrf * T_head_lrf.inv()
     turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])

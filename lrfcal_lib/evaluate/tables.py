@@ -294,7 +294,7 @@ def _parameter_table(keys, found):
 def camera_calibration_table(solutions):
     """Parameters of every calibration (Solutions by camera and method) with their standard deviations.
 
-    Columns camera, method, parameter, unit, value, sigma: the larger of propagated noise and spread over placements.
+    Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
     found = {key: (s.names, s.parameters, s.trusted_sigma) for key, s in solutions.items()}
     return _parameter_table(["camera", "method"], found)
@@ -370,7 +370,8 @@ def outline_table(outline):
 
     Columns edge, length_mm, sd_mm (over the images that show the edge with both neighbours), n_images.
     """
-    rows = [(n, 1000 * v, 1000 * outline.length_sd[n], outline.n_lengths[n]) for n, v in outline.lengths.items()]
+    lengths, sd, count = outline.board.lengths(), outline.length_sd, outline.n_lengths
+    rows = [(name, 1000 * length, 1000 * sd[name], count[name]) for name, length in lengths.items()]
     return pd.DataFrame(rows, columns=["edge", "length_mm", "sd_mm", "n_images"])
 
 
@@ -517,14 +518,13 @@ def joint_table(joint):
     """Every shared unknown of the joint estimate (JointCalibration).
 
     Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the placements, model
-    errors included; NaN where unknown), sigma (the larger one).
+    errors included; NaN where unknown), sigma (of both, see `Solution.trusted`).
     """
     solution = joint.solution.solution
     units, factors = zip(*map(unit_of, solution.names), strict=True)
-    spread = np.full(len(factors), np.nan) if solution.sigma_placements is None else solution.sigma_placements
     return pd.DataFrame({
         "parameter": solution.names, "unit": units, "value": factors * solution.parameters,
-        "sigma_noise": factors * solution.sigma, "sigma_placements": factors * spread,
+        "sigma_noise": factors * solution.sigma, "sigma_placements": factors * solution.sigma_placements,
         "sigma": factors * solution.trusted_sigma,
     })  # fmt: skip
 
@@ -567,7 +567,7 @@ def joint_fit(joint, cameras=None):
 def edge_misses_px(joint, camera):
     """Distances of crossings of scan lines from one camera's edges without the edge bias, undistorted pixels, (n,)."""
     solution, edges, placements = joint.solution, list(joint.observations.edges), list(joint.solution.boards)
-    obs, pose = joint.seen_by(camera, crossings=ALL).along().select(placements), solution.transforms[camera]
+    obs, pose = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements), solution.transforms[camera]
     if len(obs.crossing_points) == 0:
         return np.zeros(0)
     rows = [placements.index(p) for p in obs.crossing_placement], [edges.index(e) for e in obs.crossing_edge]

@@ -301,7 +301,7 @@ def solve(
         covariance=_covariance(hessian, scales, lost) * inflation[..., None, None],
         covariance_placements=None if groups is None and shared is None else placement_covariance(hessians, scores)[0],
         unobservable=lost, method=method, n_observations=n_observations or r.shape[-1], chi2=chi2, inflation=inflation,
-        state=state,
+        state=state, n_placements=hessians.shape[-3],
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
+from scipy.special import polygamma
 
 from lrfcal_lib.model.camera import CameraModel
 
@@ -52,6 +53,8 @@ class Solution:
         Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T`` where ``d_g`` is the
         change of the estimate when placement g is left out. Model errors are common to one placement, which the first
         covariance cannot know. None where one placement alone carries an unknown, or with fewer than three placements.
+    n_placements : int
+        G.
     unobservable : tuple of str
         Motions that the data do not determine, in words.
     chi2, inflation : float or ndarray
@@ -77,6 +80,7 @@ class Solution:
     weights: np.ndarray
     covariance: np.ndarray
     covariance_placements: np.ndarray | None
+    n_placements: int
     unobservable: tuple[str, ...]
     method: str
     n_observations: int
@@ -94,21 +98,22 @@ class Solution:
 
     @property
     def sigma_placements(self):
-        """Standard deviations from `covariance_placements`, shape (..., k), or None."""
+        """Standard deviations from `covariance_placements`, shape (..., k); NaN without."""
         found = self.covariance_placements
-        return None if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+        return np.full_like(self.sigma, np.nan) if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
 
     @property
     def trusted(self):
         """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
 
-        Of every parameter the larger standard deviation of propagated noise and scatter over placements, with the
-        correlations of the noise: the scatter of a few placements says little about correlations.
+        That of the noise, with its correlations, and grown where a parameter scatters more over placements than chance
+        explains: of the square of the logarithm of the ratio of both variances, what n placements leave to chance
+        (trigamma of (n - 1) / 2) is taken off. A large excess over many placements counts in full.
         """
-        if self.covariance_placements is None:
-            return self.covariance
         known = (self.sigma > 0) & np.isfinite(self.sigma)
-        grow = np.fmax(np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known), 1.0)
+        ratio = np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known)
+        excess, chance = 2 * np.log(np.fmax(ratio, 1.0)), polygamma(1, (self.n_placements - 1) / 2)
+        grow = np.exp(np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0) / 2)
         return grow[..., :, None] * self.covariance * grow[..., None, :]
 
     @property

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lrfcal_lib.model.geometry import cross
+
 
 @dataclass(frozen=True)
 class Chessboard:
@@ -88,7 +90,7 @@ def outline_lines(corners):
 def corners_of_lines(lines):
     """Corners (..., n, 2) of a polygon from its sides (..., n, 3): corner i is where side i - 1 meets side i."""
     lines = np.asarray(lines, float)
-    points = np.cross(np.roll(lines, 1, axis=-2), lines)
+    points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
 
 

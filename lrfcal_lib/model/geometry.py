@@ -216,7 +216,7 @@ def fit_plane(points):
 
 
 def fit_line(points):
-    """Total least squares line of points (n, 3): their centre, the unit direction, their rms distance.
+    """Total least squares line of points (n, 2 or 3): their centre, the unit direction, their rms distance.
 
     DegenerateGeometry with fewer than two distinct points.
     """
@@ -224,7 +224,7 @@ def fit_line(points):
     if len(points) < 2 or np.ptp(points, axis=0).max() == 0:
         raise DegenerateGeometry(f"a line needs two distinct points, got {len(points)}")
     centre, values, vectors = _principal(points)
-    return centre, vectors[:, 2], float(np.sqrt(max(values[0] + values[1], 0.0)))
+    return centre, vectors[:, -1], float(np.sqrt(max(np.sum(values[:-1]), 0.0)))
 
 
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from lrfcal_lib.model.board import corners_of_lines, outline_lines
+from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import distort
 from lrfcal_lib.model.geometry import polar_to_points
 
@@ -240,16 +240,16 @@ def board_plan(ax, board):
 
 def outline(ax, measured, exaggerate=20):
     """The measured Outline of the board with the spread of each edge over the images, `exaggerate` times larger."""
-    corners = corners_of_lines(measured.lines)
+    corners = measured.board.known_corners()
     closed = np.vstack([corners, corners[:1]])
     ax.plot(*closed.T, "-", color=COLORS["truth"])
-    for index, name in enumerate(measured.board.edges):
+    for index, (name, length) in enumerate(measured.board.lengths().items()):
         ends, normal = closed[index : index + 2], measured.lines[index, :2]
         if np.isfinite(measured.line_sd[index]):
             away = exaggerate * measured.line_sd[index] * normal
             band = np.vstack([ends - away, ends[::-1] + away])
             ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
-        text = f"{name}\n{1000 * measured.lengths[name]:.1f} mm" if name in measured.lengths else name
+        text = f"{name}\n{1000 * length:.1f} mm"
         ax.text(*(ends.mean(axis=0) - 0.09 * normal), text, ha="center", va="center", fontsize=8)
     if measured.board.pattern is not None:
         ax.plot(*measured.board.pattern.points()[:, :2].T, "+", color=COLORS["raw"], markersize=4)

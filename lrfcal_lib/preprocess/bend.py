@@ -57,8 +57,6 @@ class Bend:
         range of heights, continued from the pattern to the area that was scanned; nan where that is not known. A bend
         that all placements share cannot be told from the lens. Where `sheet` is much smaller than `size`, the scan is
         at fault (its pitch), or the board beside the sheet, or the sheet has always been so.
-    surface : ndarray, shape (3,), or None
-        Coefficients of x^2, x y, y^2 in the coordinates of the `Face`, away from the LRF, 1/m.
     """
 
     placement: int
@@ -69,7 +67,6 @@ class Bend:
     reason: str = ""
     sheet: float = np.nan
     sheet_sigma: float = np.nan
-    surface: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -107,9 +104,14 @@ class Face:
     around: np.ndarray
 
     def columns(self, flat):
-        """Columns of a plane and a quadratic surface about the middle of the face at points of it, shape (n, 6)."""
-        x, y = (flat - (self.flat.min(axis=0) + self.flat.max(axis=0)) / 2).T
-        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        """Those of :func:`quadratic` about the middle of the face at points of it, shape (n, 6)."""
+        return quadratic(flat - (self.flat.min(axis=0) + self.flat.max(axis=0)) / 2)
+
+
+def quadratic(points):
+    """Columns (n, 6) of a plane and a quadratic surface at points (n, 2)."""
+    x, y = points.T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def board_bends(prepared, to_board=None):
@@ -133,8 +135,8 @@ def board_bends(prepared, to_board=None):
     level, sigma = common_level(list(faces.values()))
     applied = bool(abs(level) > 3 * sigma)
     found = {p: bend_of(face, p, level if applied else 0.0) for p, face in faces.items()}
-    sheets = {p: sheet_surface(prepared, p) for p in faces if p in to_board and not found[p].reason}
-    sheets = {p: sheet for p, sheet in sheets.items() if sheet is not None}
+    seen = (p for p in faces if p in to_board and not found[p].reason)
+    sheets = {p: sheet for p in seen if (sheet := sheet_surface(prepared, p)) is not None}
     if len(sheets) >= FEWEST_SHEETS:
         usual = np.median([surface for surface, _ in sheets.values()], axis=0)
         for p, (surface, covariance) in sheets.items():
@@ -222,7 +224,7 @@ def bend_of(face, placement=0, level=0.0):
         F = q @ np.linalg.solve(covariance[3:, 3:], q) / len(q)
         p_value = max(p_value, float(fdtrc(len(q), count - unknowns, F)))
     size, sigma = _height_range(face, q, by_parts[3:, 3:])
-    return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND), surface=q)
+    return Bend(placement, size, sigma, p_value, bool(p_value < LEVEL and size > LEAST_BEND))
 
 
 def _height_range(face, q, covariance):

@@ -31,10 +31,6 @@ THIN_PROFILES = 150  # of an edge where orders are compared by the narrow search
 CLEAR_SHARE = 0.7  # an order with less than this share of the best score is ruled out
 
 
-class OutlineNotFound(ValueError):
-    """No dark region with straight edges in the image."""
-
-
 @dataclass(frozen=True)
 class BoardView:
     """The board in one image.
@@ -107,7 +103,7 @@ def view_board(image, board, model, view=None, picks=None, *, lines=None, relief
     if board.pattern is None:
         try:
             found = _views_plain(view, image, board, model, picks)
-        except (OutlineNotFound, EdgeNotSeen) as error:
+        except EdgeNotSeen as error:
             return replace(view, reason=str(error))
         if not found:
             return replace(view, reason=f"no pose of board '{board.name}' explains the outline in the image")
@@ -129,7 +125,7 @@ def _view_pattern(view, image, board, model, picks, lines, relief, most=np.inf):
     inner, corners, edges, rejected = undistort(np.nanmean(pixels, axis=0), model), corners_of_lines(lines), [], []
     for name, line, start, end in zip(board.edges, lines, corners, np.roll(corners, -1, axis=0), strict=True):
         if name in picks:
-            edges.append(_pick(name, picks, inner, model))
+            edges.append(picked_edge(name, undistort(picks[name], model), inner))
             continue
         inset, middle = CORNER_INSET * (end - start), (start + end) / 2
         uv = on_board(np.stack([start + inset, end - inset, middle, middle + WINDOW * line[:2]]), pose, model)
@@ -140,11 +136,6 @@ def _view_pattern(view, image, board, model, picks, lines, relief, most=np.inf):
         except EdgeNotSeen as error:
             rejected.append((name, str(error)))
     return replace(view, edges=tuple(edges), rejected=tuple(rejected))
-
-
-def _pick(name, picks, inner, model):
-    start, end = undistort(picks[name], model)
-    return picked_edge(name, start, end, (start + end) / 2 - inner)
 
 
 def order_scores(image, board, model, orders, poses):
@@ -246,12 +237,15 @@ def pose_from_edges(edges, board, model, start, covariance=None):
 
 
 def line_residuals(edges, board, model, pose):
-    """Whitened distances (E, 2) of every edge's two corners from its image line, derivatives by [w, v] (E, 2, 6)."""
+    """Those of :func:`line_misses` for every edge's two corners."""
+    i, flat = np.array([board.edges.index(e.name) for e in edges]), board.points()
+    return line_misses(edges, flat[np.stack([i, (i + 1) % len(flat)], axis=1)], model, pose)
+
+
+def line_misses(edges, points, model, pose):
+    """Whitened distances (E, n) of board points (E, n, 3) from image lines, derivatives by [w, v] (E, n, 6)."""
     line, centre, covariance = (np.stack([getattr(e, k) for e in edges]) for k in ("line", "centre", "covariance"))
-    i = np.array([board.edges.index(e.name) for e in edges])
-    flat = board.points()
-    ends = flat[np.stack([i, (i + 1) % len(flat)], axis=1)]
-    turned = rotate_points(pose, ends)
+    turned = rotate_points(pose, points)
     p_camera = turned + pose[:, 3]
     uv = pinhole(p_camera, model)
     lever = np.einsum("enk,ek->en", uv - centre[:, None], np.stack([line[:, 1], -line[:, 0]], axis=1))
@@ -268,7 +262,7 @@ def _views_plain(view, image, board, model, picks):
     if set(picks) == set(board.edges):
         inner = undistort(np.mean([picks[n] for n in board.edges], axis=(0, 1)), model)
         # sides in the turning sense of the image
-        sides = [_pick(name, picks, inner, model) for name in board.edges][::-1]
+        sides = [picked_edge(name, ends[name], inner) for name in board.edges][::-1]
     else:
         corners = undistort(find_polygon(image, len(board.known_corners())), model)
         middle = corners.mean(axis=0)
@@ -280,7 +274,7 @@ def _views_plain(view, image, board, model, picks):
     for pose, covariance, edges in board_poses(sides, board, model):
         if all(np.abs(line_distance(ends[e.name], e.line)).max() < SAME_NAMES_PX for e in edges if e.name in ends):
             inner = np.mean([e.centre for e in edges], axis=0)
-            edges = tuple(_pick(e.name, picks, inner, model) if e.name in picks else e for e in edges)
+            edges = tuple(picked_edge(e.name, ends[e.name], inner) if e.name in ends else e for e in edges)
             found.append(replace(view, T_camera_board=pose, covariance=covariance, edges=edges))
     return found
 
@@ -288,7 +282,7 @@ def _views_plain(view, image, board, model, picks):
 def find_polygon(image, n_corners):
     """Corners (n, 2) of the largest dark convex polygon, to about a recorded pixel, in the turning sense right to down.
 
-    OutlineNotFound if no dark region looks like such a polygon, or if it is cut by the image border.
+    EdgeNotSeen if no dark region looks like such a polygon, or if it is cut by the image border.
     """
     picture = cv2.GaussianBlur(grey(image), (0, 0), 1.0)
     level = cv2.threshold(picture, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
@@ -306,10 +300,10 @@ def find_polygon(image, n_corners):
             else:
                 best, best_area = corners, area
     if best is None and cut:
-        raise OutlineNotFound("the dark board is cut by the image border")
+        raise EdgeNotSeen("the dark board is cut by the image border")
     if best is None:
         why = "the board must stand out from the rest"
-        raise OutlineNotFound(f"no dark region with {n_corners} straight edges in the image: {why}")
+        raise EdgeNotSeen(f"no dark region with {n_corners} straight edges in the image: {why}")
     return best
 
 

@@ -46,8 +46,6 @@ class ImageEdge:
     n_points : int
         Profiles that the line was fitted to (2 for a pick).
     rms_px : float
-    picked : bool
-        True for an edge picked by hand.
     """
 
     name: str
@@ -57,7 +55,6 @@ class ImageEdge:
     ends: np.ndarray
     n_points: int
     rms_px: float
-    picked: bool = False
 
 
 class EdgeNotSeen(ValueError):
@@ -160,7 +157,6 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     the edge is searched `half_width` pixels to both sides. `prior_px` is the standard deviation of the prediction: of
     two lines with similar support the nearer one is taken. A profile stands at every pixel, or at `most` that many.
     """
-    start, end = np.asarray(start, float), np.asarray(end, float)
     length = np.linalg.norm(end - start)
     if min(*start, *end) <= BEHIND:
         raise EdgeNotSeen("it passes behind the camera")
@@ -217,14 +213,13 @@ def outward_line(a, b, outward):
     return line if line[:2] @ outward > 0 else -line
 
 
-def picked_edge(name, start, end, outward, sigma=PICK_SIGMA_PX):
-    """The edge through two points clicked by hand (undistorted pixels, `sigma` each)."""
-    ends = np.stack([np.asarray(start, float), np.asarray(end, float)])
-    length = np.linalg.norm(ends[1] - ends[0])
+def picked_edge(name, ends, inner):
+    """The edge through two points clicked by hand (2, 2); `inner` is a point of the board. Undistorted pixels."""
+    length, centre = np.linalg.norm(ends[1] - ends[0]), ends.mean(axis=0)
     if length < 1:
         raise ValueError(f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart")
-    covariance = np.diag([sigma**2 / 2, 2 * sigma**2 / length**2])
-    return ImageEdge(name, outward_line(*ends, outward), covariance, ends.mean(axis=0), ends, 2, 0.0, True)
+    covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
+    return ImageEdge(name, outward_line(*ends, centre - inner), covariance, centre, ends, 2, 0.0)
 
 
 def board_line(view, edge, model):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import DEPTH_NOISE, depth_jump, plane_axes, row_ends, row_median
-from lrfcal_lib.session.stated import ASSUMED_SPOT_RADIUS
 
 VARIANTS = ("last_beam", "half_step")
 MIXING = 1.0  # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram listing)
@@ -20,7 +19,6 @@ LEAST_ANGLE = np.radians(20)
 SHORTEST_SIDE = 0.1  # of the board's size
 UNIFORM = 1 / np.sqrt(12.0)  # standard deviation of a uniform distribution of width 1
 EDGE_SCATTER = 0.006  # metres; about twice what the end points of a real board scatter about a straight edge
-EDGE_BEND = 0.001  # metres; error of edge points that no number of them averages out
 SAME_SIDE = 0.02  # metres; a side found by lines and by columns
 WARPED_BEAMS = 15  # at most, at either end of a scan line, that tell how far the board lies from the fitted line
 REACH = 2  # beams (or scan lines) on either side of a boundary
@@ -108,10 +106,10 @@ class ScanSide:
     Attributes
     ----------
     side : int
-        Number within the placement; the same in all variants and in :func:`sweep_edges`.
+        Number within the placement; the same in all variants, along and across.
     end : int
-        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of :func:`sweep_edges`: -1
-        where it ends columns at low pitch, +1 at high pitch.
+        -1 where it ends scan lines at low bearings (right), +1 at high bearings (left); of columns: -1 at
+        low pitch, +1 at high pitch.
     n_points : int
     length : float
         Of the stretch with points, metres.
@@ -131,16 +129,6 @@ class ScanSide:
     rms: float
     angle: float
     ends: np.ndarray
-
-    @property
-    def angle_sigma(self):
-        """Standard deviation of the side's direction within the board's plane, radians.
-
-        That of a line through n points spread evenly over the length, ``sqrt(12 / n) rms / length``, where neighbours
-        share their errors in pairs, and with a millimetre that never averages out: what stands behind an edge changes
-        along it, and with it where a wide spot takes the edge to be.
-        """
-        return float(np.sqrt(12 * (2 * self.rms**2 / self.n_points + EDGE_BEND**2)) / self.length)
 
     def is_same(self, other):
         """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
@@ -195,42 +183,32 @@ class ScanEdges:
     background: np.ndarray
 
 
-def edge_points(scan):
-    """Where scan lines cross the board's edges, by the half step; step (iii) of the paper's preprocessing.
+def crossings(scan, across=False, known=()):
+    """Where scan lines cross the board's edges or, with `across`, columns of the range image (one beam over the pitch).
+
+    One rule, step (iii) of the paper's preprocessing, in which bearing and pitch change places.
 
     Parameters
     ----------
     scan : BoardScan
+    across : bool
+        Edges nearly parallel to the scan lines are found here.
+    known : sequence of ScanSide
+        Found the other way: a side that is one of them gets its number.
 
     Returns
     -------
-    ScanEdges
-        Ends of scan lines at holes inside the board do not appear; neither do ends at the border of the field of
-        view, nor where something nearer hides the board. The points lie on the fitted straight line (the paper), moved
-        along the ray by what the outermost beams say where the board turns out to be warped. The covariance holds the
-        beam spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at
-        less than 20 deg to the scan lines are left out (side -1): there the pitch decides where a line ends.
-    """
-    return crossings(scan)[0]["half_step"]
-
-
-def sweep_edges(scan):
-    """Where columns of the range image (one beam over the pitch) cross the board's edges: as :func:`edge_points`.
-
-    Edges nearly parallel to the scan lines, which :func:`edge_points` cannot see, are found here. Nothing ends at the
-    first or last scan lines of the sweep, which may have been cut. The points lie on the board at the pitch given with
-    them; `end` is -1 at low and +1 at high pitch; a side that :func:`edge_points` sees too has the same number. The
-    covariance is that of the pitch step (as a displacement on the board) and of the line fit.
-    """
-    return crossings(scan, True, crossings(scan)[1])[0]["half_step"]
-
-
-def crossings(scan, across=False, known=()):
-    """Crossings of scan lines or, with `across`, of columns: one rule, in which bearing and pitch change places.
-
-    Returns ScanEdges by variant, and all sides with those that are seen at too small an angle; sides that are among the
-    `known` ones keep their number. 'half_step': halfway between the last beam on the board and the first off it,
-    unbiased for an edge anywhere between them; 'last_beam': the paper's rule, half a step inside on average.
+    edges : dict of str to ScanEdges
+        By variant. 'half_step': halfway between the last beam on the board and the first off it, unbiased for an edge
+        anywhere between them; 'last_beam': the paper's rule, half a step inside on average. Ends at holes inside the
+        board do not appear; neither do ends at the border of the view (of the sweep, which may have been cut), nor
+        where something nearer hides the board. The points lie on the fitted straight line (the paper), moved along the
+        ray by what the outermost beams say where the board turns out to be warped. The covariance holds the beam
+        spacing (uniform over one step), the line fit and warp, and what a side scatters more than that. Sides at less
+        than 20 deg to the scan lines (to the columns) are left out (side -1): there the pitch (the bearing) decides
+        where a line ends.
+    sides : tuple of ScanSide
+        All of them, with those left out.
     """
     line, beam, step, end = _ends(scan, across)
     angles, cell = (scan.sweep.pitch, line) if across else (scan.sweep.bearings, beam)
@@ -367,100 +345,41 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
         place = order[mine] - np.searchsorted(left_out, order[mine])
         for run in straight_runs(flat[mine], place, max(float(spacing), EDGE_SCATTER), shortest):
             rows = mine[run]
-            new = _describe(scan, flat[rows], axes, e, float(np.mean(pitch[rows])))
-            number = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
-            side[rows] = number
-            sides.append(replace(new, side=number))
+            centre, direction, along, across = line_of(flat[rows])
+            ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
+            level = np.cross(_to_platform(scan, np.array([0.0, 0.0, 1.0]), np.mean(pitch[rows])), scan.normal)
+            cosine = min(abs(level @ (direction @ axes)) / np.linalg.norm(level), 1.0)
+            rms = float(np.sqrt(np.mean(across**2) * len(rows) / max(len(rows) - 2, 1)))
+            new = ScanSide(-1, e, len(rows), float(np.ptp(along)), rms, float(np.arccos(cosine)), ends)
+            side[rows] = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
+            sides.append(replace(new, side=int(side[rows[0]])))
     return side, tuple(sides)
 
 
-def _describe(scan, flat, axes, end, pitch):
-    """A ScanSide (number still open) from its points in the plane."""
-    centre, direction, along, across = line_of(flat)
-    ends = (centre + np.outer([along.min(), along.max()], direction)) @ axes + scan.distance * scan.normal
-    level = np.cross(_to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch), scan.normal)
-    cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
-    rms = float(np.sqrt(np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)))
-    return ScanSide(-1, end, len(flat), float(np.ptp(along)), rms, float(np.arccos(min(cosine, 1.0))), ends)
-
-
-@dataclass(frozen=True)
-class EdgeCells:
-    """Beams about the edges of the board in one placement.
-
-    Attributes
-    ----------
-    placement : int
-    line, beam : ndarray of int, shape (n,)
-        Scan line and beam; every pair appears once.
-    bearing, pitch : ndarray, shape (n,)
-        Radians.
-    hit : ndarray of bool, shape (n,)
-        Whether the beam read the board.
-    side : ndarray of int, shape (n,)
-        Number of the side, as in ScanEdges.
-    range_m : ndarray, shape (n,)
-        Distance of the board's plane along the beam, metres.
-    radius : ndarray, shape (n,)
-        Of the spot there, across the beam, metres.
-    background : ndarray, shape (n,)
-        What the background adds to the log odds at which the reading flips, as far as distances and incidence tell it.
-    across : ndarray of bool, shape (n,)
-        Whether the boundary was found across the scan lines (the neighbour is a scan line, not a beam).
-    step : ndarray, shape (n,)
-        Angle between neighbours in that direction, radians.
-    """
-
-    placement: int
-    line: np.ndarray
-    beam: np.ndarray
-    bearing: np.ndarray
-    pitch: np.ndarray
-    hit: np.ndarray
-    side: np.ndarray
-    range_m: np.ndarray
-    radius: np.ndarray
-    background: np.ndarray
-    across: np.ndarray
-    step: np.ndarray
-
-    def __len__(self):
-        return len(self.line)
-
-    def select(self, keep):
-        """Some of the cells: a mask or indices."""
-        names = [f.name for f in fields(self) if f.name != "placement"]
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
-
-
-def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
+def edge_cells(scan, along, swept, lrf):
     """The beams about every boundary of the board, along and across the scan lines.
 
     Parameters
     ----------
     scan : BoardScan
     along, swept : ScanEdges
-        Of :func:`edge_points` and :func:`sweep_edges`; no `swept` for a single shot.
-    lrf : LrfInfo, optional
-        States the spot; a radius of 5 mm everywhere where it does not.
-    reach : int
-        Beams (or scan lines) on either side of a boundary.
+        Of :func:`crossings`, along and across the scan lines; None instead of `swept` for a single shot.
+    lrf : LrfInfo
+        Knows the spot.
 
     Returns
     -------
-    EdgeCells
-        Of all straight sides, no cell twice. Without cells in holes, at the border of the view, where something nearer
-        hides the board, with two edges in one spot, and beside a background less than a pulse length (1 m) behind,
-        whose echo melts into the board's. Where most of the outline has such a background they stay, with `background`
-        0; so do all cells where most boundaries have no return behind them (clouds cut to the board).
-
-    Raises
-    ------
-    ValueError
-        For a reach below 1.
+    recarray
+        ``line`` and ``beam`` (every pair appears once); ``bearing`` and ``pitch``, radians; ``hit``, whether the beam
+        read the board; ``side``, its number as in ScanEdges; ``range_m``, distance of the board's plane along the beam,
+        and ``radius`` of the spot there, metres; ``background``, what it adds to the log odds at which the reading
+        flips, as far as distances and incidence tell it; ``across``, whether the boundary was found across the scan
+        lines (the neighbour is a scan line, not a beam); ``step``, angle between neighbours in that direction, radians.
+        Of all straight sides, without cells in holes, at the border of the view, where something nearer hides the
+        board, with two edges in one spot, and beside a background less than a pulse length (1 m) behind, whose echo
+        melts into the board's. Where most of the outline has such a background they stay, with `background` 0; so do
+        all cells where most boundaries have no return behind them (clouds cut to the board).
     """
-    if reach < 1:
-        raise ValueError(f"reach is a number of beams on either side of an edge, at least 1, got {reach}")
     found, sweep = [edges for edges in (along, swept) if edges is not None], scan.sweep
     line, beam, step, side = (
         np.concatenate([getattr(edges, name)[edges.side >= 0] for edges in found])
@@ -468,13 +387,13 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     )
     board, cosine = _plane_range(scan, polar_to_points(1.0, sweep.bearings), sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
-    radius = np.full(board.shape, ASSUMED_SPOT_RADIUS) if lrf is None else lrf.spot_radius(board)
+    radius = lrf.spot_radius(board)
     here, behind = board[line, beam], beyond(scan, line, beam, step)
     seen, mixed = np.isfinite(behind), behind - here < MIXING
     close = len(seen) == 0 or np.mean(seen) < 0.5 or np.mean(mixed) >= 0.5
     odds = np.zeros(len(here)) if close else background_odds(here, behind)
     usable = np.flatnonzero(seen & ~mixed) if not close else np.arange(len(here))
-    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape, reach)
+    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
     # before a far background also beams that noise takes off the plane read the board
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
     gaps = [np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (sweep.pitch, sweep.bearings)]
@@ -493,16 +412,17 @@ def edge_cells(scan, along, swept=None, lrf=None, reach=REACH):
     sides = [s for edges in found for s in edges.sides]
     keep &= _on_one_side(scan, (line, beam), board, (CORNER * radius / np.abs(cosine))[line, beam], sides, side[row])
     across = step[row, 0] != 0
-    cells = EdgeCells(
-        scan.placement, line, beam, sweep.bearings[beam], sweep.pitch[line], hit, side[row], board[line, beam],
-        radius[line, beam], odds[row], across, np.where(across, *gaps),
-    )  # fmt: skip
-    return cells.select(keep)
+    cells = {
+        "line": line, "beam": beam, "bearing": sweep.bearings[beam], "pitch": sweep.pitch[line], "hit": hit,
+        "side": side[row], "range_m": board[line, beam], "radius": radius[line, beam], "background": odds[row],
+        "across": across, "step": np.where(across, *gaps),
+    }  # fmt: skip
+    return np.rec.fromarrays([*cells.values()], names=[*cells])[keep]
 
 
-def _neighbours(usable, line, beam, step, shape, reach):
+def _neighbours(usable, line, beam, step, shape):
     """Cells about boundaries, each once, with the nearest boundary: its number, the step k from it, line and beam."""
-    k, row = np.meshgrid(np.arange(1 - reach, reach + 1), usable, indexing="ij")
+    k, row = np.meshgrid(np.arange(1 - REACH, REACH + 1), usable, indexing="ij")
     k, row = k.ravel(), row.ravel()
     order = np.argsort(np.abs(k - 0.5), kind="stable")
     k, row = k[order], row[order]
@@ -516,12 +436,10 @@ def _neighbours(usable, line, beam, step, shape, reach):
 
 def _on_one_side(scan, cells, board, reach, sides, side):
     """Cells on the stretch of their own side whose spot reaches no other one; all of them where sides are not known."""
-    if not sides:
-        return np.ones(len(side), bool)
     axes, (line, beam) = plane_axes(scan.normal), cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
     flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
-    keep, alone = np.zeros(len(side), bool), np.ones(len(side), bool)
+    keep, alone = ~np.isin(side, [s.side for s in sides]), np.ones(len(side), bool)
     for s in sides:
         first, last = s.ends @ axes.T
         direction = (last - first) / np.linalg.norm(last - first)

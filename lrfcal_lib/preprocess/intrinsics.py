@@ -111,27 +111,24 @@ def predict(state, points, basis):
     unknowns, without the first mounting, poses as ``[w, v]``.
     """
     lenses, mounting, poses, shape = state
-    cameras, views, last = len(lenses), len(poses), 15 * len(lenses) - 6 + 6 * len(poses)
-    turned = rotate_points(poses, points + (basis @ shape)[:, None] * UP)
-    p_first = turned + poses[:, None, :, 3]
-    pixels, every = np.empty((cameras, *p_first.shape[:2], 2)), np.arange(views)
-    out = np.zeros(pixels.shape + (last + basis.shape[1],))
-    own = out[..., last - 6 * views : last].reshape(pixels.shape + (views, 6))  # a view
-    for c, (lens, mount) in enumerate(zip(lenses, mounting, strict=True)):
+    turned, pixels, derivatives = rotate_points(poses, points + (basis @ shape)[:, None] * UP), [], []
+    p_first, view = turned + poses[:, None, :, 3], np.eye(len(poses))[:, None, None]
+
+    def at(place, own):
+        """Derivatives (..., m) by one of several (a row of their identity (..., n)) among those by all, (..., n m)."""
+        return (place[..., None] * own[..., None, :]).reshape(*own.shape[:-1], -1)
+
+    for camera, lens, mount in zip(np.eye(len(lenses)), lenses, mounting, strict=True):
         mounted = rotate_points(mount, p_first)
         by_point, by_lens = project_jacobians(mounted + mount[:, 3], CameraModel(1, 1, *lens[:4], lens[4:]))
         # the derivatives by fx and fy are the distorted normalised coordinates themselves
         distorted = np.stack([by_lens[..., 0, 0], by_lens[..., 1, 1]], axis=-1)
-        pixels[c] = lens[:2] * distorted + lens[2:4]
-        out[c, ..., 9 * c : 9 * c + 9] = by_lens
-        if c:
-            at = 9 * cameras + 6 * (c - 1)
-            out[c, ..., at : at + 6] = gradient_by_pose(mounted[..., None, :], by_point)
-        by_first = by_point @ mount[:, :3]
-        own[c, every, :, :, every] = gradient_by_pose(turned[..., None, :], by_first)
-        by_height = np.einsum("vkij,vj->vki", by_first, poses[:, :, 2])
-        out[c, ..., last:] = by_height[..., None] * basis[:, None]
-    return pixels, out
+        pixels.append(lens[:2] * distorted + lens[2:4])
+        by_mount, by_first = gradient_by_pose(mounted[..., None, :], by_point), by_point @ mount[:, :3]
+        by_view = at(view, gradient_by_pose(turned[..., None, :], by_first))
+        by_shape = np.einsum("vkij,vj->vki", by_first, poses[:, :, 2])[..., None] * basis[:, None]
+        derivatives.append(np.concatenate([at(camera, by_lens), at(camera[1:], by_mount), by_view, by_shape], axis=-1))
+    return np.array(pixels), np.array(derivatives)
 
 
 def moved(state, step):
@@ -156,12 +153,11 @@ def adjust_robust(pixels, points, models, poses, mounting=None, **options):
         distance = np.linalg.norm(seen, axis=-1)
         # the median of a Rayleigh variable is 1.1774 sigma
         near = distance <= OUTLIER_SIGMAS * max(np.nanmedian(distance) / 1.1774, SIGMA_FLOOR_PX)
-        near = np.broadcast_to(near[..., None], pixels.shape)
-        if np.array_equal(near, used):
+        used, before = np.broadcast_to(near[..., None], pixels.shape), used
+        if np.array_equal(used, before):
             break
-        used = near
-        masked = np.where(used, pixels, np.nan)
-        result = adjust(masked, points, result.models, result.poses, result.mounting, **options)
+        taken = np.where(used, pixels, np.nan)
+        result = adjust(taken, points, result.models, result.poses, result.mounting, **options)
     return result
 
 
@@ -185,7 +181,6 @@ def estimate_intrinsics(pixels, pattern, size, *, relief=False):
         raise ValueError(f"intrinsics need at least three views of the pattern, got {len(pixels)}")
     pixels, points = np.asarray(pixels, float)[None], pattern.points()
     board, views = [points.astype(np.float32)] * pixels.shape[1], list(pixels[0].astype(np.float32))
-    size = tuple(int(s) for s in size)
     try:
         out = cv2.calibrateCamera(board, views, size, None, None, flags=cv2.CALIB_FIX_K3)
     except cv2.error as error:

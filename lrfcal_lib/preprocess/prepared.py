@@ -11,7 +11,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.survey import Outline, views_of
-from lrfcal_lib.session.cache import cached
+from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import SessionError
 
@@ -103,16 +103,22 @@ def prepare_scans(session):
     """The board in every sweep of a session, and its edge points in both variants; a Prepared without cameras."""
     scans, problems = {}, {}
     edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
-    for placement in session.board_placements:
+
+    def look(placement):
+        """The board and its crossings in one sweep, or in words why not."""
         try:
-            known = session.board, session.T_head_lrf, session.lrf
-            scan = scans[placement] = find_board(session.sweep(placement), *known)
+            scan = find_board(session.sweep(placement), session.board, session.T_head_lrf, session.lrf)
         except (BoardNotFound, SessionError) as error:
-            problems[placement] = str(error)
-            continue
+            return str(error)
         along, sides = crossings(scan)
-        across = crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {}
-        for out, found in ((edges, along), (swept, across)):
+        return scan, along, crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {}
+
+    for placement, seen in zip(session.board_placements, spread(look, session.board_placements), strict=True):
+        if isinstance(seen, str):
+            problems[placement] = seen
+            continue
+        scans[placement] = seen[0]
+        for out, found in zip((edges, swept), seen[1:], strict=True):
             for variant in found:
                 out[variant][placement] = found[variant]
     return Prepared(session, session.board, scans, edges, swept, problems=problems)

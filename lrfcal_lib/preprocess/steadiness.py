@@ -106,48 +106,52 @@ class Steadiness:
         return bool(np.ptp(self.corner_px) > LEAST_SCALE and np.ptp(self.scale) > 5 * sigma)
 
 
-def camera_steadiness(session, camera, views=None, model=None):
+def camera_steadiness(prepared, camera):
     """Whether a camera that is fixed to the base stood still over the placements of a session.
 
     Parameters
     ----------
-    session : Session
-    camera : str
-    views : dict of int to BoardView, optional
-        The board in the images, by placement; it and its surroundings are left out. Without it the board must cover
+    prepared : Prepared
+        Its views tell where the board is, which is left out with its surroundings. A board that was not seen must cover
         less than about half of the features for the robust fit to see through.
-    model : CameraModel, optional
-        The session's own intrinsics when left out.
+    camera : str
 
     Returns
     -------
     Steadiness
         With a `reason` and no placements for a camera on the head, or with fewer than two images.
-
-    Raises
-    ------
-    ValueError
-        For a camera the session does not have, or one without intrinsics.
     """
-    if camera not in session.cameras:
-        raise ValueError(f"no camera '{camera}'; the session has {', '.join(session.cameras)}")
-    info = session.cameras[camera]
-    if info.mount != "platform":
+    session, model = prepared.session, prepared.models[camera]
+    if session.cameras[camera].mount != "platform":
         return Steadiness(camera, (), reason=f"camera {camera} rides on the head: its background moves with the pitch")
-    model = info.model if model is None else model
-    if model is None:
-        raise ValueError(f"camera '{camera}' has no intrinsics in the session: give model (Prepared.models holds it)")
-    records = {r.placement: r for r in reversed(session.images(camera, purpose="board")) if r.placement >= 0}
+    records = {r.placement: r for r in reversed(session.images(camera, purpose="board"))}
     records = {p: records[p] for p in session.placements if p in records}
     if len(records) < 2:
         reason = f"camera {camera} has {len(records)} images of placements: nothing to compare"
         return Steadiness(camera, (), reason=reason)
-    hulls = {p: board_hull(view, model) for p, view in (views or {}).items()}
+    hulls = {p: board_hull(view, model) for p, view in prepared.views[camera].items()}
     # the placement whose board covers least of the image; the middle one where boards are unknown
     areas = {p: cv2.contourArea(hulls[p].astype(np.float32)) for p in records if hulls.get(p) is not None}
     reference = min(areas, key=areas.get) if areas else list(records)[len(records) // 2]
-    images = ((p, session.read_image(record)) for p, record in records.items())
-    return steadiness_of(camera, images, session.read_image(records[reference]), reference, model, hulls)
+    first = session.read_image(records[reference])
+    mask, quality = outside(hulls.get(reference), first), (MOST_FEATURES, FEATURE_QUALITY, FEATURE_DISTANCE)
+    level, features = even_contrast(first), cv2.goodFeaturesToTrack(grey(first), *quality, mask=mask)
+    motions, problems = {reference: (np.zeros(3), 1.0, np.zeros((4, 4)))}, {}
+    for placement in (p for p in records if p != reference):
+        image = session.read_image(records[placement])
+        try:
+            pairs = follow(level, even_contrast(image), features, outside(hulls.get(placement), image))
+            motions[placement] = fit_motion(*pairs, model)
+        except BackgroundLost as lost:
+            problems[placement] = f"camera {camera}, placement {placement}: {lost}"
+    order, root = [p for p in records if p in motions], pixel_root(model)
+    turn, scale, covariance = (np.array(each) for each in zip(*map(motions.get, order), strict=True))
+    # the camera's own turn is the opposite of the background's
+    turn, covariance = -turn, covariance * np.outer([-1, -1, -1, 1], [-1, -1, -1, 1])
+    size, corner = np.linalg.norm(turn @ root.T, axis=1), np.hypot(model.width, model.height) / 2 * (scale - 1)
+    steps = find_steps(order, turn, covariance[:, :3, :3], root)
+    motion = turn, scale, covariance, size, corner, steps
+    return Steadiness(camera, np.array(order, int), reference, *motion, problems=problems)
 
 
 def board_hull(view, model):
@@ -163,29 +167,6 @@ def board_hull(view, model):
     return middle + GROWTH * (hull - middle)
 
 
-def steadiness_of(camera, images, reference_image, reference, model, hulls=None):
-    """The same for (placement, image) pairs in the order of recording, the reference image, and hulls by placement."""
-    hulls, motions, problems = hulls or {}, {reference: (np.zeros(3), 1.0, np.zeros((4, 4)))}, {}
-    level, mask = even_contrast(reference_image), outside(hulls.get(reference), reference_image.shape[:2])
-    features, order = find_features(reference_image, mask), []
-    for placement, image in images:
-        try:
-            if placement != reference:
-                hull = outside(hulls.get(placement), image.shape[:2])
-                motions[placement] = fit_motion(*follow(level, even_contrast(image), features, hull), model)[:3]
-            order.append(placement)
-        except BackgroundLost as lost:
-            problems[placement] = f"camera {camera}, placement {placement}: {lost}"
-    metric, found = pixel_metric(model), zip(*(motions[p] for p in order), strict=True)
-    turn, scale, covariance = (np.array(v) for v in found)
-    # the camera's own turn is the opposite of the background's
-    turn, covariance = -turn, covariance * np.outer([-1, -1, -1, 1], [-1, -1, -1, 1])
-    size, corner = turn_px(turn, metric), np.hypot(model.width, model.height) / 2 * (scale - 1)
-    steps = find_steps(order, turn, covariance[:, :3, :3], metric)
-    motion = turn, scale, covariance, size, corner, steps
-    return Steadiness(camera, np.array(order, int), reference, *motion, problems=problems)
-
-
 def even_contrast(image):
     """Grey image with the same brightness and contrast everywhere, so that a change of the light moves nothing."""
     picture = grey(image).astype(np.float32)
@@ -194,26 +175,19 @@ def even_contrast(image):
     return np.clip(128 + 40 * detail / spread, 0, 255).astype(np.uint8)
 
 
-def outside(hull, shape):
-    """Mask (uint8) of the image outside a hull (pixels), all of it without one."""
-    mask = np.full(shape, 255, np.uint8)
+def outside(hull, image):
+    """Mask (uint8) of an image outside a hull (pixels), all of it without one."""
+    mask = np.full(image.shape[:2], 255, np.uint8)
     return mask if hull is None else cv2.fillConvexPoly(mask, np.round(hull).astype(np.int32), 0)
 
 
-def find_features(image, mask=None):
-    """Corners to follow, pixels, shape (n, 2); none where the mask (uint8) is zero."""
-    found = cv2.goodFeaturesToTrack(grey(image), MOST_FEATURES, FEATURE_QUALITY, FEATURE_DISTANCE, mask=mask)
-    return np.zeros((0, 2), np.float32) if found is None else found[:, 0]
-
-
-def follow(first, second, features, mask):
-    """Find features (n, 2) of one image in another (pyramidal Lucas-Kanade), both of :func:`even_contrast`.
+def follow(first, second, start, mask):
+    """Find features (n, 1, 2; None without any) of one image in another, both of :func:`even_contrast` (Lucas-Kanade).
 
     Returns start and end (m, 2) of those that lead back to where they came from, and end where the mask is not zero.
     """
-    if len(features) == 0:
+    if start is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    start = features.astype(np.float32)[:, None]
     end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, **TRACKING)
     back, here, _ = cv2.calcOpticalFlowPyrLK(second, first, end, None, **TRACKING)
     good = (there[:, 0] > 0) & (here[:, 0] > 0) & (np.linalg.norm(back - start, axis=2)[:, 0] < THERE_AND_BACK)
@@ -226,8 +200,8 @@ def fit_motion(start, end, model):
     """Turn and scale that carry features (n, 2) of one image to where another shows them, robust.
 
     Returns the rotation vector of the background in the camera frame (the camera's own turn is the opposite), the
-    scale, their covariance (4, 4) from the scatter over cells of the image, whose features share their errors, and how
-    many features agree. BackgroundLost with fewer than 40 features or 10 cells of the image (8 by 5) that agree.
+    scale, and their covariance (4, 4) from the scatter over cells of the image, whose features share their errors.
+    BackgroundLost with fewer than 40 features or 10 cells of the image (8 by 5) that agree.
     """
     column, row = np.clip((start * CELLS / [model.width, model.height]).astype(int), 0, CELLS - 1).T
     cell, focal, centre = row * CELLS[0] + column, np.array([model.fx, model.fy]), np.array([model.cx, model.cy])
@@ -254,7 +228,7 @@ def fit_motion(start, end, model):
     filling = np.zeros((cell.max() + 1, 4))
     np.add.at(filling, cell, score)
     bread = np.linalg.inv(bread)
-    return turn.as_rotvec(), float(scale), bread @ (filling.T @ filling) @ bread * cells / (cells - 4), int(count)
+    return turn.as_rotvec(), float(scale), bread @ (filling.T @ filling) @ bread * cells / (cells - 4)
 
 
 def motion_misses(first, second, turn, scale):
@@ -270,23 +244,18 @@ def motion_misses(first, second, turn, scale):
     return second - scale * np.stack([x, y], axis=1), by_state
 
 
-def pixel_metric(model):
-    """Matrix M (3, 3) with w M w the mean squared motion of undistorted pixels over the image for a turn w."""
+def pixel_root(model):
+    """Matrix (3, 3) that makes of a turn a vector as long as the rms motion of undistorted pixels over the image."""
     u, v = np.meshgrid(np.linspace(0, model.width - 1, 17), np.linspace(0, model.height - 1, 11))
     bare = np.column_stack([(u.ravel() - model.cx) / model.fx, (v.ravel() - model.cy) / model.fy])
     by_turn = motion_misses(bare, bare, Rotation.identity(), 1.0)[1][:, :, :3] * np.array([[model.fx], [model.fy]])
-    return np.einsum("nij,nik->jk", by_turn, by_turn) / len(bare)
+    return np.linalg.cholesky(np.einsum("nij,nik->jk", by_turn, by_turn) / len(bare)).T
 
 
-def turn_px(rotvec, metric):
-    """Root mean square motion over the image of small turns (..., 3), pixels."""
-    return np.sqrt(np.einsum("...i,ij,...j->...", rotvec, metric, rotvec))
-
-
-def find_steps(placements, rotvec, covariance, metric):
+def find_steps(placements, rotvec, covariance, root):
     """Turns of a camera that happened between two placements and lasted: a tuple of Step in order.
 
-    From the turns (n, 3) of the placements in the order of recording, with their covariance and a :func:`pixel_metric`.
+    From the turns (n, 3) of the placements in the order of recording, with their covariance and a :func:`pixel_root`.
     A step is significant at a level of 0.001 over all places it might be at, at least 0.2 px, and the two placements on
     either side lie on their own side of it. None with fewer than 6 placements. Binary segmentation; the noise without
     steps comes from the median absolute difference of neighbours, which a few steps do not change, or from the measured
@@ -295,7 +264,6 @@ def find_steps(placements, rotvec, covariance, metric):
     n = len(placements)
     if n < FEWEST_PLACEMENTS:
         return ()
-    root = np.linalg.cholesky(metric).T
     moved = rotvec @ root.T  # in pixels: its length is the motion over the image
     own = np.einsum("ij,njk,ik->ni", root, covariance, root)
     sigma = np.maximum(1.4826 * np.median(np.abs(np.diff(moved, axis=0))) / np.sqrt(2), np.sqrt(np.median(own)))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import PurePath
 
 import numpy as np
@@ -13,11 +12,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders, spread_views
+from lrfcal_lib.session.cache import spread
 
 UPRIGHT = 0.05  # weight of the turn between two cameras where few placements tell: most look the same way, head up
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
@@ -51,25 +50,23 @@ class Outline:
 
     Attributes
     ----------
+    board : Board
+        With its corners filled in.
     lines : ndarray, shape (E, 3)
         Board-frame lines ``a x + b y + c = 0``, unit normals out of the board, in the order of ``board.edges``.
     line_sd : ndarray, shape (E,)
         Standard deviation over the views of an edge's offset at its middle, metres.
-    lengths, length_sd : dict of str to float
-        Edge lengths of the outline and their standard deviation over the views that show the edge with both neighbours
-        (NaN below two), metres.
+    length_sd : dict of str to float
+        Standard deviation of an edge's length over the views that show it with both neighbours (NaN below two), metres.
     n_lengths : dict of str to int
         Views that show the edge with both neighbours.
-    board : Board
-        With its corners filled in.
     """
 
+    board: Board
     lines: np.ndarray
     line_sd: np.ndarray
-    lengths: dict
     length_sd: dict
     n_lengths: dict
-    board: Board
 
 
 def views_of(session, models=None, *, one_per_placement=False):
@@ -123,17 +120,19 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
 
     usable = [r for r in records if not plain or r.purpose != "intrinsics"]
     groups = [group for c in models for group in _choices(usable, c, one_per_placement)]
-    with ThreadPoolExecutor() as pool:  # OpenCV frees the interpreter while it looks for corners
-        images = list(pool.map(lambda group: _first(group, begin), groups))
+    images = [_first(group, begin) for group in groups[:1]]  # tells the finder what to look for
+    images += spread(lambda group: _first(group, begin), groups[1:])
     if plain:
         return Survey(_by_camera(models, _turned_alike([view for _, view in images])), dict(models), None, board)
-    flat = {c: m or _intrinsics(c, images, board, read) for c, m in models.items()}
+    flat = spread(lambda c: models[c] or _intrinsics(c, images, board, read), models)
+    flat = dict(zip(models, flat, strict=True))
     images, lines, unseen = _ordered(images, read, board, flat)
     models, relief = _with_relief(images, board, models, flat)
     images = [(r, view) for r, view in images if r.purpose != "intrinsics"]
     known, outline = board.corners is not None or unseen, None
     for _ in range(1 if known else 2):
-        views = [v if v.reason else look(r, v, models, lines=lines, relief=relief) for r, v in images]
+        again = partial(look, models=models, lines=lines, relief=relief)
+        views = spread(lambda own: own[1] if own[1].reason else again(*own), images)  # noqa: B023
         if not known:
             outline = measure_outline(views, board, models)
             lines = outline.lines
@@ -153,19 +152,23 @@ def all_views(prepared):
         return {camera: list(found.values()) for camera, found in prepared.views.items()}
     marks, finder, orders = _marks(session.picks, board), PatternFinder(board.pattern), pattern_orders(board.pattern)
     options = {"lines": None if board.corners is None else board.lines(), "relief": prepared.relief}
-    for r in records:
+
+    def look(r):
+        """The board in one image; None where the prepared view says it: the same image, or none shows the board."""
         view, seen = _view(r), prepared.views[r.camera][r.placement]
-        if seen.file == view.file or seen.pixels is None:  # the same, or none of the placement's images shows it
-            views[r.camera].append(replace(seen, file=view.file, pitch=view.pitch))
-            continue
+        if seen.file == view.file or seen.pixels is None:
+            return None
         image = session.read_image(r)
         view = _corners(view, image, finder)
-        if not view.reason:
-            off = [np.nanstd(view.pixels[order] - seen.pixels, axis=0).sum() for order in orders]
-            view = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]])
-            picked = marks.get((r.camera, r.file))
-            view = view_board(image, board, prepared.models[r.camera], view, picked, **options)
-        views[r.camera].append(view)
+        if view.reason:
+            return view
+        off = [np.nanstd(view.pixels[order] - seen.pixels, axis=0).sum() for order in orders]
+        view, picked = replace(view, pixels=view.pixels[orders[int(np.argmin(off))]]), marks.get((r.camera, r.file))
+        return view_board(image, board, prepared.models[r.camera], view, picked, **options)
+
+    for r, view in zip(records, spread(look, records), strict=True):
+        same = replace(prepared.views[r.camera][r.placement], file=_view(r).file, pitch=r.pitch)
+        views[r.camera].append(same if view is None else view)
     return views
 
 
@@ -241,17 +244,19 @@ def _intrinsics(camera, images, board, read):
 
 def _with_relief(images, board, models, flat):
     """Intrinsics and the shape of the sheet, now that the corners of all images are in one order."""
-    out, reliefs = dict(flat), []
-    for camera, model in flat.items():
-        pixels = _for_intrinsics(images, camera)
-        if len(pixels) >= LEAST_VIEWS_FOR_RELIEF:
-            if models[camera] is None:
-                result = estimate_intrinsics(pixels, board.pattern, (model.width, model.height), relief=True)
-            else:
-                result = estimate_relief(pixels, board.pattern, model)
-            out[camera] = result.models[0]
-            reliefs.append(result.relief)
-    return out, np.mean(reliefs, axis=0) if reliefs else np.zeros(len(board.pattern.points()))
+
+    def estimate(camera):
+        """The Adjustment of a camera that sees the pattern often enough."""
+        pixels, model = _for_intrinsics(images, camera), flat[camera]
+        if len(pixels) < LEAST_VIEWS_FOR_RELIEF:
+            return None
+        if models[camera] is None:
+            return estimate_intrinsics(pixels, board.pattern, (model.width, model.height), relief=True)
+        return estimate_relief(pixels, board.pattern, model)
+
+    found = {c: result for c, result in zip(flat, spread(estimate, flat), strict=True) if result is not None}
+    reliefs = [result.relief for result in found.values()] or np.zeros((1, len(board.pattern.points())))
+    return flat | {c: result.models[0] for c, result in found.items()}, np.mean(reliefs, axis=0)
 
 
 def _ordered(images, read, board, models):
@@ -277,10 +282,13 @@ def _ordered(images, read, board, models):
     placements = [-1 if r.purpose == "intrinsics" else v.placement for r, v, _ in seen]
     first, partner = alike([pose.rotation for pose in poses], placements, [v.camera for _, v, _ in seen])
     if known:
-        scores = [
-            order_scores(read(r), board, model, v.pixels[orders[own]], pose[own])
-            for (r, v, model), own, pose in zip(seen, partner, poses, strict=True)
-        ]
+
+        def score(number):
+            """Of one image in every order."""
+            (r, v, model), own = seen[number], partner[number]
+            return order_scores(read(r), board, model, v.pixels[orders[own]], poses[number][own])
+
+        scores = spread(score, range(len(seen)))
         chosen, lines, unseen = decide(scores, first), board.lines(), ""
     else:
         votes, up = [], []
@@ -399,12 +407,11 @@ def measure_outline(views, board, models):
     rough = corners_of_lines([np.median(found, axis=0) for found in lines])
     ends = np.stack([rough, np.roll(rough, -1, axis=0)], axis=1)
     fitted, line_sd = map(np.array, zip(*map(_median_line, lines, ends), strict=True))
-    measured = replace(board, corners=corners_of_lines(fitted))
     for trio in zip(np.roll(board.edges, 1), board.edges, np.roll(board.edges, -1), strict=True):
         corners = [corners_of_lines([own[name] for name in trio]) for own in seen if own.keys() >= {*trio}]
         lengths[trio[1]] = np.array([np.linalg.norm(c[2] - c[1]) for c in corners])
     spread, count = ({n: f(x) for n, x in lengths.items()} for f in (_spread, len))
-    return Outline(fitted, line_sd, {n: float(x) for n, x in measured.lengths().items()}, spread, count, measured)
+    return Outline(replace(board, corners=corners_of_lines(fitted)), fitted, line_sd, spread, count)
 
 
 def _spread(values):
@@ -419,51 +426,3 @@ def _median_line(lines, ends):
     offsets = -(lines[:, :2] @ ends.T + lines[:, 2:]) / (lines[:, :2] @ normal)[:, None]
     a, b = ends + np.median(offsets, axis=0)[:, None] * normal
     return outward_line(a, b, normal), _spread(offsets.mean(axis=1))
-
-
-def stereo_check(first, second, pattern, models, *, relief=None, refine=False):
-    """Relative pose of two cameras from the pattern's corners in views of the same placements.
-
-    Parameters
-    ----------
-    first, second : sequence of BoardView
-        Of two cameras; views with the same placement belong together.
-    pattern : Chessboard
-    models : pair of CameraModel
-        Intrinsics.
-    relief : ndarray, shape (k,), optional
-        Non-zero heights: the sheet is wavy, its shape is estimated along.
-    refine : bool
-        Estimate the intrinsics of both cameras along: the best knowledge of the mounting. Without, the result goes with
-        the given intrinsics (so does a calibration that uses them), and the covariance leaves their errors out.
-
-    Returns
-    -------
-    T_second_first : RigidTransform
-    covariance : ndarray, shape (6, 6)
-        Of ``[w, v]``.
-    adjustment : Adjustment
-
-    Raises
-    ------
-    ValueError
-        If no placement is seen by both cameras.
-    """
-    corners = [{v.placement: v.pixels for v in views if v.pixels is not None and v.placement >= 0}
-               for views in (first, second)]  # fmt: skip
-    common = sorted(corners[0].keys() & corners[1].keys())
-    if not common:
-        raise ValueError("no placement shows the pattern to both cameras: the stereo check needs at least one")
-    pixels = np.array([[own[p] for p in common] for own in corners])
-    poses = [
-        RigidTransform.concatenate([board_pose(p, pattern, model)[0] for p in own])
-        for own, model in zip(pixels, models, strict=True)
-    ]
-    between = poses[1] * poses[0].inv()
-    rough = RigidTransform.from_components(np.median(between.translation, axis=0), between.rotation.mean())
-    mounting = RigidTransform.concatenate([RigidTransform.identity(), rough])
-    wavy = relief is not None and np.any(relief)
-    options = {"intrinsics": refine, "basis": intrinsics.waves(pattern.points()) if wavy else None}
-    options["fixed"] = (8,) if all(m.distortion[4] == 0 for m in models) else ()
-    result = intrinsics.adjust_robust(pixels, pattern.points(), models, poses[0], mounting, **options)
-    return result.mounting[1], result.mounting_covariance[0], result

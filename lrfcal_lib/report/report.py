@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import ctypes
-import fcntl
 import hashlib
 import json
 import os
@@ -21,7 +18,7 @@ from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
+from tempfile import TemporaryDirectory
 
 import nbformat
 import pandas as pd
@@ -164,19 +161,16 @@ def default_session():
     return SCRATCH
 
 
-def main(argv=None):
-    """Command line; returns 0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it."""
-    parser = argparse.ArgumentParser(prog="python -m lrfcal_lib report", description=__doc__)
-    parser.add_argument("session", nargs="*", help="folders of sessions (default: the one at hand)")
-    parser.add_argument("--out", help="folder of the report (default reports/<session>)")
-    parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
-    parser.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
-    options = parser.parse_args(argv)
+def main(sessions=(), out=None, jobs=2, stored=False):
+    """Report on sessions, or store the notebooks as run on them; the one at hand where none is named.
+
+    0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it.
+    """
     # nohup ignores SIGHUP
     before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
-        sessions = [Path(path) for path in options.session] or [default_session()]
-        return max(_store_all(session) if options.store else _report(session, options) for session in sessions)
+        sessions = [Path(path) for path in sessions] or [default_session()]
+        return max(_store_all(session) if stored else _report(session, out, jobs) for session in sessions)
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
@@ -196,9 +190,9 @@ def _stop(number, frame):
     raise KeyboardInterrupt(number)
 
 
-def _report(session, options):
-    begin, out = time.monotonic(), Path(options.out or ROOT / "reports" / session.resolve().name).resolve()
-    runs = make_report(session, out, options.jobs)
+def _report(session, out, jobs):
+    begin, out = time.monotonic(), Path(out or ROOT / "reports" / session.resolve().name).resolve()
+    runs = make_report(session, out, jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
         print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
@@ -221,26 +215,17 @@ def _beside(out):
     """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        for left in out.parent.glob(PART + "*"):
-            with suppress(OSError), open(left / "lock", "a") as lock:  # its owner lives, or it is somebody else's
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(left)
-        box = Path(mkdtemp(prefix=".lrfcal-", dir=out.parent))
-        try:
-            with open(box / "lock", "w") as lock:  # it ends with this process, however that ends
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                box = box.rename(box.with_name(PART + box.name))  # named as others expect only once it is locked
-                (box / "report" / "parts").mkdir(parents=True)
-                yield box / "report"
-                _take_place(box / "report", out)
-        finally:
-            shutil.rmtree(box, ignore_errors=True)
+        with TemporaryDirectory(prefix=PART, dir=out.parent, ignore_cleanup_errors=True) as box:
+            (new := Path(box) / "report").mkdir()
+            (new / "parts").mkdir()
+            yield new
+            _take_place(new, out)
     except OSError as error:
         raise SessionError(f"{out}: cannot write the report ({error}); --out names another folder") from error
 
 
 def _take_place(new, out):
-    """Exchange two folders in one step; files in the old one that are no report's come along."""
+    """Exchange two folders; files in the old one that are no report's come along."""
 
     def ours(folder, names):
         pages = (name for name in names if re.fullmatch("[0-9]{2}_.*[.]html", name))
@@ -248,11 +233,8 @@ def _take_place(new, out):
 
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE: os.rename replaces nothing but empty folders
-    if ctypes.CDLL(None).renameat2(here, os.fsencode(new), here, os.fsencode(out), exchange):
-        old = out.rename(out.with_name(out.name + ".old"))  # disks that cannot exchange, such as NFS
-        new.rename(out)
-        shutil.rmtree(old)
+    out.rename(new.with_name("old"))
+    new.rename(out)
 
 
 def _execute_all(paths, environment, jobs):

@@ -1,4 +1,4 @@
-"""Stages that several notebooks begin with, worked out once.
+"""Stages that several notebooks begin with, worked out once; loops that several processes share.
 
 Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there for
 whoever asks for the same again. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs.
@@ -12,6 +12,10 @@ import fcntl
 import hashlib
 import os
 import pickle
+import signal
+import sys
+import threading
+from contextlib import contextmanager, suppress
 from functools import lru_cache, wraps
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -21,6 +25,7 @@ import numpy as np
 import scipy
 
 VARIABLE = "LRFCAL_CACHE"
+_processes = 1  # that share a loop
 
 
 def cached(stage):
@@ -76,3 +81,63 @@ def library():
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.digest()
+
+
+@contextmanager
+def all_processors():
+    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays alone."""
+    global _processes
+    alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
+    before, _processes = _processes, 1 if alone else len(os.sched_getaffinity(0))
+    try:
+        yield
+    finally:
+        _processes = before
+
+
+def spread(work, items):
+    """``[work(item) for item in items]``, shared with forked processes within :func:`all_processors`.
+
+    Whoever is free takes the next item; what another process could not do (it died, or `work` raised) is done here.
+    Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory differ in the last digit.
+    """
+    global _processes
+    items, done, others, count = list(items), {}, [], _processes
+    if min(count, len(items)) < 2:
+        return [pickle.loads(pickle.dumps(work(item))) for item in items]
+    queue, end = os.pipe()  # of the numbers of items
+    os.write(end, np.arange(len(items), dtype=np.uint16).tobytes())
+    os.close(end)
+    _processes = 1  # of loops within
+
+    def take():
+        """Work on what nobody works on."""
+        with suppress(Exception):
+            while number := os.read(queue, 2):
+                number = int.from_bytes(number, sys.byteorder)
+                done[number] = work(items[number])
+
+    try:
+        for _ in range(min(count, len(items)) - 1):
+            end, own = os.pipe()
+            child = os.fork()
+            if not child:
+                with suppress(BaseException), open(own, "wb") as file:
+                    take()
+                    pickle.dump(done, file)
+                os._exit(0)
+            os.close(own)
+            others.append((child, open(end, "rb")))
+        take()
+        done = pickle.loads(pickle.dumps(done))
+        for _, file in others:
+            with suppress(EOFError, pickle.UnpicklingError):
+                done |= pickle.load(file)
+    finally:
+        _processes = count
+        os.close(queue)
+        for child, file in others:
+            file.close()
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+    return [done[i] if i in done else pickle.loads(pickle.dumps(work(item))) for i, item in enumerate(items)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -463,23 +463,18 @@ def unit_of(raw):
     return UNITS[raw[0]]
 
 
-def at(first, size, meaning):
-    """A value of a reply: where its bytes are (as in the manual, which counts the code as 0), and what they mean."""
-    return field(metadata={"bytes": slice(first, first + size), "meaning": meaning})
-
-
 @dataclass(frozen=True)
 class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
-    firmware: str = at(1, 7, text)
-    serial: str = at(10, 8, text)
-    fault: int = at(9, 1, whole)  # 0 for a sound device
-    measuring_mode: int = at(102, 1, whole)
-    scan_angle_deg: float = at(107, 2, lambda raw: float(whole(raw)))
-    resolution_deg: float = at(109, 2, lambda raw: whole(raw) / 100)
-    address: int = at(120, 1, whole)
-    unit: str = at(122, 1, unit_of)
+    firmware: str
+    serial: str
+    fault: int  # 0 for a sound device
+    measuring_mode: int
+    scan_angle_deg: float
+    resolution_deg: float
+    address: int
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -519,9 +514,10 @@ def reply_data(raw, code, shortest):
 
 def parse_status(raw):
     """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or too short."""
-    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
-    of = {f.name: f.metadata for f in fields(DeviceStatus)}
-    return DeviceStatus(**{name: how["meaning"](data[how["bytes"]]) for name, how in of.items()})
+    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)  # counted as in the manual, which calls the code 0
+    variant = float(whole(data[107:109])), whole(data[109:111]) / 100
+    words = text(data[1:8]), text(data[10:18])
+    return DeviceStatus(*words, data[9], data[102], *variant, data[120], unit_of(data[122:]))
 
 
 def parse_type(raw):

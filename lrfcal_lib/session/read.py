@@ -6,11 +6,13 @@ import math
 import os
 import re
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from zipfile import ZipFile
 
 import cv2
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
@@ -60,21 +62,23 @@ class EdgePick:
 SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
 
 
-def read_scans(path, file):
+def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
-    if file is None:
-        file = next((name for name in SOURCES if os.path.lexists(path / name)), SOURCES[0])
-    target, lexists = inside(path, file, "session.json: file of the LRF"), os.path.lexists
-    if file not in SOURCES:
-        raise SessionError(f"{path}: the LRF's file is one of {short(SOURCES)}, got '{file}'")
-    if not lexists(target) and lexists(path / "lrf") and any(map(PART.fullmatch, stated.listed(path / "lrf", path))):
-        remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
-        raise SessionError(f"{path}: the recording was interrupted; {remedy}")
-    if file == "lrf/scans.npz":
-        return read_npz(target, path), None
-    scans, log = read_telegrams(target, path)
-    with naming(target):
+    file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
+    if file.suffix == ".npz":
+        if not os.path.lexists(file) and os.path.lexists(path / "lrf") and parts_of(path):
+            remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
+            raise SessionError(f"{path}: the recording was interrupted; {remedy}")
+        return read_npz(file, path), None
+    scans, log = read_telegrams(file, path)
+    with naming(file):
         return check_scans(scans), log
+
+
+def parts_of(path):
+    """Files of a session's sweeps in their order, until it is finished."""
+    files = stated.checked(path / "lrf" / "any", path).parent.iterdir()
+    return sorted(file for file in files if PART.fullmatch(file.name))
 
 
 def read_npz(file, within):
@@ -207,22 +211,16 @@ def read_edges(path, facts, records):
 
 def image_size(file, data):
     """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        header, complete = data[16:24], b"IEND" in data[-16:]
-        size = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")
-    elif data[:2] == b"\xff\xd8":
-        at, size, complete = 2, None, b"\xff\xd9" in data[-64:]
-        # what is no segment ends the walk: a decoder would go on looking, and find another header than we do
-        while size is None and at + 9 <= len(data) and data[at] == 0xFF and 0xC0 <= data[at + 1] < 0xFF:
-            marker = data[at + 1]
-            if 0xD0 <= marker <= 0xD9:
-                break
-            if marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # the frame header
-                size = int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    else:
+    ends = {b"\x89PNG\r\n\x1a\n": b"IEND", b"\xff\xd8": b"\xff\xd9"}
+    end = next((end for begin, end in ends.items() if data.startswith(begin)), None)
+    if end is None:
         raise SessionError(f"{file}: neither PNG nor JPEG; convert the image")
-    if size is None or not complete:
+    try:
+        with Image.open(BytesIO(data), formats=("PNG", "JPEG")) as image:
+            size = image.size
+    except Exception:  # whatever Pillow makes of a header
+        size = None
+    if size is None or end not in data[-64:]:
         raise SessionError(f"{file}: the image is truncated after {len(data)} bytes; restore it or remove its row")
     return size
 
@@ -400,7 +398,7 @@ def open_session(path):
             raise ValueError(f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'")
         facts = stated.parse_session(data)
         unfinished = facts.pop("unfinished")
-        scans, log = read_scans(path, data["rig"]["lrf"].get("file"))
+    scans, log = read_scans(path)
     records = read_images(path, facts, unfinished)
     picks = read_edges(path, facts, records)
     problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)

@@ -52,28 +52,15 @@ class SessionError(ValueError):
         super().__init__(text if len(text) < 2000 else f"{text[:1000]} [...] {text[-500:]}")
 
 
-@contextmanager
-def folder(file, within, make=False):
-    """Descriptor of the folder that holds a file of a session, reached without following a link."""
-    where, handle = Path(within), os.open(within, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        for part in Path(file).relative_to(within).parts[:-1]:
-            where /= part
-            if make:
-                with suppress(FileExistsError):
-                    os.mkdir(part, dir_fd=handle)
-            _refuse_other(where, os.stat(part, dir_fd=handle, follow_symlinks=False), "d", "a folder")
-            outer, handle = handle, os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=handle)
-            os.close(outer)
-        yield handle
-    finally:
-        os.close(handle)
-
-
-def listed(path, within):
-    """Names in a folder of a session."""
-    with folder(Path(path) / "any", within) as handle:
-        return sorted(os.listdir(handle))
+def checked(file, within, make=False):
+    """A file of a session; SessionError where a folder on the way to it is none, such as a link."""
+    where = Path(within)
+    for part in Path(file).relative_to(within).parts[:-1]:
+        where /= part
+        if make:
+            where.mkdir(exist_ok=True)
+        _refuse_other(where, where.lstat(), "d", "a folder")
+    return Path(file)
 
 
 def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
@@ -97,20 +84,14 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     OSError
         If it cannot be opened.
     """
-    file = Path(file).resolve() if within is None else Path(file)
-    with folder(file, within or file.parent) as handle:
-        with suppress(FileNotFoundError):  # a device is not even opened
-            _refuse_other(file, os.stat(file.name, dir_fd=handle, follow_symlinks=False), "-", "a file")
-        inner = os.open(file.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666, dir_fd=handle)
-    try:
-        status = os.fstat(inner)
-        _refuse_other(file, status, "-", "a file")
-        if flags == os.O_RDONLY and status.st_size > most:
-            raise SessionError(f"{file}: {status.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
-        return os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
-    except BaseException:
-        os.close(inner)
-        raise
+    file = Path(file).resolve() if within is None else checked(file, within)
+    with suppress(FileNotFoundError):  # a device is not even opened
+        found = file.lstat()
+        _refuse_other(file, found, "-", "a file")
+        if flags == os.O_RDONLY and found.st_size > most:
+            raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
+    inner = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    return os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
 
 
 def _refuse_other(file, status, kind, wanted):
@@ -129,18 +110,14 @@ def alone(path):
         except BlockingIOError:
             holder = stream.read(200).decode(errors="replace") or "another process"
             raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
-        if not os.fstat(stream.fileno()).st_nlink:  # who held it has removed it meanwhile
-            with alone(path):
-                yield
-            return
         stream.truncate()
         stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
         stream.flush()
         try:
             yield
         finally:
-            with suppress(OSError), folder(Path(path) / LOCK, path) as handle:  # gone with its session?
-                os.unlink(LOCK, dir_fd=handle)
+            with suppress(OSError):  # gone with its session?
+                os.unlink(Path(path) / LOCK)
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB

@@ -77,8 +77,7 @@ class SessionWriter:
 
     def _make_folders(self):
         for name in ("lrf", *(f"images/{camera}" for camera in self.cameras)):
-            with stated.folder(self.path / name / "any", self.path, make=True):
-                pass
+            stated.checked(self.path / name / "any", self.path, make=True)
         if self.cameras:
             self._begin_table("images.csv", read.IMAGE_COLUMNS)
 
@@ -221,8 +220,7 @@ def complete(path):
     mend_tables(path)
     if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    parts = [path / "lrf" / name for name in stated.listed(path / "lrf", path) if read.PART.fullmatch(name)]
-    if not parts:
+    if not (parts := read.parts_of(path)):
         raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
     sweeps = [read.read_npz(part, path) for part in parts]
     shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
@@ -251,19 +249,21 @@ def cell(value):
 
 def write_file(file, content, within, save=np.savez):
     """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
-    draft = file.with_name(file.name + ".draft")
-    with stated.folder(file, within) as inside:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(draft.name, dir_fd=inside)
-        with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
-            if isinstance(content, dict):
-                save(stream, **content)
-            else:
-                stream.write(content.encode() if isinstance(content, str) else content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(draft.name, file.name, src_dir_fd=inside, dst_dir_fd=inside)
-        os.fsync(inside)
+    draft = stated.checked(file, within).with_name(file.name + ".draft")
+    draft.unlink(missing_ok=True)
+    with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
+        if isinstance(content, dict):
+            save(stream, **content)
+        else:
+            stream.write(content.encode() if isinstance(content, str) else content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    draft.replace(file)
+    handle = os.open(file.parent, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def append_file(file, content, within):
@@ -324,8 +324,7 @@ class SessionRecorder(SessionWriter):
             self._mark_dropped(placement)
         self._state(unfinished=[])
         for camera in self.cameras:
-            there = stated.listed(self.path / "images" / camera, self.path)
-            names = [name.partition(".")[0] for name in there if not name.endswith(".draft")]
+            names = [file.stem for file in (self.path / "images" / camera).iterdir() if file.suffix != ".draft"]
             self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
 
     def begin_placement(self, placement):

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -169,12 +168,16 @@ def printed_triangle():
     return triangle_board(name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
 
 
-_FILE = json.loads(Path(__file__).with_name("setups.json").read_text())
+SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
 
 
 def load_setup(name):
-    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is like."""
-    row = _radians(_FILE[_FILE[name].get("like", name)] | _FILE[name])
+    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is like.
+
+    ValueError for a name that is not there.
+    """
+    need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
+    row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
     names = ("seed", "pairs", "distances", "step", "intrinsics_views", "room_sweep", "room_images", "quality")
     cameras = []
     for camera, c in row["cameras"].items():
@@ -198,10 +201,6 @@ def _radians(row):
     """A row with what ends in _deg in radians, and no lists."""
     turned = {k.removesuffix("_deg"): np.radians(v).tolist() if k.endswith("_deg") else v for k, v in row.items()}
     return {k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()}
-
-
-SETUPS = {name: partial(load_setup, name) for name in _FILE}
-sim_lms221, sim_quick = (SETUPS[name] for name in ("sim_lms221", "sim_quick"))
 
 
 @dataclass(frozen=True)

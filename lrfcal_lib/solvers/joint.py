@@ -539,9 +539,9 @@ def finished(obs, state, data, unknowns, excluded, required):
         shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=MOST_STEPS,
         tolerance=LAST_STEP, n_observations=count_rows(obs),
     )  # fmt: skip
-    lens, lens_scale = joint_noise.lens_covariance(obs, found, data, unknowns)
+    lens, twice, lens_scale = joint_noise.lens_covariance(obs, found, data, unknowns)
     spread = None if found.covariance_placements is None else found.covariance_placements + lens
-    found = replace(found, covariance=found.covariance + lens, covariance_placements=spread)
+    found = replace(found, covariance=found.covariance + lens - twice, covariance_placements=spread)
     wider = replace(unknowns, sensor=tuple(dict.fromkeys((*unknowns.sensor, *joint_noise.TERMS))))
     state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, wider), obs.placements.tolist()
     levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")

@@ -47,17 +47,17 @@ def lens_covariance(obs, found, data, unknowns):
     """Covariance (c, c) of the shared unknowns from those of the intrinsics, and the scatter of views that these cause.
 
     The latter in stated standard deviations, like the scale of views: what no unknown can take up of the error that all
-    views of a camera share. Zeros where intrinsics are taken to be exact.
+    views of a camera share. Between them comes what this scatter has added to `found.covariance` through the scale of
+    views, as far as that exceeds the stated noise: the intrinsics would count twice. Zeros where they are exact.
     """
     c = unknowns.shared
     total, square = np.zeros((c, c)), 0.0
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
-        return total, square
+        return total, total, square
     block = view_block(found.state, data, unknowns)
     J, used = whiten(block)[1], data.view["used"]
     lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
-    weighted = np.sqrt(found.weights[..., None]) * found.jacobian
-    hessian = np.swapaxes(weighted, -1, -2) @ weighted
+    hessian = np.swapaxes(found.jacobian, -1, -2) @ (found.weights[..., None] * found.jacobian)
     own = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
     reduced = J[..., :c] - J[..., c:] @ own @ hessian[:, c:, :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
@@ -67,7 +67,10 @@ def lens_covariance(obs, found, data, unknowns):
         gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
         left = shift - reduced @ gain - J[..., c:] @ (own @ (np.swapaxes(J[..., c:], -1, -2) @ shift))
         total, square = total + gain @ spread @ gain.T, square + np.sum(left @ spread * left)
-    return total, float(data.view_scale[0] * np.sqrt(square / (6 * used.sum() * _freedom(used))))
+    level = data.view_scale[0] ** 2
+    square *= level / (6 * used.sum() * _freedom(used))
+    share = np.clip(level - 1, 0, square) / level
+    return total, share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite, float(np.sqrt(square))
 
 
 def _freedom(used):

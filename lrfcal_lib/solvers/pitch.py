@@ -210,8 +210,8 @@ class PitchErrors:
     direction : ndarray of int, shape (p,)
     direction_offset, direction_sigma : float
         Radians to add to the recorded pitch of sweeps with direction +1 (and to subtract for -1), with its standard
-        deviation, the larger of noise (at the level of the residuals) and scatter over the placements. nan where the
-        sweeps all go one way.
+        deviation (`Solution.trusted`, with the noise at the level of the residuals). nan where the sweeps all go
+        one way.
     models : dict of str to PitchModel
     wanted : str
         The model that the data ask for: each larger one must beat the last one wanted with p < 0.01.

@@ -1,0 +1,194 @@
+"""What can go wrong with a device on a serial line, switched on by tests; all that is random follows from a seed."""
+
+from collections import Counter
+from contextlib import suppress
+from copy import copy
+
+import numpy as np
+
+from lrfcal_lib.drivers import pelco_d
+from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
+from lrfcal_lib.emulators.head import EmulatedHead
+from lrfcal_lib.emulators.lms2xx import ACK, BAUD_WORD, DONE, REPLY_S, RESET_S, EmulatedLms
+from lrfcal_lib.session import lms2xx_codec as codec
+
+DELAY_S, PAUSE_S, AWAY_S, SLIP_S, SLOW_MODE_S, JUMP = 0.7, 0.08, 0.5, 0.3, 2.8, 1000  # JUMP in hundredths of a degree
+BYTES = {  # what some do to the bytes of a reply, about a place in it
+    "drop": lambda data, i, _: data[:i] + data[i + 1 :],
+    "flip": lambda data, i, rng: data[:i] + bytes([data[i] ^ 1 << int(rng.integers(8))]) + data[i + 1 :],
+    "duplicate": lambda data, i, _: data[: i + 1] + data[i:],
+    "insert": lambda data, i, rng: data[: i + 1] + rng.bytes(1) + data[i + 1 :],
+    "swap": lambda data, i, _: data[:i] + data[i : i + 2][::-1] + data[i + 2 :],
+    "blank": lambda data, i, _: data[:i] + bytes(len(data[i : i + 4])) + data[i + 4 :],
+    "cut": lambda data, i, _: data[:i],
+    "headless": lambda data, i, _: data[i + 1 :],
+    "noise": lambda data, _, rng: rng.bytes(int(rng.integers(1, 21))) + data,
+    "checksum": lambda data, _, rng: data[:-1] + bytes([data[-1] ^ int(rng.integers(1, 256))]),
+}
+REQUEST = {"request_drop": BYTES["drop"], "request_flip": BYTES["flip"], "deaf": lambda *_: b""}
+LINE = (*BYTES, *REQUEST, "address", "foreign", "silence", "delay", "pause", "twice", "stale", "echo", "unplug")
+LMS = (*LINE, "length", "nak", "no_ack", "refused", "reboot", "rate", "stuck", "slow_mode", "skip", "status")
+HEAD = (*LINE, "mute", "stall", "slip", "jump")
+
+
+class Faults:
+    """Switches of one device; `counts` tells how often each happened, ``changed()`` is called when one was armed."""
+
+    def __init__(self, known, seed, now, changed):
+        self.known, self.changed, self.counts, self._now = known, changed, Counter(), now
+        self.rng, self.away_s = np.random.default_rng([seed, len(known)]), AWAY_S
+        self._times, self._until = Counter(), {}
+
+    def inject(self, name, count=1, *, seconds=None):
+        """Arm a fault for so many opportunities (replies, requests, ...) from now on, or at every one for a while."""
+        assert name in self.known
+        if name == "unplug":  # how long the port is away
+            self.away_s, seconds = AWAY_S if seconds is None else seconds, None
+        if seconds is None:
+            self._times[name] += count
+        else:
+            self._until[name] = self._now() + seconds
+        self.changed()
+
+    def clear(self, name=None):
+        """Disarm one fault, or all."""
+        for switches in (self._times, self._until):
+            switches.clear() if name is None else switches.pop(name, None)
+
+    @property
+    def armed(self):
+        """Names of the faults that can still happen."""
+        return {*+self._times, *(name for name, end in self._until.items() if end > self._now())}
+
+    def hit(self, name):
+        """Whether the fault happens at this opportunity, which is then counted."""
+        hit = bool(self._times[name] > 0 or self._now() < self._until.get(name, 0))
+        self._times[name] -= self._times[name] > 0
+        self.counts.update([name] * hit)
+        return hit
+
+    def mangle(self, data, changes):
+        """Bytes as they are after those of the faults that hit them; each changes something where it can."""
+        for name, change in changes.items():
+            if data and self.hit(name):
+                tries = (change(data, int(self.rng.integers(len(data))), self.rng) for _ in range(100))
+                data = next((changed for changed in tries if changed != data), data)
+        return data
+
+
+class FaultyLine:
+    """Faults of any device on a line."""
+
+    def __init__(self, *args, seed=0, **options):
+        super().__init__(*args, seed=seed, **options)
+        self.faults = Faults(self.known, seed, self.host.now, lambda: getattr(self.port, "wake", lambda: None)())
+        self.hit, self._last = self.faults.hit, {}
+
+    def advance(self):
+        if self.port.there and self.hit("unplug"):
+            self.port.unplug()
+            self.at(self.host.now() + self.faults.away_s, lambda _: self.port.plug())
+        super().advance()
+
+    def hear(self, data):
+        if self.hit("echo"):
+            self.port.put(data)
+        super().hear(data)
+
+    def receive(self, data, at):
+        if data := self.faults.mangle(data, REQUEST):
+            super().receive(data, at)
+
+    def reply(self, raw, at, then=None):
+        kind = raw[4:5] if raw[:1] == b"\x02" else raw[-4:-3]
+        old, self._last[kind] = self._last.get(kind), raw
+        data = self.faults.mangle(self.prepare(old if old is not None and self.hit("stale") else raw), BYTES)
+        at += DELAY_S * self.hit("delay")
+        data = b"" if self.hit("silence") else data
+        for _ in range(self.hit("twice")):
+            super().reply(data, at)
+        if len(data) > 1 and self.hit("pause"):
+            half = len(data) // 2
+            self.write(data[:half], at)
+            data, at = data[half:], at + half * self.byte_s + PAUSE_S
+        super().reply(data, at, then)
+
+
+class FaultyLms(FaultyLine, EmulatedLms):
+    """An LMS2xx with faults."""
+
+    known = LMS
+
+    def heard(self, raw, at, sound=True):
+        return super().heard(raw, at, sound and not self.hit("nak"))
+
+    def write(self, data, at, then=None):
+        if data != ACK or not self.hit("no_ack"):
+            super().write(data, at, then)
+
+    def obey(self, telegram, at):
+        memory = self.memory
+        if self.hit("reboot"):
+            return self.at(at + RESET_S, self.restart)
+        if self.hit("rate"):
+            memory.baudrate = int(self.faults.rng.choice([rate for rate in BAUD_WORD if rate != memory.baudrate]))
+        return self.answer(at, 0x92) if self.hit("refused") else super().obey(telegram, at)
+
+    def set_mode(self, data, at):
+        streamed, mode = self.streaming, self.memory.mode
+        super().set_mode(data, at)
+        if streamed and self.memory.mode != mode and self.hit("stuck"):
+            self.memory.mode = mode
+
+    def answer(self, at, code, data=b"", effect=None, delay=REPLY_S):
+        slow = (code, data, effect) == (0xA0, DONE, None) and self.hit("slow_mode")
+        super().answer(at, code, data, effect, SLOW_MODE_S if slow else delay)
+
+    def emit(self, scan, at, then=None):
+        if then is None and self.hit("skip"):
+            self.telegrams += 1
+        else:
+            super().emit(scan, at, then)
+
+    def prepare(self, raw):
+        """A reply with the faults that keep its checksum sound."""
+        with suppress(codec.TelegramError):
+            told = codec.parse_telegram(raw)
+            status = 0xD3 if self.hit("status") else told.status
+            address = 0x80 | (told.address + 5) % 0x80 if self.hit("address") else told.address
+            raw = codec.encode_telegram(told.code, told.data, status=status, address=address)
+        if self.hit("length"):
+            length = (len(raw) - 5 + int(self.faults.rng.integers(40))) % 800
+            raw = raw[:2] + length.to_bytes(2, "little") + raw[4:-2]
+            raw += codec.crc16(raw).to_bytes(2, "little")
+        return codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
+
+
+class FaultyHead(FaultyLine, EmulatedHead):
+    """A head with faults."""
+
+    known = HEAD
+
+    def obey(self, frame, at):
+        moves = frame.command2 & (pelco_d.UP | pelco_d.DOWN) and not frame.command2 & 1
+        head, until = self.head, self.absolute_until
+        stalls = (moves or frame.command2 == pelco_d.SET_TILT) and self.hit("stall")
+        self.head = copy(head) if stalls else head  # another one moves
+        super().obey(frame, at)
+        self.head, self.absolute_until = head, until if stalls else self.absolute_until
+
+    def stop(self, at):
+        super().stop(at + SLIP_S * self.hit("slip"))
+
+    def tell(self, opcode, at):
+        if not self.hit("mute"):
+            super().tell(opcode, at)
+
+    def prepare(self, raw):
+        """A reply with the faults that keep its checksum sound."""
+        if len(raw) == pelco_d.FRAME and raw[3] == pelco_d.TILT and self.hit("jump"):
+            raw = encode_extended(raw[1], raw[3], (int.from_bytes(raw[4:6], "big") + JUMP) % pelco_d.TURN)
+        if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and self.hit("address"):
+            other = raw[1] % 255 + 1
+            raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
+        return encode_extended(self.address, pelco_d.ZOOM, 0x1234) + raw if self.hit("foreign") else raw
