@@ -53,7 +53,7 @@ class Still:
     """A camera in virtual time, which stands still while an image is drawn."""
 
     def __init__(self, rig, name):
-        self.rig, self.name, self.settings, self.count = rig, name, {"warnings": []}, 0
+        self.rig, self.name, self.count = rig, name, 0
 
     def newest(self, after=None, timeout=None):
         self.rig.host.sleep(0.5)

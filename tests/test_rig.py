@@ -373,7 +373,7 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
     clock, made = Clock(), []
     head = Head(clock)
     lrf, camera = Lrf(head, clock), Camera("left", head, clock)
-    camera.settings = {"size": {"asked": SIZE, "got": size}}
+    camera.size = size
 
     def make(driver, fake, *_, **__):
         made.append(driver)

@@ -18,7 +18,7 @@ KEPT = 256  # scans that can be asked for by their instant
 LEAST_QUIET_S = 0.6  # of a stream, before it is taken for silent
 RECOVERY_S = 8.0  # one attempt to find a lost device; there are more until the stream is stopped
 REPLY_S = 0.4  # the manual allows 60 ms until a scan begins to be sent; a machine may be busy
-COUNTS = ("telegrams", "crc_errors", "resyncs", "dropped", "stale", "reconnects")
+COUNTS = ("dropped", "stale", "reconnects")
 
 
 class LMS2xx(Closed):
@@ -107,9 +107,8 @@ class LMS2xx(Closed):
     def counts(self):
         """How often what happened since the device was opened, a dict.
 
-        'telegrams': sound ones; 'crc_errors': damaged ones; 'resyncs': stray bytes skipped; 'dropped': scans that the
-        mirror made between two that came (needs real-time indices), most of them because the line is slow; 'stale':
-        scans that were not newer than the one before; 'reconnects'.
+        'dropped': scans that the mirror made between two that came (needs real-time indices), most of them because the
+        line is slow; 'stale': scans that were not newer than the one before; 'reconnects'.
         """
         return dict(self._counts)
 
@@ -117,7 +116,7 @@ class LMS2xx(Closed):
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
-        self._link, self._scan_clock = Link(self.port, first, self._counts, **self._options), ScanClock()
+        self._link, self._scan_clock = Link(self.port, first, **self._options), ScanClock()
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()

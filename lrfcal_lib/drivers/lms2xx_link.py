@@ -53,14 +53,13 @@ def interval_s(size, baudrate, scan_s):
 class Link:
     """An open port with an LMS2xx at its other end.
 
-    `counts` has the numbers of 'telegrams', 'crc_errors' and 'resyncs', counted up; address 0 reaches any device; once
-    the event `interrupted` is set, whoever waits here gets NoReply. Replies count whose address byte is among `senders`
-    (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s` is the instant by the clock at which
-    the last one was sent for the first time, and `heard` counts bytes of any kind.
+    Address 0 reaches any device; once the event `interrupted` is set, whoever waits here gets NoReply. Replies count
+    whose address byte is among `senders` (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s`
+    is the instant by the clock at which the last one was sent for the first time, and `heard` counts bytes of any kind.
     """
 
-    def __init__(self, path, baudrate, counts, *, address=0, interrupted=None, host=REAL):
-        self.path, self.counts, self.address, self.host = path, counts, address, host
+    def __init__(self, path, baudrate, *, address=0, interrupted=None, host=REAL):
+        self.path, self.address, self.host = path, address, host
         self.interrupted = interrupted or host.event()
         self.senders, self.deadline, self.asked_s, self.heard = None, math.inf, 0.0, 0
         self._port = host.port(path, baudrate, timeout=READ_S)
@@ -123,9 +122,6 @@ class Link:
         stray = data[ends[-1] if ends else 0 : stream.pending]
         self._stray = stray[-1] if stray else None if ends else self._stray
         self._rest = data[stream.pending :]
-        self.counts["telegrams"] += len(ends)
-        self.counts["crc_errors"] += int((stream.rejected < stream.pending).sum())
-        self.counts["resyncs"] += stream.skipped > 1  # one byte is an acknowledgement
         spans = zip(stream.offset.tolist(), ends, strict=True)
         found = [Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate) for begin, end in spans]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]

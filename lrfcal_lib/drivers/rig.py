@@ -329,8 +329,7 @@ def _camera(stated, name):
     asked, info = stated.devices.cameras[name], stated.cameras[name]
     size, options = (info.width, info.height), asked.model_dump(exclude_none=True, exclude={"source", "size"})
     camera = Camera(asked.source, name=name, size=size, **options)
-    got = camera.settings["size"]["got"]
-    if got is not None and tuple(got) != size:
+    if (got := camera.size) not in (None, size):
         camera.close()
         raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x {size[1]}: "
                          "state a size that it can do")  # fmt: skip

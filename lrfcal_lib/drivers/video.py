@@ -210,7 +210,7 @@ class Frame:
 
 
 class Camera(Closed):
-    """A camera, set to what is asked for; what came of it is read back. A context manager.
+    """A camera, set to what is asked for; what could not be set is logged. A context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
     source again when it is lost. A recorded one (video file, images) gives its next image each time it is asked.
@@ -231,9 +231,8 @@ class Camera(Closed):
 
     Attributes
     ----------
-    settings : dict
-        'size' (width, height) in pixels, 'exposure' in s and 'fps', each a dict of 'asked' and 'got' (None where it is
-        unknown), and 'warnings', a list of str: what could not be set.
+    size : tuple of int or None
+        Width and height that it gives, pixels; None where that is unknown.
     lost : bool
         A live source gave no frame when it should have, and was not found again yet; a recorded one is at its end.
 
@@ -244,9 +243,8 @@ class Camera(Closed):
     """
 
     def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
-        asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
-        self.name, self.lost = name, False
-        self.settings = {key: {"asked": value, "got": None} for key, value in asked.items()} | {"warnings": []}
+        self._asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
+        self.name, self.lost, self._told = name, False, set()
         self._source = find_source(source, silence_s)
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
         self._capture = self._source.open(self._source)
@@ -351,8 +349,7 @@ class Camera(Closed):
 
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
-        self._before, capture, ticks = REAL.time(), self._capture, 0
-        asked = {key: one["asked"] for key, one in self.settings.items() if key != "warnings"}
+        self._before, capture, asked, ticks = REAL.time(), self._capture, self._asked, 0
         if self._source.open is _open_device:
             exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
             wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
@@ -361,15 +358,13 @@ class Camera(Closed):
             done = {key: capture.set(key, value) for key, value in wanted.items() if value is not None}
             ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
         size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
-        found = {"size": size if all(size) else None, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
+        self.size = size if all(size) else None
+        found = {"size": self.size, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
                  "fps": capture.get(FPS) or None}  # fmt: skip
-        warnings = []
         for key, got in found.items():
-            self.settings[key]["got"] = got
-            if asked[key] is not None and (got is None or not np.allclose(asked[key], got, rtol=0.05, atol=0)):
-                told = "cannot be set" if got is None else f"is {got}"
-                warnings.append(f"camera {self.name}: {key} {told}, asked {asked[key]}")
-        for text in warnings:
-            if text not in self.settings["warnings"]:
+            if asked[key] is None or got is not None and np.allclose(asked[key], got, rtol=0.05, atol=0):
+                continue
+            text = f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, asked {asked[key]}"
+            if text not in self._told:  # once, however often it is opened again
+                self._told.add(text)
                 LOG.warning(text)
-        self.settings["warnings"] = warnings
