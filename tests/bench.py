@@ -1,7 +1,7 @@
 """Speed and memory, every figure beside a named alternative in the same run: ``make bench``.
 
-Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: `make bench` installs
-it, and its ratio is null where it cannot be had.
+Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: `make bench`
+installs it, and its ratio is null where it cannot be had.
 """
 
 import argparse
@@ -90,10 +90,13 @@ def cameras(size):
     def one():
         return solve_camera(obs, "line", T0, search=False)
 
+    def ten():
+        return [one() for _ in range(BATCH)]
+
     def many():
         return solve_camera(trials, "line", T0)
 
-    batch, theirs = seconds(3 * size["repeats"], lambda: [one() for _ in range(BATCH)], lambda: scipy(obs.crossing_points))
+    batch, theirs = seconds(3 * size["repeats"], ten, lambda: scipy(obs.crossing_points))
     ours = batch / BATCH
     yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours, one
     some = points[: max(1, len(points) // 20)]
