@@ -54,7 +54,7 @@ def run_nbval(path, report):
     environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem}
     tests = Path(__file__).parent
     environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [environment.get("PYTHONPATH")])])
-    environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")  # kernels look at the figures they save
+    environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 

@@ -64,7 +64,7 @@ def test_a_bend_is_measured(bend, size):
 
 @pytest.mark.parametrize("waves", [0.0, 0.003])
 def test_flat_boards_do_not_bend_and_the_p_value_is_honest(waves):
-    found = [bend_of(a_face(np.random.default_rng(seed), 1500, waves=waves)) for seed in range(200)]
+    found = [bend_of(a_face(np.random.default_rng(seed), 1500, waves=waves)) for seed in range(100)]
     assert not any(b.bends for b in found)
     assert np.mean([b.p_value < 0.1 for b in found]) < 0.2
     assert np.mean([b.p_value < 0.5 for b in found]) > 0.25
@@ -100,7 +100,7 @@ def a_triangle(rng, lines=22, beams=25, noise=0.01):
 def test_coarse_sweeps_of_flat_boards_seldom_look_bent():
     """Five percent of them at a level of 5 %, or fewer: the scatter of few parts must not be trusted too far."""
     rng = np.random.default_rng(11)
-    p_values = np.array([bend_of(a_triangle(rng)).p_value for _ in range(400)])
+    p_values = np.array([bend_of(a_triangle(rng)).p_value for _ in range(200)])
     assert np.sum(p_values < 0.05) <= binom.ppf(0.999, len(p_values), 0.05)
     assert np.sum(p_values < 0.001) <= 2
 

@@ -1,4 +1,4 @@
-"""Half a minute of streaming at every rate, in virtual time: every scan of the device is accounted for."""
+"""Ten seconds of streaming at every rate, in virtual time: every scan of the device is accounted for."""
 
 import math
 
@@ -9,7 +9,7 @@ from virtual import INDEXED, lms
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import RATES
 
-STREAM_S, SCAN_S, TURNS, BYTES = 30.0, 2 * 0.01332, 2, 732 + 2  # of the variant 180/0.5
+STREAM_S, SCAN_S, TURNS, BYTES = 10.0, 2 * 0.01332, 2, 732 + 2  # of the variant 180/0.5
 
 
 @pytest.mark.parametrize("rate", RATES)
