@@ -19,7 +19,7 @@ help:
 	@echo "make campaign                the many falsified and drawn recordings of which make test has a few"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
-	@echo "make bench                   speed and memory beside scipy, OpenCV and GTSAM, if installed: reports/bench/"
+	@echo "make bench                   speed and memory beside scipy, OpenCV and GTSAM (which it installs): reports/bench/"
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
 	@echo "make data                    rebuild the simulated sessions in data/ from their seeds"
@@ -52,6 +52,7 @@ lab: setup
 	[ -w notebooks ] || echo "this folder is read-only: notebooks run, changes to them cannot be saved" >&2; \
 	LRFCAL_CACHE="$$folder" .venv/bin/jupyter lab $(AS_ROOT) $(NO_BUILD_QUESTION) notebooks
 
+bench: export BENCH := 1
 bench: setup
 	@PYTHONPATH=tests $(RUN) tests/bench.py
 

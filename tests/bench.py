@@ -1,7 +1,7 @@
 """Speed and memory, every figure beside a named alternative in the same run: ``make bench``.
 
-Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: its ratio is null
-unless somebody installs it (`pip install gtsam`).
+Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: `make bench`
+installs it, and its ratio is null where it cannot be had.
 """
 
 import argparse
@@ -43,20 +43,29 @@ TINY = {  # for the test, which only asks whether everything is written
     "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "core": 0, "points": 10_000, "growth": (1_000,),
     "telegrams": 100, "session": None,
 }  # fmt: skip
+SHORT = 0.02  # seconds
 CHUNK = 1_000_000  # points that growth hands over at a time
 ROWS = {"face": 40, "beam": 30}
 MODEL = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
 
 
 def seconds(repeats, *functions):
-    """Median times of calls that take turns (so that both meet the same load), after one each to warm up."""
-    times = np.zeros((repeats + 1, len(functions)))
+    """Median times of calls that take turns (so that both meet the same load), short ones ten times a turn."""
+    calls, times = [], np.zeros((repeats, len(functions)))
+    for function in functions:  # to warm up, and to see which are short
+        taken = [elapsed(function) for _ in range(2)]
+        calls.append(10 if min(taken) < SHORT else 1)
     for row in times:
-        for i, function in enumerate(functions):
-            begin = time.perf_counter()
-            function()
-            row[i] = time.perf_counter() - begin
-    return np.median(times[1:], axis=0).tolist()
+        row[:] = [elapsed(function, n) for function, n in zip(functions, calls, strict=True)]
+    return np.median(times, axis=0).tolist()
+
+
+def elapsed(function, calls=1):
+    """Mean time of some calls, seconds."""
+    begin = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - begin) / calls
 
 
 def memory(function):
@@ -88,6 +97,9 @@ def cameras(size):
 
     def one():
         return solve_camera(obs, "line", T0, search=False)
+
+    def ten():
+        return [one() for _ in range(BATCH)]
 
     def many():
         return solve_camera(trials, "line", T0)
@@ -176,7 +188,7 @@ def joint(size):
     try:
         theirs = [with_gtsam(count, at_once) for at_once in (False, True)]
     except ImportError:
-        print("no GTSAM here (pip install gtsam): its ratios stay empty", file=sys.stderr)
+        print("no GTSAM here: its ratios stay empty", file=sys.stderr)
         theirs = []
     taken, *others = seconds(size["repeats"], *ours, *theirs)
     for key, how, other in zip(("", "_at_once"), ("a factor each", "at once"), others or none_of_them, strict=True):

@@ -256,10 +256,12 @@ def exp_rotation(w):
 
 def log_rotation(R):
     """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be exact."""
-    x, y, z = (0.5 * (R[..., i, k] - R[..., k, i]) for i, k in ((2, 1), (0, 2), (1, 0)))
-    sine, cosine = np.sqrt(x * x + y * y + z * z), 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1)
-    turned = np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12), 1.0)
-    w, half = np.stack([x, y, z], axis=-1) * turned[..., None], cosine < -0.9  # near half a turn the sine says little
+    if R.ndim == 2:
+        return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
+    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    sine, cosine = np.sqrt(x * x + y * y + z * z), R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1  # twice, both
+    turn = np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12), 0.5)
+    w, half = np.stack([x, y, z], axis=-1) * turn[..., None], cosine < -1.8  # near half a turn the sine says little
     if half.any():
         w[half] = Rotation.from_matrix(R[half], assume_valid=True).as_rotvec()
     return w
