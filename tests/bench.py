@@ -98,9 +98,6 @@ def cameras(size):
     def one():
         return solve_camera(obs, "line", T0, search=False)
 
-    def ten():
-        return [one() for _ in range(BATCH)]
-
     def many():
         return solve_camera(trials, "line", T0)
 
