@@ -12,11 +12,11 @@ import fcntl
 import hashlib
 import os
 import pickle
+import signal
+import sys
 import threading
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache, wraps
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -26,7 +26,6 @@ import scipy
 
 VARIABLE = "LRFCAL_CACHE"
 _processes = 1  # that share a loop
-_loop = None  # that they share: what to do, and with what
 
 
 def cached(stage):
@@ -97,22 +96,48 @@ def all_processors():
 
 
 def spread(work, items):
-    """``[work(item) for item in items]``, by forked processes within :func:`all_processors`.
+    """``[work(item) for item in items]``, shared with forked processes within :func:`all_processors`.
 
+    Whoever is free takes the next item; what another process could not do (it died, or `work` raised) is done here.
     Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory differ in the last digit.
     """
-    global _processes, _loop
-    items, before = list(items), (_processes, _loop)
-    if min(_processes, len(items)) < 2:
+    global _processes
+    items, done, others, count = list(items), {}, [], _processes
+    if min(count, len(items)) < 2:
         return [pickle.loads(pickle.dumps(work(item))) for item in items]
-    _processes, _loop = 1, (work, items)  # what processes find when they are forked; loops within are not shared again
+    queue, end = os.pipe()  # of the numbers of items
+    os.write(end, np.arange(len(items), dtype=np.uint16).tobytes())
+    os.close(end)
+    _processes = 1  # of loops within
+
+    def take():
+        """Work on what nobody works on."""
+        with suppress(Exception):
+            while number := os.read(queue, 2):
+                number = int.from_bytes(number, sys.byteorder)
+                done[number] = work(items[number])
+
     try:
-        with ProcessPoolExecutor(min(before[0], len(items)), get_context("fork")) as pool:
-            return list(pool.map(_item, range(len(items))))
+        for _ in range(min(count, len(items)) - 1):
+            end, own = os.pipe()
+            child = os.fork()
+            if not child:
+                with suppress(BaseException), open(own, "wb") as file:
+                    take()
+                    pickle.dump(done, file)
+                os._exit(0)
+            os.close(own)
+            others.append((child, open(end, "rb")))
+        take()
+        done = pickle.loads(pickle.dumps(done))
+        for _, file in others:
+            with suppress(EOFError, pickle.UnpicklingError):
+                done |= pickle.load(file)
     finally:
-        _processes, _loop = before
-
-
-def _item(number):
-    work, items = _loop
-    return work(items[number])
+        _processes = count
+        os.close(queue)
+        for child, file in others:
+            file.close()
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+    return [done[i] if i in done else pickle.loads(pickle.dumps(work(item))) for i, item in enumerate(items)]
