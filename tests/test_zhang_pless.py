@@ -31,7 +31,7 @@ def test_closed_form_is_exact_on_exact_data(source):
     sets = plane_sets(obs)
     triangles = compress(sets, 1.0)
     assert planes.common_plane(triangles)[1] == (source == "lrf")
-    found = pose_transform(planes.closed_form(triangles, sets.boards, np.arange(12)[None], source == "platform"))
+    found = pose_transform(planes.closed_form(triangles, sets.boards, np.arange(12)[None], source == "platform")[0])
     assert max(transform_difference(found, rig.T_camera_lrf)) < 1e-9
 
 
