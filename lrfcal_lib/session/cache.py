@@ -100,6 +100,7 @@ def spread(work, items):
 
     Whoever is free takes the next item; what another process could not do (it died, or `work` raised) is done here.
     Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory differ in the last digit.
+    Pickles are read from the pipes of our own children only.
     """
     global _processes
     items, done, others, count = list(items), {}, [], _processes
