@@ -116,17 +116,6 @@ def test_cameras_open_as_any_stream_and_show_the_place(rig):
     video.release()
 
 
-def test_no_image_while_the_head_moves(rig):
-    """A new one afterwards, which shows the new pitch."""
-    cameras, head, now = rig.camera_server, rig.world.head, rig.host.now
-    until(lambda: cameras.image("left", timeout=1.0)[0] is not None, "an image at rest")
-    before = cameras.image("left", timeout=DEADLINE)[0]
-    head.move(now(), head.measured(now()) + 0.2, 0.2)
-    assert cameras.image("left", timeout=0.3) == (None, None)
-    after = cameras.image("left", timeout=DEADLINE)[0]
-    assert after[2] == pytest.approx(before[2] + 0.2, abs=0.01) and head.settled(rig.host.now())
-
-
 @pytest.fixture
 def drawing(small):
     """Makes camera servers whose drawing process is replaced by one that ends when it is told: pitch and result."""
@@ -165,15 +154,6 @@ def obeyed(url, command):
     return urllib.request.urlopen(f"{url}/{command}", timeout=DEADLINE).status == 204
 
 
-def test_the_board_is_put_elsewhere(world):
-    server = CameraServer(world)
-    server.start()
-    for command, key in (("place/2", ("placement", 2)), ("place/none", ("placement", None)),
-                         ("close/right/1", ("close", "right", 1))):  # fmt: skip
-        assert obeyed(server.url, command) and world.place.key == key
-    server.close()
-
-
 @pytest.mark.parametrize(
     ("command", "match"),
     [("dance", "404.*there are left.mjpg, right.mjpg, place/NUMBER"), ("place/9", "400.*no placement 9"),
@@ -184,39 +164,6 @@ def test_the_board_is_put_elsewhere(world):
 def test_what_cannot_be_is_refused(rig, command, match):
     with pytest.raises(urllib.error.HTTPError, match=match):
         obeyed(rig.camera_server.url, command)
-
-
-def test_the_devices_share_one_world(rig):
-    """The head moves by Pelco-D, and the scans that leave the other port are of where it then is."""
-    rig.world.put(1)
-    head, port = serial.Serial(rig.pan_tilt.path, 2400), serial.Serial(rig.lrf.path, 9600, timeout=0.2)
-    head.write(bytes.fromhex("FF 01 00 4D 01 F4 43"))  # 5 deg down
-    until(lambda: rig.world.head.settled(rig.host.now()) and rig.pan_tilt.pitch() < -0.08, "the move")
-    before, data, end = len(rig.scans), b"", time.monotonic() + DEADLINE
-    while not len(split_stream(data).offset) and time.monotonic() < end:
-        port.write(bytes.fromhex("02 00 02 00 30 01 31 18"))
-        data += port.read(740) + port.read(740) + port.read(740) + port.read(740) + port.read(740)
-    record = rig.scans[before]
-    assert record.telegram in data
-    assert np.degrees(record.pitch_rad) == pytest.approx(-5.0, abs=0.2)
-    instant = record.time_s - REAL.time() + REAL.now()
-    assert rig.pan_tilt.pitch(instant) == pytest.approx(record.pitch_rad[0])
-    head.close()
-    port.close()
-
-
-def test_rig_file_states_what_a_session_states(rig, tmp_path):
-    (tmp_path / "rig.json").write_text(json.dumps(rig.rig_file()))
-    stated = json.loads((tmp_path / "rig.json").read_text())
-    assert len(read_rig_file(tmp_path / "rig.json").plan.to_do()) == 4
-    parsed = parse_session({**stated, "placements": [1]})
-    assert parsed["board"].name == SETUP.rig.board.name and parsed["cameras"]["left"].width == 64
-    assert stated["devices"]["lrf"]["port"] == rig.lrf.path and stated["devices"]["lrf"]["variant"] == [100, 0.25]
-    assert stated["devices"]["head"]["pitch_limits_deg"] == [-60, 45]
-    assert stated["plan"]["placements"][1]["pitch_deg"][0] > stated["plan"]["placements"][1]["pitch_deg"][1]
-    low, high, step = stated["plan"]["pitch_deg"]
-    assert all(low <= min(p["pitch_deg"][:2]) and max(p["pitch_deg"][:2]) <= high for p in stated["plan"]["placements"])
-    assert step == 0.25 and all(camera["silence_s"] >= 60 for camera in stated["devices"]["cameras"].values())
 
 
 def test_own_placements_and_unknown_setups(tmp_path):

@@ -285,26 +285,6 @@ def test_a_configuration_that_is_not_taken_is_said(monkeypatch):
     assert device.memory.mode == 0x25
 
 
-@pytest.mark.parametrize(("command", "call"), [
-    (0x77, lambda lms: lms.configure(unit="cm")), (0x3B, lambda lms: lms.set_variant(100, 0.5)),
-])  # fmt: skip
-
-
-def test_a_lost_reply_does_not_make_a_second_write(command, call):
-    device = emulated()
-    with opened(device) as lms:
-        reply = device.reply
-
-        def swallowed(kind, *args):
-            if kind == command | 0x80:
-                device.faults.inject("silence")
-            reply(kind, *args)
-
-        device.reply = swallowed
-        assert call(lms)
-    assert commands(device).count(command) == 1
-
-
 def test_a_rate_that_does_not_come_through_is_given_up():
     device = emulated()
     through, hear = device.port.put, device.hear
@@ -321,20 +301,6 @@ def test_a_rate_that_does_not_come_through_is_given_up():
         opened(device, baudrate=500000)
     with opened(device) as lms:
         assert lms.baudrate == 38400 and len(lms.request().ranges) == 361
-
-
-def test_a_rate_that_this_end_cannot_do_changes_nothing(monkeypatch):
-    device = emulated()
-
-    def set_rate(port, rate):
-        if rate == 500000:
-            raise PortError("does not take 500000 Bd")
-        port.baudrate = rate
-
-    monkeypatch.setattr(device.host, "set_rate", set_rate)
-    with pytest.raises(PortError, match="does not take 500000 Bd"):
-        opened(device, baudrate=500000)
-    assert device.baudrate == 38400 and device.memory.mode == 0x25
 
 
 # ------------------------------------------------------------------------------------------------- times of scans
@@ -427,17 +393,6 @@ def test_four_partial_scans_make_one(indexed):
 def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
     """The last: 0 and 1 of one set and 2 and 3 of the next."""
     assert list(interlaced([0, 1, 2, 3] * 3, indexed, missing)) == made
-
-
-def test_telegrams_of_another_kind_are_no_scan():
-    one, ranges = assembler(), np.full(361, 2.0)
-    assert one.feed(encode_scan(ranges, indices=(1, 1)), 5.0) is not None
-    for raw in (
-        encode_scan(ranges), encode_scan(ranges[:181], indices=(3, 2)), encode_scan(ranges, unit="cm", indices=(3, 2)),
-        encode_scan(ranges[:181], partial=0, indices=(3, 2)),
-        encode_telegram(0xB0, b"\x05\x40\1\1", status=16), encode_telegram(0xBA, b"LMS200", status=16),
-    ):  # fmt: skip
-        assert one.feed(raw, 5.1) is None
 
 
 # ------------------------------------------------------------------------------------------------ scans of a device
@@ -579,19 +534,6 @@ def test_a_stream_comes_back_by_itself_with_the_same_settings(fault):
         assert len(reading.ranges) == 201 and record_of(device, reading) and lms.counts["reconnects"] == 1
         assert device.baudrate == 500000 and device.memory.flash_writes == 0
     assert not device.streaming
-
-
-def test_a_stream_on_a_lost_line_can_be_stopped():
-    device = emulated()
-    lms = opened(device)
-    lms.start()
-    lms.take(1)
-    device.close()
-    with pytest.raises(NoReply, match="no new scan within 1.5 s: .*(lost|come back)"):
-        lms.take(1, after=device.host.time(), timeout=1.5)
-    with pytest.raises(LineLost, match="the device may still stream"):
-        lms.stop()
-    lms.close()
 
 
 # ---------------------------------------------------------------------------------------------------- in real time

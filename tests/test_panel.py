@@ -101,13 +101,6 @@ def test_a_list_of_placements_has_an_end(connect):
         made.capture()
 
 
-def test_views_held_close_come_first(connect):
-    made = connect(intrinsics_images=2)
-    assert made.task().close == ("left", 0) and "hold the board close" in made.task().guidance
-    (light,) = made.capture()  # noise shows no board: the view is still to be taken
-    assert light.state == "bad" and made.task().close == ("left", 0)
-
-
 def test_the_last_placement_can_be_recorded_again(connected):
     with pytest.raises(RecordingError, match="at least three placements"):
         connected.calibrate()
@@ -148,13 +141,6 @@ def test_one_thing_at_a_time(connected, monkeypatch):
     go_on.set()
     thread.join(WAIT_S)
     assert connected.finished == (1,)
-
-
-def test_advice_is_asked_from_the_third_placement_on(connect):
-    made = connect(count=9)
-    lights = [made.capture() for _ in range(4)]
-    assert made.task().guidance == "put it there"
-    assert [found[-1].name for found in lights] == ["camera left"] * 2 + ["information"] * 2
 
 
 # ----------------------------------------------------------------------------------------------- the live view
@@ -213,55 +199,7 @@ def test_data_without_a_board_give_no_calibration(connected):
 # ---------------------------------------------------------------------------------------------------- pictures
 
 
-def test_a_scan_from_above_is_drawn_where_it_is():
-    bearings = np.radians([60.0, 90.0, 120.0])
-    empty, middle, right = (page.scan_picture(ranges, bearings, VIEW) for ranges in np.where(
-        [[0, 0, 0], [0, 1, 0], [1, 0, 0]], 1.5, np.nan))  # fmt: skip
-    painted = [np.argwhere((image != empty).any(axis=2)).mean(axis=0) for image in (middle, right)]
-    assert painted[0][1] == pytest.approx(199.5, abs=1.5) and painted[1][1] > 240  # bearing 60 deg is to the right
-    assert painted[0][0] < painted[1][0]  # straight ahead is up
-
-
-def test_a_sweep_grows_line_by_line():
-    bearings, ranges = np.linspace(*VIEW, 101), np.full(101, 4.0)
-    ranges[80:] = 1.0  # near at the large bearings, which are on the left
-
-    def drawn(rows):
-        return page.sweep_picture(rows, bearings, VIEW, np.radians([-10.0, 10.0]), np.radians(1.0))
-
-    empty, high, low = drawn({}), drawn({np.radians(9.0): ranges}), drawn({np.radians(-9.0): ranges})
-    rows, columns = np.nonzero((high != empty).any(axis=2))
-    assert rows.max() < 75 and columns.min() < 50 and columns.max() > 380
-    left, right = high[rows[0] + 2, 60].astype(int), high[rows[0] + 2, 350].astype(int)
-    assert left.sum() > right.sum() + 100  # near is bright
-    assert np.nonzero((low != empty).any(axis=2))[0].min() > 200
-    nothing = drawn({0.0: np.full(101, np.nan)})
-    assert (np.ptp(nothing[(nothing != empty).any(axis=2)], axis=1) == 0).all()  # grey
-
-
 # ------------------------------------------------------------------------------------------------------- words
-
-
-def test_lights_and_errors_say_their_state_in_signs_and_words():
-    found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
-    said = page.lights_html("Quality", found)
-    for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
-        assert sign in said
-    assert "→ next" in page.lights_html("", [Light("information", "warn", "put it there")])
-    assert "as soon as a placement is recorded" in page.lights_html("Quality", ())
-    assert page.error_html("failed", "") == ""
-    assert "✕" in page.error_html("a", "b") and "check the plug" in page.error_html("a", "check the plug")
-
-
-@pytest.mark.parametrize("answer, said", [("yes", "✓ can be trusted"), ("with care", "! use"), ("no", "✕ cannot be")])
-def test_a_result_says_whether_to_trust_it(answer, said):
-    sigma = np.full(3, 0.5)
-    poses = {"left": (np.array([90.0, 1.0, -2.0]), np.array([120.0, 30.0, -4.0]), sigma, sigma)}
-    sentences = ("Use this calibration with care: few placements.", "Record next: there.")
-    shown = page.result_html(collector.Result(answer, sentences, "joint", poses, None, None))
-    for text in (said, "Few placements.", "Record next", "90.00 ± 0.50", "-4.0 ± 0.5", "left"):
-        assert text in shown
-    assert "<table" not in page.result_html(collector.Result("no", sentences, "", {}, None, None))
 
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):
@@ -352,9 +290,3 @@ def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypa
     assert "does not tell its tilt" in panel.parts.notes.value
     panel.close()
     assert panel.notes not in logging.getLogger("lrfcal_lib").handlers
-
-
-def test_the_emulated_rigs_are_those_that_there_are():
-    assert sorted(collector.PRACTICE_RIGS) == sorted([practice.PRACTICE, *SETUPS])
-    with pytest.raises(ValueError, match="no set-up 'nowhere'"):
-        practice.emulated("nowhere")
