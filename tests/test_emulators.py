@@ -1,22 +1,20 @@
-"""Emulated devices in virtual time: byte-exact replies, times, and clients as other people write them."""
+"""Emulated devices in virtual time: byte-exact replies, times."""
 
 import os
 
 import numpy as np
 import pytest
 import serial
-from virtual import INDEXED, Bench, Source, VirtualHost, head, lms
+from virtual import Bench, Source, VirtualHost, head, lms
 
 from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.head import REACT_S, Head
 from lrfcal_lib.emulators.line import SerialDevice
-from lrfcal_lib.emulators.lms2xx import BAUD_COMMAND, VARIANTS
+from lrfcal_lib.emulators.lms2xx import VARIANTS
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
-    decode_scan,
     encode_telegram,
     parse_status,
-    parse_telegram,
 )
 from lrfcal_lib.simulate.rig import Platform
 
@@ -26,15 +24,11 @@ TYPE, STATUS, ERRORS, CONFIG, SCAN, RESET = (
     "02 00 01 00 3A 1E 12", "02 00 01 00 31 15 12", "02 00 01 00 32 16 12", "02 00 01 00 74 50 12",
     "02 00 02 00 30 01 31 18", "02 00 01 00 10 34 12",
 )  # fmt: skip
-STREAM, STOP, PARTIAL = "02 00 02 00 20 24 34 08", "02 00 02 00 20 25 35 08", "02 00 02 00 20 2A 3A 08"
-RATE = {rate: encode_telegram(0x20, bytes([mode])) for mode, rate in BAUD_COMMAND.items()}
+STREAM, STOP = "02 00 02 00 20 24 34 08", "02 00 02 00 20 25 35 08"
 INSTALL = "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5"
+VARIANT = {v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in VARIANTS}
 WRITE_TL = f"02 00 23 00 77 00 00 70 00 00 00 01 00 00 02 02 {ZEROS} 02 00 11 88"
 WRITE_CAP = f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02 {ZEROS} 02 00 94 8A"
-VARIANT = {v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in VARIANTS}
-MILLIMETRES = Configuration().changed(unit="mm")
-
-
 def bench(source=None, rate=None, **options):
     """A laser range finder and a program at its line."""
     return Bench(lms(source, **options), rate)
@@ -155,40 +149,6 @@ def test_a_device_that_fails_says_so(tmp_path):
         port.write(b"x")
         device.port.join(60)
         assert str(device.error) == "broken" and not os.path.lexists(device.path)
-
-
-# ---------------------------------------------------------------------------------------------- other people's clients
-
-
-CONNECT = [RATE[38400], 38400, STOP, TYPE, STATUS, CONFIG, INSTALL, encode_telegram(0x77, INDEXED.block), STOP,
-           VARIANT[100, 25], PARTIAL, "12 scans", STOP, RATE[9600], 9600, TYPE]  # fmt: skip
-CLIENTS = {  # seconds that it waits for a reply, how often it asks; what it does: requests, its rate, scans to be read
-    "sicktoolbox": (1.0, 3, CONNECT),
-    "sicktoolbox, after one that crashed in a stream": (1.0, 3, [STREAM, *CONNECT]),
-    "a client in pure Python": (1.5, 1, [RATE[38400], 38400, INSTALL, WRITE_CAP, STREAM, "3 scans", STOP]),
-    "CARMEN": (0.25, 8, [STOP, RATE[500000], 500000, STOP, CONFIG, INSTALL, encode_telegram(0x77, INDEXED.block[:32]),
-                         STOP, VARIANT[100, 25], PARTIAL, "8 scans"]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("client", CLIENTS)
-def test_clients_of_other_people(client):
-    """Every request is answered in time, with what it asked for, and scans come whole and in order."""
-    one, (wait, tries, steps) = bench(rate=9600, configuration=MILLIMETRES), CLIENTS[client]
-    for step in steps:
-        if isinstance(step, int):
-            one.rate = step
-            one.machine.sleep(0.25)
-        elif str(step).endswith("scans"):
-            found = [one.read(3.0) for _ in range(int(step.split()[0]))]
-            assert found == [record.telegram for record in one.device.scans][: len(found)]
-            assert [int(decode_scan(raw).partial[0]) for raw in found] == (
-                [-1] * 3 if len(found) == 3 else [i % 4 for i in range(len(found))])  # fmt: skip
-        else:
-            one.device.scans.clear()
-            code = parse_telegram(bytes.fromhex(step) if isinstance(step, str) else step).code | 0x80
-            answer = one.reply(step, code, wait=wait, tries=tries)
-            assert code not in (0xA0, 0xF7, 0xBB) or answer[5] == (code != 0xA0)
 
 
 # ------------------------------------------------------------------------------------------------ the head

@@ -177,24 +177,6 @@ def test_any_scan_survives_both_ways(mode, unit, partial, indices):
 # ---------------------------------------------------------------------------------------------------- streams
 
 
-def test_scans_of_different_kinds_are_sorted_out_of_a_stream():
-    rng = np.random.default_rng(4)
-    kinds = [(361, "mm", -1, None), (401, "cm", -1, None), (181, "mm", 0, None), (180, "mm", 2, (1, 2))]
-    sent = [(random_words(rng, kinds[k][0]), *kinds[k][1:]) for k in rng.integers(0, 4, 300)]
-    raws = [codec.encode_words(w, unit=u, partial=p, indices=i) for w, u, p, i in sent]
-    data = b"".join(raw + b"\x06" * rng.integers(0, 3) + A0 * (k % 5 == 0) for k, raw in enumerate(raws))
-    stream = split_stream(data)
-    assert stream.pending == len(data) and stream.skipped == len(data) - sum(map(len, raws)) - 60 * len(A0)
-    groups = codec.decode_scans(data, stream.offset, stream.length, 2)
-    assert len(groups) == 4 and sum(len(g.rows) for g in groups) == 300
-    where = np.flatnonzero(stream.code == 0xB0)
-    for group in groups:
-        for row, words, partial in zip(group.rows, group.words, group.partial, strict=True):
-            source = sent[np.searchsorted(where, row)]
-            np.testing.assert_array_equal(words, source[0])
-            assert (group.unit, partial) == source[1:3]
-
-
 def test_telegrams_are_found_between_garbage():
     rng = np.random.default_rng(5)
     raws = [encode_scan(rng.uniform(1, 8, 181)) for _ in range(50)]
@@ -220,28 +202,7 @@ def test_an_unfinished_telegram_is_kept_for_later(cut):
     assert rest.offset.tolist() == [0] and rest.pending == len(raw) and rest.skipped == 0
 
 
-def test_both_directions_are_told_apart():
-    command = encode_telegram(0x20, b"\x24")
-    data = command + A0 + command
-    assert split_stream(data).offset.tolist() == [8]
-    assert split_stream(data, replies=False).offset.tolist() == [0, 17]
-    assert len(split_stream(b"").offset) == 0 and codec.decode_scans(b"", np.array([], int), np.array([], int)) == []
-
-
 # --------------------------------------------------------------------------------------------------- replies
-
-
-def test_configuration_survives_and_says_its_mode():
-    *_, written, raw = REPLIES
-    read = codec.parse_configuration(raw)
-    assert (read.measuring_mode, read.unit, read.realtime_indices) == (4, "mm", False)
-    assert codec.encode_configuration(read) == raw and codec.parse_configuration(written).measuring_mode == 0
-    changed = read.changed(measuring_mode=6, unit="cm", realtime_indices=True)
-    again = codec.parse_configuration(codec.encode_configuration(changed))
-    assert (again.measuring_mode, again.unit, again.realtime_indices) == (6, "cm", True)
-    assert again.changed(measuring_mode=4, unit="mm", realtime_indices=False) == read
-    factory = codec.Configuration()  # of an outdoor device
-    assert (len(factory.block), factory.measuring_mode, factory.unit) == (34, 0, "cm")
 
 
 # --------------------------------------------------------------------------------------------- real recordings

@@ -133,21 +133,6 @@ def received(link, far, data):
     return [one.raw for one in out]
 
 
-def test_telegrams_come_out_of_any_bytes():
-    (far, link), raw = linked(), encode_scan(np.linspace(1, 8, 181))
-    other = encode_telegram(0xB2, status=16, address=0x85)
-    bad = raw[:100] + bytes([raw[100] ^ 4]) + raw[101:]
-    assert received(link, far, raw[50:] + b"\x06" + raw + b"\x02\x80" + bad + other + raw) == [raw, other, raw]
-    link.senders = {0x80}
-    link.send(0x31)
-    assert received(link, far, other + raw) == [raw]
-    link.send(0x31)
-    assert received(link, far, raw[:9]) == []
-    far.say(raw[9:])
-    far.host.sleep(1.0)
-    assert [one.raw for one in link.receive()] == [raw]
-
-
 @pytest.mark.parametrize(("data", "acknowledged", "declined"), [
     (b"\x06", True, False), (b"\x15", False, True), (b"\x33\x15", False, True), (b"\x15\x33", False, False),
     (encode_telegram(0x31) + b"\x06", True, False),  # an echo, which holds 15 itself

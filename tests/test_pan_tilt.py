@@ -207,17 +207,6 @@ def test_what_happens_once_is_made_up_for(opened):
     assert device.faults.counts["jump"] == 1
 
 
-def test_late_reply_is_not_taken_for_the_next(opened):
-    device, head = opened(replace(FAST, retries=0))
-    device.faults.inject("delay")  # by 0.7 s
-    with pytest.raises(NoReply):
-        head.pitch()
-    device.host.sleep(0.5)
-    device.head.go(device.host.now(), 2 * DEGREE, 1e3)
-    device.host.sleep(0.05)
-    assert head.pitch()[0] == near(2, 0.01)
-
-
 # ------------------------------------------------------------------------------------------------- timed moves
 
 
@@ -373,23 +362,6 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
 
 
 # ----------------------------------------------------------------------------------------------------- bad lines
-
-
-def test_line_that_comes_back_during_a_move(opened, caplog):
-    device, head = opened()
-    later(device, lambda: go_away(device), degrees=5)
-    assert head.move_to(40 * DEGREE) == near(40)
-    assert caplog.text.count("to the head is back") == 1
-
-
-def test_line_that_comes_back_finds_the_head_stopped(opened):
-    device, head = opened()
-    device.head.move(device.host.now(), 80 * DEGREE, 0.1)
-    device.port.unplug()
-    device.port.plug()
-    with contextlib.suppress(NoReply):
-        head.pitch()
-    assert halted(device)
 
 
 def test_line_that_stays_away(opened):

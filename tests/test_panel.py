@@ -11,20 +11,13 @@ from fake_rig import SIZE, make_rig, opened, raising, rig_data
 
 from lrfcal_lib.acquire import collector
 from lrfcal_lib.acquire import panel as page
-from lrfcal_lib.acquire.checks import Light
 from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
-from lrfcal_lib.emulators import rig as practice
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.simulate.rig import SETUPS
 
 WAIT_S = 20  # guards against hanging
-VIEW = np.radians([40.0, 140.0])
-
-
 @pytest.fixture
 def fake(monkeypatch, tmp_path):
     """Makes a rig file, to whose plan keywords go, and the fake rig that opens for it."""
@@ -92,15 +85,6 @@ def test_a_session_goes_on_and_may_be_longer_than_planned(connect, tmp_path):
     assert open_session(tmp_path / "s").placements == (1, 2, 3)
 
 
-def test_a_list_of_placements_has_an_end(connect):
-    made = connect(placements=[{"number": 4, "board": False}])
-    assert made.task().guidance.startswith("take the board away")
-    made.capture()
-    assert made.task() is None
-    with pytest.raises(RecordingError, match="plan of this rig is done"):
-        made.capture()
-
-
 def test_the_last_placement_can_be_recorded_again(connected):
     with pytest.raises(RecordingError, match="at least three placements"):
         connected.calibrate()
@@ -146,14 +130,6 @@ def test_one_thing_at_a_time(connected, monkeypatch):
 # ----------------------------------------------------------------------------------------------- the live view
 
 
-def test_a_lost_line_is_looked_for(connected):
-    connected.rig.lrf.lost = 1
-    connected.look()
-    assert connected.rig.lrf.reconnects == 1 and connected.view.trouble == ""
-    connected.rig.lrf.lost = 2
-    assert "line is lost" in connected.look().trouble
-
-
 # --------------------------------------------------------------------------------------------------- bad input
 
 
@@ -182,30 +158,10 @@ def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch
     assert not made.connected and not (tmp_path / "s").exists()
 
 
-def test_a_session_of_another_rig(connected, fake, tmp_path):
-    connected.capture()
-    with pytest.raises(SessionError, match="board.corners_m"):
-        connected.connect(fake(board=[0.5, 0]), tmp_path / "s")
-    assert not connected.connected
-
-
-def test_data_without_a_board_give_no_calibration(connected):
-    connected.capture()
-    found = connected.calibrate()
-    assert found.answer == "no" and not found.poses and found.file is None
-    assert "no image can be used" in found.sentences[0] and found.sentences[-1] == "Nothing is written."
-
-
 # ---------------------------------------------------------------------------------------------------- pictures
 
 
 # ------------------------------------------------------------------------------------------------------- words
-
-
-def test_advice_where_nothing_is_determined_yet(monkeypatch):
-    monkeypatch.setattr(collector, "prepare", lambda session: session)
-    monkeypatch.setattr(collector, "calibrate_jointly", raising(collector.DegenerateGeometry("one placement only")))
-    assert collector.advise(None) == "not determined yet: one placement only"
 
 
 # ------------------------------------------------------------------------------------------------- the buttons

@@ -70,12 +70,6 @@ def test_every_tilt_survives():
     assert pelco_d.encode_tilt(2 * math.pi + 0.5) == pelco_d.encode_tilt(0.5)
 
 
-@pytest.mark.parametrize("address", [-1, 256])
-def test_an_address_that_no_frame_carries(address):
-    with pytest.raises(ValueError, match="must be in range"):
-        encode_frame(address)
-
-
 # --------------------------------------------------------------------------------------------------- streams
 
 
@@ -121,31 +115,6 @@ def test_echo_whole_or_part_of_it(count, end):
     assert [one.raw for one in received.replies] == [PAN_45, LEVEL]
     assert received.echoed + received.skipped == count
     assert received.echoed == (count if count == 7 or end == "last" else 0)
-
-
-def test_a_piece_of_the_own_stop_is_no_reply():
-    for count in range(1, 8):
-        for piece in (STOP[:count], STOP[-count:]):
-            assert split_replies(piece, STOP, complete=True) == pelco_d.Received((), count, 0)
-    received = split_replies(STOP + b"\x01", STOP, complete=True)
-    assert (received.echoed, [one.raw for one in received.replies]) == (7, [b"\x01"])
-
-
-def test_echo_like_an_acknowledgement():
-    command = encode_extended(1, pelco_d.SET_TILT, 0x11EE)  # ends in its opcode, so that its beginning looks like one
-    assert command[6] == command[3]
-    for data, complete, found in ((command[:4], False, []), (command[:4], True, []), (command * 2, True, [])):
-        assert [one.raw for one in split_replies(data, command, complete=complete).replies] == found
-    assert split_replies(command + command[:4], command, complete=True).replies[0].raw == command[:4]
-
-
-def test_bytes_that_come_one_by_one_give_no_premature_reply():
-    for address in (1, 8, 255):
-        sent = encode_extended(address, pelco_d.QUERY_TILT)
-        data = sent + b"\xff" + encode_extended(address, pelco_d.TILT, 4500)
-        for count in range(len(data)):
-            assert not split_replies(data[:count], sent).replies
-        assert split_replies(data, sent).replies[0].value == 4500
 
 
 def test_reply_after_every_kind_of_noise():

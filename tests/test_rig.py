@@ -5,10 +5,8 @@ import json
 import math
 import operator
 import os
-import threading
 from dataclasses import replace
 from functools import partial, reduce
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import numpy as np
 import pytest
@@ -169,15 +167,6 @@ def test_sweeps_meet_their_ends_and_do_not_exceed_their_step(step, stops):
     assert (odd.direction, even.direction) == (1, -1)
 
 
-def test_listed_placements_come_as_they_are_listed():
-    listed = [{"number": 7, "pitch_deg": [4, -4, 1]}, {"number": 2, "board": False, "image_pitch_deg": [1, 2]}]
-    first, second = Plan(placements=tuple(listed)).to_do()
-    assert (first.number, first.direction, first.purpose) == (7, -1, "board")
-    assert (second.number, second.purpose) == (2, "scene")
-    np.testing.assert_allclose(np.degrees(second.image_pitch), [1, 2])
-    assert len(Plan(placements=tuple(listed)).to_do(1)) == 1
-
-
 # ------------------------------------------------------------------------------------------------- stop-and-go
 
 
@@ -191,19 +180,6 @@ def begun(rig, number=1, events=0):
 
 def events_of(rig, number=1, kind=object):
     return [event for event in begun(rig, number) if isinstance(event, kind)]
-
-
-@pytest.mark.parametrize("number", [1, 2])
-def test_stops_scans_and_images_come_in_order(number):
-    rig = make_rig(rig_data(cameras=("left", "right"), image_pitch_deg=[-1.5, 2], scans_per_stop=2))
-    events = events_of(rig, number)
-    moves, scans, images = ([e for e in events if isinstance(e, kind)] for kind in (Moved, Scanned, Photographed))
-    wanted = sorted([*range(-4, 5), -1.5], reverse=number == 2)
-    np.testing.assert_allclose([math.degrees(m.commanded) for m in moves], wanted)
-    assert [m.number for m in moves] == list(range(1, 11)) and {m.of for m in moves} == {10}
-    assert [len(e.readings) for e in scans] == [2] * 9 and {e.purpose for e in images} == {"board"}
-    assert [(e.camera, round(math.degrees(e.pitch), 6)) for e in images] == [
-        (camera, pitch) for pitch in sorted([-1.5, 2], reverse=number == 2) for camera in ("left", "right")]
 
 
 def test_what_is_recorded_at_a_stop_is_later_than_its_rest():
@@ -233,22 +209,6 @@ def test_what_is_older_than_the_rest_is_refused(interlaced, monkeypatch):
         events_of(rig)
 
 
-def test_scans_that_began_before_the_rest_are_asked_for_again():
-    rig = make_rig()
-    scan, begun = rig.lrf._scan, []
-
-    def sometimes_early(instant):
-        begun.append(instant)
-        return scan(instant - 3.0 * (len(begun) % 3 == 1))
-
-    rig.lrf._scan = sometimes_early
-    settled = None
-    for event in events_of(rig):
-        settled = event.time_s if isinstance(event, Moved) else settled
-        assert not isinstance(event, Scanned) or event.readings[0].time_s > settled
-    assert len(begun) > 9
-
-
 def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
     rig = make_rig()
     rig.lrf.lost = 1
@@ -257,12 +217,6 @@ def test_a_line_that_was_lost_is_mended_once_a_stop(caplog):
     rig.lrf.lost = 2
     with pytest.raises(DeviceError, match="the line is lost"):
         events_of(rig)
-
-
-def test_interlaced_scans_are_streamed():
-    rig = make_rig(changed("devices.lrf.interlaced", True, scans_per_stop=2))
-    assert [len(e.readings) for e in events_of(rig, kind=Scanned)] == [2] * 9
-    assert not rig.lrf.streaming
 
 
 def scans(moving, noise, step=0.0):
@@ -314,13 +268,6 @@ def test_the_scans_stop_also_where_the_head_cannot(caplog, monkeypatch):
     events.close()
     assert not rig.lrf.streaming
     assert "the head could not be stopped (the line is lost): cut its power" in caplog.text
-
-
-def test_the_board_held_close_is_seen_from_pitch_zero():
-    rig = make_rig()
-    rig.head.at = 0.3
-    (event,) = rig.acquire_close("left")
-    assert event.purpose == "intrinsics" and event.placement == -1 and rig.head.at == event.pitch == 0.0
 
 
 # --------------------------------------------------------------------------------------------------- continuous
@@ -412,25 +359,3 @@ def test_what_the_device_says_about_itself_counts():
         assert rig.lrf_info.max_range == pytest.approx(longest)
     rig = make_rig(changed("devices.lrf.interlaced", True))
     assert math.degrees(rig.lrf_info.bearing_step) == pytest.approx(0.25)
-
-
-class Control(BaseHTTPRequestHandler):
-    """An emulated rig that has eight placements."""
-
-    def do_GET(self):
-        self.send_response(204 if int(self.path[-1]) < 9 else 400, f"no placement {self.path[-1]}")
-        self.end_headers()
-
-
-def test_the_board_of_an_emulated_rig_is_moved():
-    rig = make_rig()
-    assert rig.move_board(1) is False and rig.hold_close("left", 0) is False
-    with HTTPServer(("127.0.0.1", 0), Control) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        rig = make_rig(changed("devices.control", f"http://127.0.0.1:{server.server_port}"))
-        assert rig.move_board(3) is True
-        with pytest.raises(DeviceError, match="control http:.*: no placement 9"):
-            rig.move_board(9)
-        server.shutdown()
-    with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
-        rig.move_board(3)
