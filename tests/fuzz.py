@@ -20,6 +20,7 @@ import tempfile
 import traceback
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -27,20 +28,21 @@ import numpy as np
 from fake_rig import rig_data
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file
+from lrfcal_lib.drivers.port import PortError, open_port
+from lrfcal_lib.drivers.rig_file import HeadSettings, RigFileError, read_rig_file
 from lrfcal_lib.evaluate.export import file_hashes
 from lrfcal_lib.evaluate.tables import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
-from lrfcal_lib.session.lms2xx_codec import crc16, encode_scan
+from lrfcal_lib.session.lms2xx_codec import encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
 from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
-READ = (sys.prefix, sys.base_prefix, LIBRARY, __file__, "/proc/self")  # by Python itself
+READ = (sys.prefix, sys.base_prefix, LIBRARY, __file__, "/proc/self", "/proc/cpuinfo")  # by Python itself
 BATCH, SURVEYED = 2000, 0.02  # cases of a process; share of the cases in which the images are looked at, which is slow
 MODEL = CameraModel(160, 120, 150.0, 150.0, 79.5, 59.5, np.zeros(5))
 LRF = LrfInfo("made up", (0.0, np.pi), np.radians(1.0), 0.005)
@@ -93,7 +95,10 @@ def make_sessions(folder):
         writer.begin_placement(2)
         record(writer, 2)
     (folder / "rig").mkdir()
-    (folder / "rig" / "rig.json").write_text(json.dumps(rig_data()))
+    rig = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
+    rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
+    rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "fps": 10, "silence_s": 10}
+    (folder / "rig" / "rig.json").write_text(json.dumps(rig))
     (folder / "outside").mkdir()
     for name in ("secret", "secret.png"):
         (folder / "outside" / name).write_bytes(cv2.imencode(".png", picture(0))[1].tobytes())
@@ -134,7 +139,7 @@ def damage(rng, path):
     file = any_of(rng, *files)
     if file.suffix in (".png", ".jpg") and rng.random() < 0.6:  # small tables and statements matter as much
         file = any_of(rng, *files)
-    kind = {".json": text, ".csv": any_of(rng, text, rows), ".npz": arrays, ".bin": telegrams}.get(file.suffix, pixels)
+    kind = {".json": text, ".csv": any_of(rng, text, rows), ".npz": arrays, ".bin": raw}.get(file.suffix, pixels)
     try:
         any_of(rng, kind, kind, kind, kind, raw, other)(rng, file)
     except Exception:
@@ -202,19 +207,6 @@ def arrays(rng, file):
             archive.writestr(key, data)
 
 
-def telegrams(rng, file):
-    """Damaged telegrams with a sound checksum, as index.csv lists them."""
-    data, index = bytearray(file.read_bytes()), file.parent / "index.csv"
-    assert index.is_file() and not index.is_symlink() and index.stat().st_size < 1_000_000
-    offset, length = (int(v) for v in any_of(rng, *index.read_text().splitlines()[1:]).split(",")[1:3])
-    for _ in range(rng.integers(1, 4)):
-        at = offset + 4 + min(int(rng.integers(length - 6)), any_of(rng, 3, length))
-        data[at] = any_of(rng, 0, 255, 0xB0, 0xB1, 0xF4, 0x77, rng.integers(256))
-    end = offset + length
-    data[end - 2 : end] = crc16(bytes(data[offset : end - 2])).to_bytes(2, "little")
-    file.write_bytes(data)
-
-
 def pixels_of(png, size, kind=(8, 2, 0, 0, 0)):
     """A PNG image that states another size."""
     body = b"IHDR" + struct.pack(">II5B", *size, *kind)
@@ -266,10 +258,21 @@ def other(rng, file):
 def use(rng, path):
     """Everything that reads a session, and some that writes; the errors that came out."""
     if (path / "rig.json").exists():
-        return [_caught(read_rig_file, path / "rig.json")]  # what it names belongs to who wrote it
+        return [_caught(_open_rig, path / "rig.json")]  # what it names belongs to who wrote it
     read = any_of(rng, validate, _survey if rng.random() < SURVEYED else read_all)
     writing = [any_of(rng, _go_on, _go_on, finish)] * (rng.random() < 0.3)
     return [_caught(work, path) for work in (read, *writing)]
+
+
+def _open_rig(file):
+    """What is stated can be asked of the drivers, and no time is endless."""
+    devices = read_rig_file(file).devices
+    for one in (devices.lrf, devices.head, *devices.cameras.values()):
+        times = [value for name, value in vars(one).items() if name.endswith("_s") and value is not None]
+        assert max(times, default=0) <= 3600
+    for one in (devices.lrf, devices.head):
+        with suppress(PortError):
+            open_port(f"/nowhere{one.port}", devices.head.baudrate, timeout=0.1)
 
 
 def _survey(path):

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
 from concurrent.futures import Future
 from dataclasses import replace
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import serial
 from fake_rig import make_rig, rig_data
+from shared import until
 
 from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.emulators.head import Head
@@ -44,13 +44,6 @@ def world(placements):
 def small(placements):
     """A world whose images are small."""
     return EmulatedWorld(SMALL, placements=placements)
-
-
-def until(condition, what):
-    end = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < end, f"{what} did not happen"
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])
@@ -92,7 +85,7 @@ def test_cameras_open_as_any_stream_and_show_the_place(rig):
     ok, first = video.read()
     assert ok and first.shape == (48, 64, 3)
     rig.world.put(None)
-    until(lambda: np.abs(video.read()[1].astype(int) - first).mean() > 3, "an image without the board")
+    until(lambda: np.abs(video.read()[1].astype(int) - first).mean() > 3)
     video.release()
 
 
@@ -122,10 +115,10 @@ def test_an_image_begun_before_a_move_is_not_sent(small):
     """The drawing process is replaced by one that ends when it is told."""
     server, asked = CameraServer(small), []
     server._pool.submit = lambda *_: asked.append(Future()) or asked[-1]
-    until(lambda: server.image("left", timeout=0.05) == (None, None) and asked, "the wish for an image")
+    until(lambda: server.image("left", timeout=0.05) == (None, None) and asked)
     small.head.go(small.host.now(), 0.05, 2.0)
     asked[0].set_result(b"old")
-    until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1, "the wish for a new one")
+    until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1)
     asked[-1].set_result(b"new")
     assert server.image("left", timeout=DEADLINE)[1] == b"new"
     server.close()
@@ -148,7 +141,7 @@ def test_the_command_line_cleans_up(tmp_path):
     file = tmp_path / "rig.json"
     call = [sys.executable, "-m", "lrfcal_lib", "emulate", "--rig-file", str(file)]
     run = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
-    until(lambda: file.exists() or run.poll() is not None, "the rig file")
+    until(lambda: file.exists() or run.poll() is not None)
     said = "".join(iter(run.stdout.readline, f"  rig file {file}   python -m lrfcal_lib record --help\n"))
     assert "place/NUMBER puts it at 1, 2" in said
     devices = json.loads(file.read_text())["devices"]

@@ -171,8 +171,11 @@ def test_check_finds_what_two_writers_left(folder, monkeypatch):
     assert re.search(r"index.csv line 8: t_s runs back from 5.5 to 5: two writers at once\? Record the", found)
 
 
-def test_check_finds_an_edge_that_is_picked_twice(folder):
+def test_check_finds_an_edge_that_is_picked_twice_and_times_that_are_none(folder):
     with (folder / "scans" / "edges.csv").open("a") as table:
         table.write("left,images/left/0001.png,ab,1,2,20,9\n")
     told = "\n".join(validate(folder / "scans"))
     assert "edges.csv line 4: left, images/left/0001.png, ab stands in line 2" in told
+    replaced("images.csv", "\n2", "\nnoon")(folder / "telegrams")  # of the placement that was not finished
+    told = "\n".join(validate(folder / "telegrams"))
+    assert re.search("images.csv line 3: t_s is 'noon.*': a number of seconds is needed", told)

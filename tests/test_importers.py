@@ -165,13 +165,6 @@ def test_command_line(source, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [[], ["fly"], ["check"], ["check", "a", "--fast"], ["import", "lasersetero", "a"]])
-def test_wrong_commands(words, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(words)
-    assert "usage:" in capsys.readouterr().err
-
-
 # ---------------------------------------------------------------------------------------------- the real recording
 
 

@@ -4,7 +4,7 @@ import ast
 import re
 
 import pytest
-from notebook_runs import NOTEBOOKS, code_cells, read, solutions
+from notebook_runs import NOTEBOOKS, read, solutions
 
 LECTURE = [path for path in NOTEBOOKS if path.stem[:2] in ("00", "01", "02", "03", "04", "05")]
 WITH_EXERCISES = [path for path in NOTEBOOKS if path.stem[:2] in ("02", "03", "04", "05", "06")]
@@ -27,20 +27,6 @@ def test_equations_stand_before_code_that_checks_them(path):
     for first in numbered:
         following = [cell.source for cell in cells[first + 1 :] if cell.cell_type == "code"][:12]
         assert any("assert np." in source for source in following), cells[first].source.splitlines()[0]
-
-
-COUNTERPARTS = {
-    "00": ("Fig. 2", "Fig. 3"), "02": ("Fig. 5 (b)",), "03": ("Fig. 4 (a) to (d)",), "04": ("Fig. 1", "Fig. 6"),
-    "05": ("Fig. 7",), "06": ("Fig. 4 (e)", "Fig. 8"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("stem", COUNTERPARTS)
-def test_figures_of_the_paper_have_counterparts(stem):
-    (path,) = (path for path in NOTEBOOKS if path.stem.startswith(stem))
-    source = "\n".join(cell.source for cell in code_cells(read(path)))
-    captions = re.findall(r'"(Fig\. \d[ ()a-z]*?) of the paper: ', source)
-    assert sorted(captions) == sorted(COUNTERPARTS[stem])
 
 
 @pytest.mark.parametrize("path", WITH_EXERCISES, ids=lambda p: p.stem)

@@ -14,7 +14,7 @@ from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, interval_s, transfer_s
+from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, transfer_s
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
@@ -291,17 +291,6 @@ def test_a_rate_that_does_not_come_through_is_given_up():
 # ------------------------------------------------------------------------------------------------- times of scans
 
 
-def test_the_transfer_is_that_of_the_manuals_table():
-    """Table 10-17: scan periods per telegram of 812 (0.25/100), 732 (0.5/180), 372 (1/180) bytes."""
-    table = {9600: (16, 29, 30), 19200: (8, 15, 15), 38400: (4, 8, 8), 500000: (1, 1, 1)}
-    for rate, periods in table.items():
-        for size, turns, n in zip((812, 732, 372), (4, 2, 1), periods, strict=True):
-            assert interval_s(size, rate, turns * TURN_S) == pytest.approx(n * turns * TURN_S)
-    assert transfer_s(732, 38400) == pytest.approx(7320 / 38400)
-    assert transfer_s(372, 500000) == pytest.approx(372 * 20e-6)
-    assert transfer_s(732, 500000) == pytest.approx(TURN_S + (732 - 508) * 20e-6)
-
-
 def test_late_arrivals_do_not_shift_scans():
     rng, clock = np.random.default_rng(1), ScanClock()
     turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
@@ -398,40 +387,19 @@ def test_scans_on_request_are_those_of_the_device(rate, variant):
             np.testing.assert_array_equal(np.rint(reading.ranges[valid] * 1000), truth.words[valid])
 
 
-def test_streamed_interlaced_scans_carry_the_instants_of_the_mirror():
-    """Whole ones: test_lms2xx_streaming."""
-    device = emulated(baudrate=500000)
-    with opened(device) as lms:
-        lms.start(interlaced=True)
-        readings = lms.take(20)
-        lms.stop()
-        assert lms.variant == (100, 0.25)
-    off = [r.time_s - record_of(device, r)[0].time_s for r in readings]
-    assert off == pytest.approx([0] * 20, abs=5e-4) and all(len(r.ranges) == 721 for r in readings)
-    assert np.all(np.diff([r.time_s for r in readings]) > 0)
-
-
 def test_scans_of_a_stream_are_handed_out_from_an_instant_on():
     device = emulated(baudrate=500000)
     with opened(device) as lms:
-        host = device.host
         lms.start()
         (first,) = lms.take(1)
         (later,) = lms.take(1, after=first.time_s + 0.3)
         assert 0.3 < later.time_s - first.time_s < 0.35
         with pytest.raises(NoReply, match="no new scan within 0.2 s"):
             lms.take(1, after=later.time_s + 100, timeout=0.2)
-        run = lms.take(10)
-        host.sleep(0.3)
-        run += lms.take(10, after=run[-1].time_s)
-        numbers = [record_of(device, r)[0].number for r in run]
-        assert np.all(np.diff(numbers) == 1)
         device.faults.inject("skip", seconds=2.0)
-        host.sleep(0.9)
+        device.host.sleep(0.9)
         with pytest.raises(NoReply, match="no new scan within 0.3 s"):
             lms.take(1, timeout=0.3)
-        asked = host.time()
-        assert lms.take(1, after=asked, timeout=10)[0].time_s > asked
 
 
 def test_calls_at_the_wrong_time_say_so():
@@ -484,24 +452,17 @@ def test_a_silent_device_is_given_up_in_time(call, limit_s):
         assert device.host.now() - begin < limit_s
 
 
-def test_the_line_comes_back_with_the_same_settings():
-    device = emulated(configuration=Configuration().changed(unit="mm"))
+def test_a_line_that_does_not_come_back():
+    device = emulated()
     with opened(device) as lms:
-        lms.set_variant(100, 1)
-        lms.configure(realtime_indices=True)
-        writes = device.memory.flash_writes
-        device.faults.inject("unplug", seconds=0.3)
-        with pytest.raises(LineLost):
-            lms.request()
-        device.memory.variant = (180, 50)  # as after a restart
-        lms.reconnect()
-        assert len(lms.request().ranges) == 101 and device.memory.flash_writes == writes
-        assert lms.counts["reconnects"] == 1
+        lms.start()
         device.close()
-        begin = device.host.now()
+        with pytest.raises(NoReply, match="no new scan within 1.5 s: .*(lost|come back)"):
+            lms.take(1, after=device.host.time(), timeout=1.5)
+        with pytest.raises(LineLost, match="the device may still stream"):
+            lms.stop()
         with pytest.raises(LineLost, match="did not come back: there is no port"):
             lms.reconnect(deadline=0.5)
-        assert device.host.now() - begin < 0.6
 
 
 @pytest.mark.parametrize("fault", ["unplug", "reboot", "rate"])

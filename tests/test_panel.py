@@ -3,11 +3,10 @@
 import json
 import logging
 import threading
-import time
 
-import numpy as np
 import pytest
-from fake_rig import SIZE, make_rig, opened, raising, rig_data
+from fake_rig import make_rig, opened, raising, rig_data
+from shared import until
 
 from lrfcal_lib.acquire import collector
 from lrfcal_lib.acquire import panel as page
@@ -64,25 +63,12 @@ def in_background(call):
 
 def test_placements_are_recorded_one_by_one(connected, tmp_path):
     shares = []
-    assert connected.task().title == "Placement 1 of 3" and connected.task().guidance.startswith("put the board")
     lights = connected.capture(lambda share, text: shares.append(share))
     assert connected.finished == (1,) and connected.task().title == "Placement 2 of 3"
     assert lights[0].name == "scan" and connected.lights[1] == lights
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
-    assert sorted(np.degrees(list(connected.view.rows)).round()) == list(range(-4, 5))
-    assert connected.view.frames["left"].image.shape == (SIZE[1], SIZE[0], 3)
     connected.close()
     assert validate(tmp_path / "s") == [] and open_session(tmp_path / "s").placements == (1,)
-    assert "unfinished" not in json.loads((tmp_path / "s" / "session.json").read_text())
-
-
-def test_a_session_goes_on_and_may_be_longer_than_planned(connect, tmp_path):
-    for number in (1, 2, 3):
-        made = connect(count=2)
-        assert made.finished == tuple(range(1, number))
-        made.capture()
-    made.close()
-    assert open_session(tmp_path / "s").placements == (1, 2, 3)
 
 
 def test_the_last_placement_can_be_recorded_again(connected):
@@ -180,29 +166,22 @@ def pressed(panel, name):
     return panel.parts
 
 
-def wait_until(holds):
-    end = time.monotonic() + WAIT_S
-    while not holds():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.05)
-
-
 def test_buttons_do_it_all(panel):
     parts = panel.parts
     assert parts.capture.disabled and parts.close.disabled and not parts.connect.disabled and not parts.stop.disabled
     pressed(panel, "connect")
     assert "ready" in parts.state.value and not parts.capture.disabled and parts.calibrate.disabled
-    wait_until(lambda: all(picture.image.value for picture in parts.pictures.values()))
+    until(lambda: all(picture.image.value for picture in parts.pictures.values()))
     assert set(parts.pictures) == {"scan", "sweep", "left"}
     before = parts.pictures["sweep"].image.value
     pressed(panel, "capture")
     assert "scan" in parts.lights.value and "recorded: 1" in parts.task.value and not parts.calibrate.disabled
-    wait_until(lambda: parts.pictures["sweep"].image.value != before)
+    until(lambda: parts.pictures["sweep"].image.value != before)
     pressed(panel, "again")
     assert "nothing is recorded yet" in parts.task.value
     parts.slider.value = 3.0
     pressed(panel, "go")
-    wait_until(lambda: "+3.00°" in parts.pitch.value)
+    until(lambda: "+3.00°" in parts.pitch.value)
     pressed(panel, "close")
     assert "not connected" in parts.state.value and parts.capture.disabled and parts.error.value == ""
 
@@ -228,12 +207,12 @@ def test_a_lost_camera_is_said_until_it_is_back(panel):
     panel.connect()
     camera, parts = panel.collector.rig.cameras["left"], panel.parts
     newest, camera.newest = camera.newest, raising(LineLost("camera left is lost: its plug"))
-    wait_until(lambda: "camera left is lost: its plug" in parts.error.value)
+    until(lambda: "camera left is lost: its plug" in parts.error.value)
     assert "left" not in panel.collector.view.frames
     with pytest.raises(LineLost, match="its plug"):
         panel.collector.capture()
     camera.newest = newest
-    wait_until(lambda: parts.error.value == "" and "left" in panel.collector.view.frames)
+    until(lambda: parts.error.value == "" and "left" in panel.collector.view.frames)
 
 
 def test_what_nobody_expects_and_what_drivers_report_is_said_too(panel, monkeypatch, caplog):

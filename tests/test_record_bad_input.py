@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared import until
 
 from lrfcal_lib.emulators.rig import EmulatedRig, practice_setup, quick_file
 from lrfcal_lib.emulators.world import scaled
@@ -66,10 +67,8 @@ class Program:
 
 
 def test_ctrl_c_while_the_head_moves_and_going_on(tmp_path, rig, stated):
-    program, limit = Program(tmp_path, stated, rig), time.monotonic() + DEADLINE
-    while not program.moves() and program.run.poll() is None:
-        assert time.monotonic() < limit
-        time.sleep(0.005)
+    program = Program(tmp_path, stated, rig)
+    until(lambda: program.moves() or program.run.poll() is not None)
     program.run.send_signal(signal.SIGINT)
     code, out, err = program.end()
     assert code == 130 and "stopped by Ctrl-C" in err or "are safe; 'python" in out

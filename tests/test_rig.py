@@ -3,7 +3,6 @@
 import contextlib
 import json
 import math
-import operator
 import os
 from dataclasses import replace
 from functools import partial, reduce
@@ -13,10 +12,9 @@ import pytest
 from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, picture, raising, rig_data, telegram
 
 from lrfcal_lib.drivers import rig as rig_module
-from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError, open_port
+from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked, unchanged
-from lrfcal_lib.drivers.rig_file import HeadSettings, Plan, RigFileError, read_rig_file, rig_of
-from lrfcal_lib.drivers.video import find_source
+from lrfcal_lib.drivers.rig_file import Plan, RigFileError, read_rig_file, rig_of
 from lrfcal_lib.session.lms2xx_codec import Configuration
 
 # ------------------------------------------------------------------------------------------------------ rig file
@@ -84,52 +82,6 @@ WRONG = {
 def test_a_wrong_rig_file_is_refused(tmp_path, message):
     with pytest.raises(RigFileError, match=rf"rig\.json: .*{message}"):
         read(tmp_path, changed(*WRONG[message]))
-
-
-VALUES = [None, True, -1, 0, 1.5, 99, 10**400, 1e9, 1e-320, 1e308, math.nan, math.inf, "", "x", "a\0b", "\ud800", [],
-          [1], ["x"], [1, 2], [1e-320] * 3, [10**400] * 3, {}, {"x": 1}, [[[]]] * 3]  # fmt: skip
-
-
-def paths(data, way=()):
-    """Where all values of a rig file stand."""
-    inner = dict(enumerate(data)) if isinstance(data, list) else data if isinstance(data, dict) else {}
-    return [place for key in inner for place in ((*way, key), *paths(inner[key], (*way, key)))]
-
-
-def every_key():
-    """A rig file that states all that can be stated about devices and plan."""
-    data = rig_data(placements=[{"number": 1, "pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "board": True}])
-    data["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
-    data["devices"]["lrf"] |= {"baudrate": 9600, "address": 1, "password": "SICK_LMS", "measuring_mode": 0,
-                               "realtime_indices": True, "interlaced": False}  # fmt: skip
-    data["devices"]["cameras"]["left"] |= {"size": list(SIZE), "exposure": 0.01, "fps": 10, "silence_s": 10}
-    data["devices"]["control"] = "/tmp/control"
-    data["plan"] |= {"mode": "stop-and-go", "scans_per_stop": 1, "sweep_speed": 32, "intrinsics_images": 0}
-    return data
-
-
-@pytest.mark.parametrize("way", paths(every_key()), ids=lambda way: ".".join(map(str, way)))
-def test_any_value_anywhere_is_taken_or_refused_in_words(tmp_path, way):
-    """What is taken can be asked of the drivers: their calls raise nothing but DeviceError, and no time is endless."""
-    for value in VALUES:
-        data = every_key()
-        reduce(operator.getitem, way[:-1], data)[way[-1]] = value
-        try:
-            stated = read(tmp_path, data)
-        except RigFileError as error:
-            assert "rig.json: " in str(error)
-            if way[0] in ("devices", "plan"):
-                assert way[0] in str(error) or "head." in str(error), (value, error)
-            continue
-        head, cameras = stated.devices.head, stated.devices.cameras.values()
-        waits = [v for one in (head, *cameras) for name, v in vars(one).items() if name.endswith("_s")]
-        assert max(v or 0 for v in waits) <= 3600
-        for device in (stated.devices.lrf, head):
-            with pytest.raises(PortError):
-                open_port(f"/nowhere{device.port}", head.baudrate, timeout=0.1)
-        bytes(7) * head.sends, range(head.retries)
-        for one in cameras:
-            find_source(one.source, one.silence_s or 1.0)
 
 
 NO_JSON = (b"[" * 100_000, b'{"x": ' * 100_000, b"\xff", b'{"x": ' + b"9" * 5000 + b"}", b"", b"{")
@@ -297,16 +249,8 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
     monkeypatch.setattr(rig_module, "GAP_S", 0.05)
     monkeypatch.setattr(rig_module, "BATCH_S", 0.02)
     rig = make_rig(rig_data(mode="continuous"))
-    take = rig.lrf.take
-
-    def once(*args, **options):
-        found = take(*args, **options)
-        rig.lrf.silent = True
-        return found
-
-    rig.lrf.take = once
-    rig.head.speed = 1e-6
-    rig.head.move_to = lambda pitch: setattr(rig.head, "at", pitch) or pitch
+    rig.lrf.wait = lambda: setattr(rig.lrf, "silent", len(rig.lrf.readings) > 1)
+    rig.head.speed = 1e-3
     with pytest.raises(NoReply, match=r"no scan for 0\.05 s of the sweep"):
         events_of(rig)
     assert rig.head.stops == 1

@@ -182,6 +182,7 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
     ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
+    ("board.edges", ["a\x1b]0;title\x07", "ab", "ca"], "board.edges.0 is "),
     ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
     ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
     ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
