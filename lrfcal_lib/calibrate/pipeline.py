@@ -144,7 +144,7 @@ class Calibration:
 
 
 @cached
-def calibrate(session, methods=tuple(METHODS), joint=True):
+def calibrate(session, methods=tuple(METHODS)):
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
@@ -152,16 +152,15 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     session : Session
     methods : sequence of str
         Of :data:`lrfcal_lib.solvers.METHODS`.
-    joint : bool
 
     Returns
     -------
     Calibration
     """
     prepared = prepare(session)
-    together = [partial(joint_or_words, prepared, all_views(prepared))] if joint and prepared.views else []
-    *together, found = spread(lambda stage: stage(), [*together, partial(_by_themselves, prepared, methods)])
-    return with_joint(found, *together) if together else found
+    stages = [partial(joint_or_words, prepared, all_views(prepared))] if prepared.views else []
+    *joint, found = spread(lambda stage: stage(), [*stages, partial(_by_themselves, prepared, methods)])
+    return with_joint(found, *joint) if joint else found
 
 
 def _by_themselves(prepared, methods):
@@ -350,8 +349,8 @@ def with_joint(calibration, joint):
     platform = calibration.platform
     if isinstance(joint, str):
         return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
-    cameras, made = joint.observations.cameras, {}
-    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
+    cameras = joint.observations.cameras
+    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance
