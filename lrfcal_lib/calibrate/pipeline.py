@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
-from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded
+from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -112,13 +112,6 @@ class JointCalibration:
         """
         solution = solution or self.solution
         return observe(self.prepared, camera, "half_step", solution.T_head_lrf, solution.correct, **options)
-
-    def edge_model(self, placement=None):
-        """What the estimate knows about how the sensor sees edges, an EdgeModel: from all placements but one."""
-        solution = self.without.get(placement, self.solution)
-        sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
-        spread = solution.noise["side_sigma"] if self.settings["sides"] else 0.0
-        return EdgeModel(solution.sensor, sigma, spread, solution.T_head_lrf, solution.correct)
 
 
 @dataclass(frozen=True)
