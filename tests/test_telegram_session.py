@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.session.lms2xx_codec import Configuration, encode_configuration, encode_scan, encode_telegram
+from lrfcal_lib.session.lms2xx_codec import (
+    Configuration,
+    encode_configuration,
+    encode_scan,
+    encode_telegram,
+    encode_values,
+    encode_words,
+)
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import LrfInfo, SessionError
 from lrfcal_lib.session.write import SessionWriter
@@ -35,8 +42,8 @@ def record(path, *batches, lrf=LRF, first=None):
     return path
 
 
-def scans(ranges, mode=6, **options):
-    return [encode_scan(line, mode=mode, **options) for line in ranges]
+def scans(ranges, mode=6, flags=0, **options):
+    return [encode_words(encode_values(line, mode=mode) | np.uint16(flags << 13), **options) for line in ranges]
 
 
 @pytest.fixture
