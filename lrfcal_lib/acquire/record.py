@@ -44,8 +44,6 @@ class Recording(Closed):
         Folder of the session.
     resume : bool
         Go on with the recording in `path` if there is one: its finished placements stay.
-    count : int, optional
-        Record only so many placements of the plan.
 
     Raises
     ------
@@ -68,8 +66,8 @@ class Recording(Closed):
 
     finished = property(lambda self: self.writer.finished, doc="Numbers of the placements that are complete and safe.")
 
-    def __init__(self, rig, path, *, resume=False, count=None):
-        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(count), rig.stated
+    def __init__(self, rig, path, *, resume=False):
+        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(), rig.stated
         reference = {
             "recording": HOW[stated.plan.mode],
             "pitch": "told by the head" if rig.head.has_feedback else "dead reckoning: the head does not tell it",
@@ -103,8 +101,6 @@ class Recording(Closed):
         When the generator ends the placement is finished. When it is closed or raises (DeviceError, or RecordingError
         if the disk is full or gone), the head is stopped and the placement is not part of the session.
         """
-        if placement.number in self.writer.data["unfinished"]:  # an earlier run of it was broken off
-            self.drop(placement.number)
         with self._safely():
             self.writer.begin_placement(placement.number)
         with contextlib.closing(self.rig.acquire(placement)) as events:
@@ -217,19 +213,19 @@ def show(light, name=None):
     print(f"{MARKS[light.state]}  {name or light.name}: {light.text}", flush=True)
 
 
-def record_session(rig, path, *, resume=False, count=None):
+def record_session(rig, path, *, resume=False):
     """Record a session with an open rig, from the first placement that is missing to the last of the plan.
 
     Parameters
     ----------
-    rig, path, resume, count
+    rig, path, resume
         As of :class:`Recording`, which is returned: finished, with all placements or those that the user wanted.
 
     Raises
     ------
     DeviceError, SessionError, RecordingError
     """
-    with Recording(rig, path, resume=resume, count=count) as recording:
+    with Recording(rig, path, resume=resume) as recording:
         if recording.finished:
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
@@ -279,16 +275,16 @@ def _placements(recording):
             show(light)
 
 
-def main(rig_file, path, *, resume=False, count=None, mode=None):
-    """Record from the command line; options as of :func:`record_session`, `mode` instead of the plan's.
+def main(rig_file, path, *, resume=False):
+    """Record from the command line; options as of :func:`record_session`.
 
     0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal. The head
     is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
-        with Rig.open(read_rig_file(rig_file).with_mode(mode)) as rig:
-            recording = record_session(rig, path, resume=resume, count=count)
+        with Rig.open(read_rig_file(rig_file)) as rig:
+            recording = record_session(rig, path, resume=resume)
     except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
         text, code = f"error: {error}", FAILED
         if isinstance(error, KeyboardInterrupt):

@@ -15,7 +15,7 @@ from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import RigFileError
 from lrfcal_lib.drivers.video import Camera
-from lrfcal_lib.session.lms2xx_codec import METRES, encode_configuration, mode_of
+from lrfcal_lib.session.lms2xx_codec import METRES, MODES, encode_configuration
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Rig(Closed):
         """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
         stated, lrf = self.stated.lrf, self.lrf
         view, step = (180, 0.25) if self.stated.devices.lrf.interlaced else lrf.variant
-        unit, largest = METRES[lrf.configuration.unit], mode_of(lrf.configuration.measuring_mode).largest
+        unit, largest = METRES[lrf.configuration.unit], MODES[lrf.configuration.measuring_mode].largest
         seen = {"field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
                 "bearing_step": math.radians(step), "range_resolution": unit, "max_range": largest * unit}  # fmt: skip
         return replace(stated, model=stated.model or lrf.type, **seen)

@@ -4,7 +4,6 @@ import contextlib
 import glob
 import logging
 import os
-import re
 import select
 import threading
 from dataclasses import dataclass
@@ -19,9 +18,8 @@ from urllib3.exceptions import HTTPError
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
 
 LOG = logging.getLogger(__name__)
-END = b"\xff\xd9"  # of a JPEG file; inside of its image data it cannot occur
+BEGIN, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG file; inside of its image data they cannot occur
 CHUNK, LONGEST = 1 << 16, 1 << 26
-LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
 EXPOSURE_UNIT_S = 1e-4  # of V4L2
 MANUAL = 1  # exposure mode of V4L2
 WIDTH, HEIGHT, FPS = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS
@@ -30,39 +28,18 @@ AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
 
 
-class MjpegStream:
-    """Reads like cv2.VideoCapture; `timeout` in s, to connect and between any two bytes.
+class Images:
+    """Encoded images that are read like cv2.VideoCapture; ``take()`` gives the next one, None at the end."""
 
-    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was
-    waited for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names none.
-    """
-
-    def __init__(self, url, timeout):
-        self._buffer, self._image, self._held, self.waited = b"", None, False, False
-        session = requests.Session()
-        session.trust_env = False  # no proxy: cameras are near
-        try:
-            self._answer = session.get(url, stream=True, timeout=timeout).raw
-        except ValueError as error:  # names that no host can have
-            raise OSError(f"no address of a stream: {error}") from error
-        kind = self._answer.headers.get("Content-Type", "")
-        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
+    def __init__(self):
+        self._image, self._held = b"", False
 
     def grab(self):
-        """Read one whole image; False at the end of the stream, or after a silence."""
-        self.waited = False
-        if self._held:
-            self._held = False
-            return True
-        try:
-            fields = b""
-            while b":" not in fields:
-                fields = self._upto(b"\r\n\r\n").strip(b"\r\n")
-            stated = LENGTH.search(fields)
-            self._image = self._count(int(stated[1])) if stated else self._upto(END)
-        except (OSError, EOFError, ValueError, HTTPError):  # ValueError: the answer was closed
-            return False
-        return True
+        """Take the next image, if there is one."""
+        if not self._held:
+            self._image = self.take()
+        self._held = False
+        return self._image is not None
 
     def retrieve(self):
         """Decode the image grabbed last: (True, image) or (False, None)."""
@@ -71,70 +48,80 @@ class MjpegStream:
 
     def get(self, key):
         """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for what is unknown."""
-        if self._image is None:
+        if self._image == b"":
             self._held = self.grab()
-        return _size_of(self.retrieve()[1], key)
+        done, image = self.retrieve()
+        height, width = image.shape[:2] if done else (0, 0)
+        return float({WIDTH: width, HEIGHT: height}.get(key, 0))
 
-    def release(self):
-        """Close the connection."""
-        self._answer.close()
 
-    def _fill(self):
-        if self._answer.closed:  # at its end or after a silence
-            raise EOFError
-        self.waited |= not select.select([self._answer], [], [], 0)[0]
-        if not (some := self._answer.read1(CHUNK)) or len(self._buffer) > LONGEST:
-            raise EOFError
-        self._buffer += some
+class MjpegStream(Images):
+    """Images of an MJPEG stream; `timeout` in s, to connect and between any two bytes.
 
-    def _upto(self, mark):
-        """Bytes up to a mark and with it."""
+    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was
+    waited for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names none.
+    """
+
+    def __init__(self, url, timeout):
+        super().__init__()
+        self._buffer, self.waited, session = b"", False, requests.Session()
+        session.trust_env = False  # no proxy: cameras are near
+        try:
+            self._answer = session.get(url, stream=True, timeout=timeout).raw
+        except ValueError as error:  # names that no host can have
+            raise OSError(f"no address of a stream: {error}") from error
+        kind = self._answer.headers.get("Content-Type", "")
+        self.multipart = self._answer.status == 200 and kind.lower().startswith("multipart/")
+        self.release = self._answer.close
+
+    def grab(self):
+        """Take the next image; False at the end of the stream, or after a silence."""
+        self.waited = False
+        return super().grab()
+
+    def take(self):
+        """The next whole image."""
         seen = 0
-        while (end := self._buffer.find(mark, seen)) < 0:
-            seen = max(0, len(self._buffer) - len(mark) + 1)
-            self._fill()
-        return self._count(end + len(mark))
+        while (end := self._buffer.find(END, seen)) < 0:
+            seen = max(0, len(self._buffer) - 1)
+            if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
+                return None
+            try:
+                self.waited |= not select.select([self._answer], [], [], 0)[0]
+                some = self._answer.read1(CHUNK)
+            except (OSError, ValueError, HTTPError):  # ValueError: the answer was closed
+                return None
+            if not some:
+                return None
+            self._buffer += some
+        image, self._buffer = self._buffer[: end + len(END)], self._buffer[end + len(END) :]
+        return image[max(image.find(BEGIN), 0) :]
 
-    def _count(self, count):
-        while len(self._buffer) < count:
-            self._fill()
-        taken, self._buffer = self._buffer[:count], self._buffer[count:]
-        return taken
 
-
-class Files:
-    """Image files that are read like cv2.VideoCapture, in the order of their names."""
+class Files(Images):
+    """Image files in the order of their names."""
 
     def __init__(self, path):
+        super().__init__()
         paths = Path(path).iterdir() if os.path.isdir(path) else map(Path, glob.glob(path))
         self._left = sorted(one for one in paths if one.suffix.lower() in IMAGES)
         if not self._left:
             raise PortError(f"there are no images in {path}: name a folder or pattern with some")
 
-    def grab(self):
-        """Take the next file, if there is one."""
+    def take(self):
+        """Content of the next file."""
         self._path, *self._left = self._left or [None]
-        return self._path is not None
+        return self._path and self._path.read_bytes()
 
     def retrieve(self):
         """Decode it: (True, image)."""
-        image = cv2.imread(os.fspath(self._path))
-        if image is None:
+        done, image = super().retrieve()
+        if not done:
             raise PortError(f"{self._path} is no image that OpenCV can read")
-        return True, image
-
-    def get(self, key):
-        """Size of the next image; 0 for what is unknown."""
-        return _size_of(cv2.imread(os.fspath(self._left[0])), key)
+        return done, image
 
     def release(self):
         """Nothing is open."""
-        self._left = []
-
-
-def _size_of(image, key):
-    height, width = (0, 0) if image is None else image.shape[:2]
-    return float({WIDTH: width, HEIGHT: height}.get(key, 0))
 
 
 def _opened(message, *arguments):

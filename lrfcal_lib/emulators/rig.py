@@ -164,7 +164,7 @@ def quick_file(rig):
     return data
 
 
-def main(name, rig_file=None, *, seed=0, feedback="full"):
+def main(name, rig_file=None):
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
 
     Its rig file is written where it is asked for, and removed at the end. ValueError for a set-up that there is not.
@@ -174,7 +174,7 @@ def main(name, rig_file=None, *, seed=0, feedback="full"):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
                 stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
-        rig = stack.enter_context(EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback}))
+        rig = stack.enter_context(EmulatedRig(load_setup(name)))
         if rig_file is not None:
             stack.callback(Path(rig_file).unlink, missing_ok=True)
             Path(rig_file).write_text(json.dumps(rig.rig_file(), indent=1) + "\n")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -25,7 +24,6 @@ EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
 PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
-PART = re.compile(r"part_\d+\.npz")  # a sweep, until the session is finished
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
@@ -66,23 +64,14 @@ def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
     if file.suffix == ".npz":
-        if not os.path.lexists(file) and os.path.lexists(path / "lrf") and parts_of(path):
-            remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
-            raise SessionError(f"{path}: the recording was interrupted; {remedy}")
         return read_npz(file, path), None
     scans, log = read_telegrams(file, path)
     with naming(file):
         return check_scans(scans), log
 
 
-def parts_of(path):
-    """Files of a session's sweeps in their order, until it is finished."""
-    files = stated.checked(path / "lrf" / "any", path).parent.iterdir()
-    return sorted(file for file in files if PART.fullmatch(file.name))
-
-
 def read_npz(file, within):
-    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
+    """The arrays of a scans.npz, checked by :func:`check_scans`; no other is unpacked."""
     if not os.path.lexists(file):
         raise SessionError(f"{file}: no such file; a session needs the scan lines")
     scans, values = {}, 0

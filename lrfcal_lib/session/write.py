@@ -19,8 +19,7 @@ from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 
-    Every sweep and every image is on the disk (fsync) before the table that names it is; :func:`finish` then makes
-    the one scans.npz, or leaves the telegrams as they are. An interrupted session is completed by ``finish(path)``.
+    Telegrams and images are on the disk (fsync) before the table that names them is; scan lines are written at the end.
     A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
 
     Parameters
@@ -46,7 +45,7 @@ class SessionWriter:
     ):  # fmt: skip
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
-        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
+        self.sweeps, self.shots = [], dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
         platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
         if platform_sigma is not None:
@@ -86,12 +85,19 @@ class SessionWriter:
 
     def __exit__(self, kind, error, trace):
         with contextlib.closing(self):
-            if kind is None:
-                complete(self.path)
+            if kind is None and not self.telegrams.exists():
+                self._write_scans()
 
     def close(self):
         """Write nothing any more: others may."""
         self._held.close()
+
+    def _write_scans(self):
+        if not self.sweeps:
+            raise SessionError(f"{self.path}: no sweep to write to lrf/; nothing was recorded")
+        shared = [key for key in self.sweeps[0] if key != "bearings" and all(key in scans for scans in self.sweeps)]
+        scans = {key: np.concatenate([scans[key] for scans in self.sweeps]) for key in shared}
+        self._write("lrf/scans.npz", {**scans, "bearings": self.sweeps[0]["bearings"]})
 
     def _write(self, name, content):
         write_file(self.path / name, content, self.path)
@@ -134,10 +140,9 @@ class SessionWriter:
         scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
         with naming(f"{self.path}: placement {placement}"):
             scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
-            if self.bearings is not None and not np.array_equal(self.bearings, bearings):
+            if self.sweeps and not np.array_equal(self.sweeps[0]["bearings"], bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
-        self.bearings, self.parts = bearings, self.parts + 1
-        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
+        self.sweeps.append(scans)
         self._note_placement(placement)
 
     def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
@@ -169,7 +174,7 @@ class SessionWriter:
             pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
-            if self.parts:
+            if self.sweeps:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
@@ -202,41 +207,6 @@ class SessionWriter:
         self._append_rows("images.csv", [[cell(time_s), camera, *where, purpose]])
 
 
-def finish(path):
-    """Complete a session: one scans.npz out of the sweeps. Also completes a session whose recording was interrupted.
-
-    A recording of telegrams is complete as it is; only what a crash cut off at the end of a table is removed.
-    SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
-    """
-    try:
-        with stated.alone(path):
-            complete(Path(path))
-    except FileNotFoundError as error:
-        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
-
-
-def complete(path):
-    """As :func:`finish`, for who writes the session already."""
-    mend_tables(path)
-    if os.path.lexists(path / "lrf" / "telegrams.bin"):
-        return
-    if not (parts := read.parts_of(path)):
-        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
-    sweeps = [read.read_npz(part, path) for part in parts]
-    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
-    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
-    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path, np.savez_compressed)
-    for part in parts:
-        part.unlink()
-
-
-def mend_tables(path):
-    """Remove rows that a crash cut off at the end of a session's tables."""
-    for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
-        if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
-            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
-
-
 def as_lines(rows):
     """Text of the rows of a table."""
     return "".join(",".join(map(str, row)) + "\n" for row in rows)
@@ -247,13 +217,13 @@ def cell(value):
     return "" if math.isnan(value) else repr(round(float(value), 9))
 
 
-def write_file(file, content, within, save=np.savez):
+def write_file(file, content, within):
     """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
     draft = stated.checked(file, within).with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
     with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
         if isinstance(content, dict):
-            save(stream, **content)
+            np.savez_compressed(stream, **content)
         else:
             stream.write(content.encode() if isinstance(content, str) else content)
         stream.flush()
@@ -319,7 +289,9 @@ class SessionRecorder(SessionWriter):
                 raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
         self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
         self._make_folders()
-        mend_tables(self.path)
+        for table in ("images.csv", "lrf/index.csv", "platform.csv"):  # a crash may have cut off the last row
+            if os.path.lexists(file := self.path / table):
+                self._write(table, stated.read_bytes(file, self.path).rpartition(b"\n")[0] + b"\n")
         for placement in self.data["unfinished"]:
             self._mark_dropped(placement)
         self._state(unfinished=[])
@@ -328,17 +300,18 @@ class SessionRecorder(SessionWriter):
             self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
 
     def begin_placement(self, placement):
-        """State that a placement is being recorded from now on; SessionError if one is, or that one was already."""
+        """State that a placement is being recorded from now on; one that was broken off is dropped.
+
+        SessionError if it was recorded already.
+        """
         for other in self.data["unfinished"]:
-            raise SessionError(f"{self.path}: placement {other} is being recorded: finish it first")
+            self.drop_placement(other)
         if placement in self.finished or placement < 0:
             raise SessionError(f"{self.path}: placement {placement} cannot be begun; recorded: {short(self.finished)}")
         self._state(unfinished=[int(placement)])
 
     def finish_placement(self):
         """State that the placement begun last is complete; from now on it is part of the session."""
-        if not self.data["unfinished"]:
-            raise SessionError(f"{self.path}: no placement is being recorded: begin one first")
         self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
 
     def drop_placement(self, placement):
@@ -362,7 +335,6 @@ class SessionRecorder(SessionWriter):
             self.drop_placement(placement)
         del self.data["unfinished"]
         self._state()
-        complete(self.path)
         self.close()
 
     def __exit__(self, kind, error, trace):
