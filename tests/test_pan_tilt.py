@@ -1,7 +1,6 @@
 """The pitch axis: emulated heads that answer fully, partly, with echo or not at all, in virtual time."""
 
 import contextlib
-import logging
 import math
 import signal
 import subprocess
@@ -207,16 +206,6 @@ def test_what_happens_once_is_made_up_for(opened):
 
 
 # ------------------------------------------------------------------------------------------------- timed moves
-
-
-def test_timed_moves_say_what_they_are(opened, caplog):
-    with caplog.at_level(logging.INFO):
-        _, head = opened(replace(TIMED, degrees_per_second=(20.0, 30.0)), feedback="none", head=Uneven)
-        assert head.pitch() == (0.0, False)
-        assert head.move_to(20 * DEGREE) == near(20, 1.5)
-    said = [record.message for record in caplog.records if "timed moves" in record.message]
-    assert len(said) == 1 and "20/30 deg/s (stated)" in said[0]
-    assert head.move_to(head.pitch()[0] + 0.02 * DEGREE) == head.pitch()[0]  # shorter than a motion can be
 
 
 def test_start_of_a_head_without_feedback(opened, caplog):

@@ -51,6 +51,7 @@ WRONG = {
     r"devices\.head: adress is not known; known are address, .*port": ("devices.head.adress", 1),
     r"devices\.head\.tilt_speed is 99: a whole number from 0 to 63": ("devices.head.tilt_speed", 99),
     r"devices\.head\.address is 'one': a whole number from 0 to 255": ("devices.head.address", "one"),
+    r"devices\.head\.pitch_limits_deg is \[10, -10\]: .*comes first": ("devices.head.pitch_limits_deg", [10, -10]),
     r"devices\.lrf\.unit is 'inch': 'mm' or 'cm'": ("devices.lrf.unit", "inch"),
     r"devices\.lrf\.variant is 180: a valid tuple": ("devices.lrf.variant", 180),
     r"devices\.lrf\.baudrate is 300: 9600, 19200, 38400 or 500000": ("devices.lrf.baudrate", 300),

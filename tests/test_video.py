@@ -11,7 +11,7 @@ import pytest
 from shared import until
 
 from lrfcal_lib.drivers import video
-from lrfcal_lib.drivers.port import LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError
 from lrfcal_lib.drivers.video import Camera, MjpegStream
 
 WAIT_S = 20.0  # guard against a hang on a busy machine
@@ -107,6 +107,9 @@ def test_newest_frame_of_a_stream(server, camera):
     assert indices == sorted(set(indices)) and not camera.lost
     assert camera.size == (64, 48)
     assert camera.newest() is frame
+    camera.close()
+    with pytest.raises(DeviceError, match="left is closed"):
+        camera.newest(after=time.time())
 
 
 def test_stream_lost_and_found(server, camera, caplog):
