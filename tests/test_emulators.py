@@ -1,15 +1,11 @@
 """Emulated devices in virtual time: byte-exact replies, times."""
 
-import os
 
 import numpy as np
 import pytest
-import serial
 from virtual import Bench, Source, VirtualHost, lms
 
-from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.head import REACT_S, Head
-from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import VARIANTS
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
@@ -133,22 +129,6 @@ def test_a_stream_that_this_machine_is_too_slow_for_leaves_scans_out(caplog):
     gaps = np.diff([record.turn for record in one.device.scans]) * TURN
     assert np.sum(gaps > 1.01 * min(gaps)) == 1 and max(gaps) > 1.2  # what is less late is caught up with
     assert one.device.left_out == 1 and "casts scans too slowly: 1." in caplog.text
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_device_that_fails_says_so(tmp_path):
-    """On a pseudo-terminal."""
-
-    class Broken(SerialDevice):
-        baudrate = 9600
-
-        def receive(self, data, at):
-            raise RuntimeError("broken")
-
-    with Broken(tmp_path / "x", REAL) as device, serial.Serial(device.path, 9600) as port:
-        port.write(b"x")
-        device.port.join(60)
-        assert str(device.error) == "broken" and not os.path.lexists(device.path)
 
 
 # ------------------------------------------------------------------------------------------------ the head

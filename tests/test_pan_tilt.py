@@ -208,15 +208,6 @@ def test_what_happens_once_is_made_up_for(opened):
 # ------------------------------------------------------------------------------------------------- timed moves
 
 
-def test_start_of_a_head_without_feedback(opened, caplog):
-    device, head = opened(replace(FAST, start_pitch_deg=-15.0, feedback=False))
-    assert "assumed, state degrees_per_second" in caplog.text
-    assert head.pitch() == (near(-15, 1e-6), False)
-    head.set_pitch(0.1)
-    assert head.pitch() == (0.1, False)
-    assert not sent(device, pelco_d.QUERY_TILT)
-
-
 # ------------------------------------------------------------------------------------------------------- sweeps
 
 SWEEPS = {"full": {}, "echo and general": {"echo": True, "reply": "general"}, "silent while moving": PARTIAL,
@@ -273,23 +264,6 @@ def test_stop_from_another_thread_ends_a_move(opened, settings, habits, stop, ab
     with pytest.raises(DeviceError, match="stopped before it arrived"):
         head.move_to(60 * DEGREE)
     assert halted(device) and -5 * DEGREE < device.pitch() < 30 * DEGREE
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
-def test_whatever_ends_a_move_stops_the_head(opened, monkeypatch, error):
-    device, head = opened(SURE)
-    moved = []
-
-    def fail(_):
-        device.host.sleep(0.2)
-        moved.append(device.head.moving(device.host.now()))
-        if moved[-1]:
-            raise error
-
-    monkeypatch.setattr(head.motion, "pause", fail)
-    with pytest.raises(error):
-        head.move_to(30 * DEGREE)
-    assert moved[-1] and not head.moving() and halted(device)
 
 
 def test_close_stops_the_head_and_is_final(opened):

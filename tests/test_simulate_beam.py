@@ -47,18 +47,6 @@ def test_a_step_mixes_over_the_width_of_the_spot(spot, distance):
     assert OFFSETS[np.argmin(np.abs(share - 0.5))] == pytest.approx(0.0, abs=0.05 * diameter)
 
 
-def test_surfaces_a_pulse_apart_do_not_mix():
-    front, back = sheet(2.0, width=10.0, shift=5.0, infrared=0.1), sheet(4.0, infrared=0.6)
-    reading = readings([front, back], np.pi / 2 - np.arctan(OFFSETS / 2.0))
-    assert np.all(np.minimum(np.abs(reading - 2.0), np.abs(reading - 4.0)) < 5e-3)
-    # the front needs a quarter of the back's echo: a share p of the disc with 0.025 p >= 0.25 * 0.0375 (1 - p)
-    edge = OFFSETS[reading < 3.0].min() / ((LMS221.spot_exit + 2.0 * LMS221.divergence) / 2)
-    share = 0.25 * 0.0375 / (0.025 + 0.25 * 0.0375)
-    t = np.linspace(-1, 1, 4001)
-    disc = (np.arccos(t) - t * np.sqrt(1 - t**2)) / np.pi  # part of the disc beyond t
-    assert -edge == pytest.approx(t[np.argmin(np.abs(disc - share))], abs=0.1)
-
-
 def test_echo_takes_the_first_that_is_strong_enough():
     beam = replace(LMS221, least_energy=0.2, least_share=0.3)
     distance = np.array([[1.0, 1.5, 4.0], [1.0, 4.0, 4.2], [1.0, np.inf, np.inf], [np.inf] * 3, [1.0, 3.0, 6.0]])

@@ -96,18 +96,6 @@ def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, ste
     )
 
 
-def test_interlaced_scans_become_dense_lines(recorded):
-    dense = room(3, 721)
-    sent = [raw for line in dense for raw in interlaced(line)]
-    session = recorded((1, sent, np.repeat([0.0, 0.0, 0.1], 4), np.arange(12.0)))
-    sweep = session.sweep(1)
-    dense[np.isinf(dense)] = np.nan
-    np.testing.assert_allclose(sweep.ranges, dense, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.degrees(sweep.bearings), np.arange(0, 180.1, 0.25))
-    assert sweep.time_s.tolist() == [1.5, 5.5, 9.5]
-    np.testing.assert_allclose(sweep.pitch, [0, 0, 0.1])
-
-
 def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(recorded):
     a, b, c = room(3, 721, seed=2)
     a[3:6] = 5.0
