@@ -15,7 +15,7 @@ from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
 
-WAIT_S = 20  # guards against hanging
+WAIT_S = 120  # guards against hanging
 @pytest.fixture
 def fake(monkeypatch, tmp_path):
     """Makes a rig file, to whose plan keywords go, and the fake rig that opens for it."""
