@@ -12,7 +12,7 @@ from lrfcal_lib.evaluate.diagnosis import motion_words, pitch_words
 from lrfcal_lib.model.camera import CameraModel, distort
 from lrfcal_lib.plots.results import background_motion
 from lrfcal_lib.preprocess import steadiness
-from lrfcal_lib.preprocess.steadiness import Steadiness, Step, find_steps, fit_motion, motion_misses, pixel_root
+from lrfcal_lib.preprocess.steadiness import Steadiness, Step, find_steps, fit_motion, pixel_root
 from lrfcal_lib.session.read import open_session
 
 MODEL = CameraModel(480, 320, 300.0, 302.0, 241.0, 158.0, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
@@ -76,14 +76,6 @@ def step_at(k, n=20, size=(0.001, -0.0008, 0.0003)):
 
 def a_step(rotvec, before=10, after=11):
     return Step(before, after, np.array(rotvec), float(np.linalg.norm(rotvec)), 2e-5, 0.9)
-
-
-def test_derivative_of_the_motion_is_that_of_differences():
-    first, turn = np.random.default_rng(0).uniform(-0.6, 0.6, (30, 2)), Rotation.from_rotvec([0.02, -0.03, 0.01])
-    base, by_state = motion_misses(first, 0 * first, turn, 1.01)
-    for k, step in enumerate(1e-6 * np.eye(4)):
-        moved = motion_misses(first, 0 * first, Rotation.from_rotvec(step[:3]) * turn, 1.01 + step[3])[0]
-        np.testing.assert_allclose((base - moved) / 1e-6, by_state[:, :, k], atol=1e-5)
 
 
 def in_pixels(bare):
