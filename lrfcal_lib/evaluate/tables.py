@@ -33,6 +33,7 @@ from lrfcal_lib.solvers.joint_noise import on_board
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 ALL = 10**9  # crossings
+ENDS = {"fused": ("image", ""), "combined": ("image", "scan")}  # what decides ends of edges: images, beams, the pitch
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
     r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
@@ -184,16 +185,10 @@ def left_out(obs, judge, method, full):
             yield judge.select([placement]), solve_camera(rest, method, full.transform, search=False)
 
 
-def jointly_left_out(joint, camera):
-    """The same of the joint estimate (JointCalibration), which is judged with its own platform and range offset."""
-    for placement, solution in joint.without.items():
-        yield joint.seen_by(camera, solution).along().select([placement]), solution.camera(camera)
-
-
 def left_out_residuals(pairs):
     """Residuals of every placement under a calibration from all the others: crossings (pixels), face points (metres).
 
-    `pairs` are those of :func:`left_out` or :func:`jointly_left_out`.
+    `pairs` are those of :func:`left_out`, or the same of the joint estimate.
     """
     edges, planes = [np.zeros(0)], [np.zeros(0)]
     for held, solution in pairs:
@@ -229,7 +224,8 @@ def method_comparison(observations, solutions, truth=None, joint=None):
         if name == "joint":
             own = observations[camera, "joint"]
             judge, used = own.along(), own.placements
-            held = () if joint is None else jointly_left_out(joint, camera)
+            rest = {} if joint is None else joint.without  # judged with their own platform and range offset
+            held = ((joint.seen_by(camera, s).along().select([p]), s.camera(camera)) for p, s in rest.items())
         else:
             own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
             used = own.placements if METHODS[name].uses == "plane" else getattr(own, f"{METHODS[name].uses}_placement")
@@ -462,21 +458,15 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         lengths, sigma = ({}, {}) if measured is None else (measured.lengths, measured.sigma)
         views = [views[placement] for views in prepared.views.values() if placement in views]
         for name in (name for name in known if any(view.edge(name) is not None for view in views)):
-            length = lengths.get(name, np.nan)
-            ends = ends_of(edges, name, weak or (), variant) if np.isfinite(length) else "not measured"
+            length, i = lengths.get(name, np.nan), edges.index(name)
+            worse = bool({edges[i - 1], edges[(i + 1) % len(edges)]} & set(weak or ()))
+            ends = ENDS.get(variant, ("scan", "pitch"))[worse] if np.isfinite(length) else "not measured"
             row = prepared.session.name, placement, name, ends, variant
             rows.append((*row, 1000 * known[name], 1000 * length, 1000 * sigma.get(name, np.nan)))
     rows += [("paper", np.nan, name, "scan", "last_beam", *lengths, np.nan) for name, lengths in PAPER_EDGES_MM.items()]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "sigma_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
-
-
-def ends_of(edges, name, weak, variant):
-    """What decides the ends of an edge: its neighbours in images, beams, or the recorded pitch (the worse)."""
-    usual, worse = {"fused": ("image", ""), "combined": ("image", "scan")}.get(variant, ("scan", "pitch"))
-    i = edges.index(name)
-    return worse if {edges[i - 1], edges[(i + 1) % len(edges)]} & set(weak) else usual
 
 
 def edge_summary(table):
