@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -185,10 +185,18 @@ def left_out(obs, judge, method, full):
             yield judge.select([placement]), solve_camera(rest, method, full.transform, search=False)
 
 
+def jointly_left_out(joint, camera):
+    """The same of the joint estimate (JointCalibration), which is judged with its own platform and range offset."""
+    ready = joint.prepared
+    for placement, solution in joint.without.items():
+        alone = replace(joint, prepared=replace(ready, scans={placement: ready.scans[placement]}))
+        yield alone.seen_by(camera, solution).along().select([placement]), solution.camera(camera)
+
+
 def left_out_residuals(pairs):
     """Residuals of every placement under a calibration from all the others: crossings (pixels), face points (metres).
 
-    `pairs` are those of :func:`left_out`, or the same of the joint estimate.
+    `pairs` are those of :func:`left_out` or :func:`jointly_left_out`.
     """
     edges, planes = [np.zeros(0)], [np.zeros(0)]
     for held, solution in pairs:
@@ -224,8 +232,7 @@ def method_comparison(observations, solutions, truth=None, joint=None):
         if name == "joint":
             own = observations[camera, "joint"]
             judge, used = own.along(), own.placements
-            rest = {} if joint is None else joint.without  # judged with their own platform and range offset
-            held = ((joint.seen_by(camera, s).along().select([p]), s.camera(camera)) for p, s in rest.items())
+            held = () if joint is None else jointly_left_out(joint, camera)
         else:
             own, judge = observations[camera, METHODS[name].variant], observations[camera, "half_step"].along()
             used = own.placements if METHODS[name].uses == "plane" else getattr(own, f"{METHODS[name].uses}_placement")
