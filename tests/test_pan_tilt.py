@@ -113,9 +113,7 @@ def sent(device, opcode):
 
 HABITS = {
     "full": {},
-    "general replies and echo": {"reply": "general", "echo": True},
-    "5-byte replies": {"reply": "five"},
-    "single byte": {"reply": "single"},
+    "general replies and echo": {"confirms": True, "echo": True},
     "silent while moving, no set-tilt": {"feedback": "partial", "echo": True},
     "uneven": {"feedback": "partial", "head": Uneven},
     "watchdog": {"feedback": "partial", "watchdog_s": 0.3},
@@ -242,7 +240,7 @@ def test_start_of_a_head_without_feedback(opened, caplog):
 
 # ------------------------------------------------------------------------------------------------------- sweeps
 
-SWEEPS = {"full": {}, "echo and general": {"echo": True, "reply": "general"}, "silent while moving": PARTIAL,
+SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "silent while moving": PARTIAL,
           "tells nothing": NONE}  # fmt: skip
 
 

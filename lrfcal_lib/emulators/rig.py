@@ -114,7 +114,7 @@ class EmulatedRig:
                 "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False, "unit": rig.beam.unit_name,
                         "variant": [rig.beam.field_of_view, rig.beam.resolution / 100]},
                 "head": {"port": head.path, "address": head.address, "baudrate": head.baudrate,
-                         "feedback": head.reply_kind != "none",
+                         "feedback": head.feedback != "none",
                          "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist()},
                 "cameras": {name: {"source": self.camera_urls[name], "silence_s": SILENCE_S,
                                    "size": [c.width, c.height]} for name, c in cameras.items()},
