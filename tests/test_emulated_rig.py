@@ -94,8 +94,6 @@ def test_images_of_another_width_show_the_same():
     for a, b in zip(small.cameras, SETUP.rig.cameras, strict=True):
         assert (a.model.width, a.model.height) == (320, 240) and a.model.fx == b.model.fx / 2
         assert (a.model.cx + 0.5) / a.model.fx == pytest.approx((b.model.cx + 0.5) / b.model.fx)
-    with pytest.raises(ValueError, match="both must be even"):
-        scaled(SETUP.rig, 333)
 
 
 @pytest.fixture(scope="module")
@@ -214,9 +212,7 @@ def test_rig_file_states_what_a_session_states(rig, tmp_path):
     assert stated["devices"]["lrf"]["port"] == rig.lrf.path and stated["devices"]["lrf"]["variant"] == [100, 0.25]
     assert stated["devices"]["head"]["pitch_limits_deg"] == [-60, 45]
     assert stated["plan"]["placements"][1]["pitch_deg"][0] > stated["plan"]["placements"][1]["pitch_deg"][1]
-    low, high, step = stated["plan"]["pitch_deg"]
-    assert all(low <= min(p["pitch_deg"][:2]) and max(p["pitch_deg"][:2]) <= high for p in stated["plan"]["placements"])
-    assert step == 0.25 and all(camera["silence_s"] >= 60 for camera in stated["devices"]["cameras"].values())
+    assert all(camera["silence_s"] >= 60 for camera in stated["devices"]["cameras"].values())
 
 
 def test_own_placements_and_unknown_setups(tmp_path):

@@ -75,7 +75,7 @@ def test_the_shipped_session_is_sound(session, truth):
     assert validate(QUICK) == []
     assert session.simulated and session.licence == "CC-BY-4.0" and session.placements == (1, 2, 3, 4, 5)
     assert all(info.model is None for info in session.cameras.values())
-    assert session.telegram_report()["values"]["dazzled"] > 0
+    assert session.telegrams.report()["values"]["dazzled"] > 0
     purposes = {p: len(session.images(purpose=p)) for p in ("intrinsics", "board", "scene")}
     assert purposes == {"intrinsics": 24, "board": 16, "scene": 4}
     head = transform_from_json(truth["T_head_lrf"])

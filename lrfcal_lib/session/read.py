@@ -301,16 +301,13 @@ class Session:
 
     def sweep(self, placement):
         """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
-        rows = self.scans["placement"] == self._known(placement)
+        if placement not in self.placements:
+            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
+        rows = self.scans["placement"] == placement
         picked = {k: v[rows] for k, v in self.scans.items() if k in ("ranges", "pitch", "time_s", "intensities")}
         if not np.isfinite(picked["ranges"]).any():
             raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
         return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
-
-    def _known(self, placement):
-        if placement not in self.placements:
-            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
-        return placement
 
     def images(self, camera=None, placement=None, purpose=None):
         """The records of images that match all that is given, in the order of images.csv."""
@@ -341,24 +338,6 @@ class Session:
         """All other placements."""
         scenes = self.scene_placements
         return tuple(p for p in self.placements if p not in scenes)
-
-    def telegram_report(self, placement=None):
-        """What became of the recorded telegrams, of a placement or (by default) of all.
-
-        Returns
-        -------
-        dict
-            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
-            'wrong_crc_offsets' : tuple of int.
-
-        Raises
-        ------
-        SessionError
-            If the session holds scan lines instead of telegrams, or has no such placement.
-        """
-        if self.telegrams is None:
-            raise SessionError(f"{self.path}: recorded as lrf/scans.npz; only lrf/telegrams.bin tells about telegrams")
-        return self.telegrams.report(placement if placement is None else self._known(placement))
 
     def sweep_direction(self, placement):
         """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one pitch."""

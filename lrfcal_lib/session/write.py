@@ -164,13 +164,7 @@ class SessionWriter:
             that has scan lines already.
         """
         with naming(f"{self.path}: placement {placement}"):
-            if isinstance(telegrams, bytes | bytearray):
-                raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
-            telegrams = [bytes(raw) for raw in telegrams]
             lengths = [len(raw) for raw in telegrams]
-            if min(lengths, default=0) < 7:
-                got = short(sorted(set(lengths)))
-                raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {got}")
             pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
