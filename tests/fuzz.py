@@ -38,7 +38,7 @@ from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.lms2xx_codec import check_crc, crc16, encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
-from lrfcal_lib.session.write import SessionRecorder, SessionWriter
+from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
@@ -312,7 +312,8 @@ def use(rng, path):
         return [_caught(read_rig_file, path / "rig.json")]  # what it names belongs to who wrote it
     surveyed = rng.random() < SURVEYED
     read = [validate, _survey if surveyed else read_all][rng.integers(2)]
-    return [_caught(work, path) for work in (read, *[_go_on] * (rng.random() < 0.3))]
+    writing = [_go_on if rng.random() < 0.7 else finish] * (rng.random() < 0.3)
+    return [_caught(work, path) for work in (read, *writing)]
 
 
 def _survey(path):
@@ -340,7 +341,7 @@ def _caught(work, *arguments):
         trace, frames = traceback.format_exc(), traceback.extract_tb(error.__traceback__)
         if "MemoryError" in trace or "nsufficient memory" in trace:
             return "memory", repr(error)[:300], trace
-        ours = [SessionError, RigFileError] + [OSError] * (work is _go_on)
+        ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
         if work in (read_all, _survey) and frames[-1].filename.startswith(LIBRARY):
             ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
         if not isinstance(error, tuple(ours)):

@@ -49,10 +49,17 @@ class Contrary(Head):
         super().move(instant, -goal, speed)
 
 
-def emulated(*, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, **options):
+def terse(raw):
+    """Replies of some heads: tilts without sync and address, and one byte for a confirmation."""
+    return bytes([0, *raw[3:6], sum(raw[3:6]) % 256]) if len(raw) == pelco_d.FRAME else b"\x01"
+
+
+def emulated(*, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, prepare=None, **options):
     """An emulated head on a virtual host; keywords are its habits."""
     options = {"baudrate": 38400, "speeds": SPEEDS, "go_speed": 120.0} | options
-    return virtual.head(head=head(Platform(settle=settle, limits=limits)), **options)
+    device = virtual.head(head=head(Platform(settle=settle, limits=limits)), **options)
+    device.prepare = prepare or device.prepare
+    return device
 
 
 def driven(device, settings=FAST):
@@ -114,6 +121,7 @@ def sent(device, opcode):
 HABITS = {
     "full": {},
     "general replies and echo": {"confirms": True, "echo": True},
+    "short replies": {"confirms": True, "prepare": terse},
     "silent while moving, no set-tilt": {"feedback": "partial", "echo": True},
     "uneven": {"feedback": "partial", "head": Uneven},
     "watchdog": {"feedback": "partial", "watchdog_s": 0.3},

@@ -244,13 +244,13 @@ def test_a_sweep_grows_line_by_line():
 
 def test_lights_and_errors_say_their_state_in_signs_and_words():
     found = [Light("scan", state, "<b>text") for state in ("ok", "warn", "bad")]
-    said = page.lights_html("Quality", found)
+    said = page.HTML.lights("Quality", found)
     for sign in ("✓ good", "! check", "✕ bad", "&lt;b&gt;text"):
         assert sign in said
-    assert "→ next" in page.lights_html("", [Light("information", "warn", "put it there")])
-    assert "as soon as a placement is recorded" in page.lights_html("Quality", ())
-    assert page.error_html("failed", "") == ""
-    assert "✕" in page.error_html("a", "b") and "check the plug" in page.error_html("a", "check the plug")
+    assert "→ next" in page.HTML.lights("", [Light("information", "warn", "put it there")])
+    assert "as soon as a placement is recorded" in page.HTML.lights("Quality", ())
+    assert page.HTML.error("failed", "") == ""
+    assert "✕" in page.HTML.error("a", "b") and "check the plug" in page.HTML.error("a", "check the plug")
 
 
 @pytest.mark.parametrize("answer, said", [("yes", "✓ can be trusted"), ("with care", "! use"), ("no", "✕ cannot be")])
@@ -258,10 +258,10 @@ def test_a_result_says_whether_to_trust_it(answer, said):
     sigma = np.full(3, 0.5)
     poses = {"left": (np.array([90.0, 1.0, -2.0]), np.array([120.0, 30.0, -4.0]), sigma, sigma)}
     sentences = ("Use this calibration with care: few placements.", "Record next: there.")
-    shown = page.result_html(collector.Result(answer, sentences, "joint", poses, None, None))
+    shown = page.HTML.result(collector.Result(answer, sentences, "joint", poses, None, None))
     for text in (said, "Few placements.", "Record next", "90.00 ± 0.50", "-4.0 ± 0.5", "left"):
         assert text in shown
-    assert "<table" not in page.result_html(collector.Result("no", sentences, "", {}, None, None))
+    assert "<table" not in page.HTML.result(collector.Result("no", sentences, "", {}, None, None))
 
 
 def test_advice_where_nothing_is_determined_yet(monkeypatch):

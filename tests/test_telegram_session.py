@@ -17,7 +17,7 @@ from lrfcal_lib.session.lms2xx_codec import (
 )
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import LrfInfo, SessionError
-from lrfcal_lib.session.write import SessionWriter
+from lrfcal_lib.session.write import SessionWriter, finish
 
 LRF = LrfInfo("made up", (np.radians(40), np.radians(140)), np.radians(0.25), 0.01, max_range=32.0)
 PITCH = np.radians([-0.5, -0.25, 0.0, 0.25])
@@ -195,13 +195,15 @@ def test_a_crash_between_data_and_index_loses_nothing_else(path):
     assert any("812 bytes after the last telegram in index.csv are not used" in text for text in session.problems)
 
 
-def test_a_row_cut_off_by_a_crash_is_left_out(path):
+def test_a_row_cut_off_by_a_crash_is_left_out_until_finish_removes_it(path):
     file = path / "lrf" / "index.csv"
     whole = file.read_text()
     file.write_text(whole[:-3])
     session = open_session(path)
     assert len(session.sweep(2).ranges) == 3
     assert any("the last row is cut off" in text for text in session.problems)
+    finish(path)
+    assert file.read_text() == whole[: whole[:-1].rindex("\n") + 1]
 
 
 def cell(row, column, value):

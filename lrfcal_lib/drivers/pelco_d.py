@@ -9,7 +9,7 @@ from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
-FRAME, GENERAL = 7, 4  # bytes of a frame, and of a confirmation
+FRAME, SHORT, GENERAL = 7, 5, 4  # bytes of a frame, of a short reply, of a confirmation
 UP, DOWN = 0x08, 0x10  # bits of command 2; without them, and those of the pan, it is a stop
 FASTEST = 0x3F  # speed byte; 0 is very slow, not stop
 SET_TILT = 0x4D
@@ -28,10 +28,6 @@ class Frame:
     data2: int = 0
 
     value = property(lambda self: self.data1 << 8 | self.data2, doc="Number of both data bytes.")
-
-    def tells_tilt(self, address):
-        """Whether the head of an address tells its tilt; angles end at 359.99 deg."""
-        return (self.address, self.command1, self.command2) == (address, 0, TILT) and self.value < TURN
 
 
 @dataclass(frozen=True)
@@ -85,23 +81,34 @@ def decode_tilt(value):
     return -math.radians((value if value <= TURN // 2 else value - TURN) / 100)
 
 
+def tilt_in(raw, address):
+    """Number of the frame with which the head of an address tells its tilt, in a tuple; angles end at 359.99 deg."""
+    return tuple(
+        frame.value for frame in split_frames(raw)[0]
+        if (frame.address, frame.command1, frame.command2) == (address, 0, TILT) and frame.value < TURN
+    )  # fmt: skip
+
+
 def split_replies(data, sent):
     """What a head, and an adapter that echoes, sent back after one frame, as Received.
 
-    7 bytes answer a query, 4 bytes confirm a command: a byte of alarm bits, and a checksum that continues that of the
-    command. Every place is tried, and one that fits nothing is skipped, so are frames of other senders. What looks like
-    a confirmation may as well be the beginning of an echo, and is none then.
+    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a command: a byte of alarm
+    bits, and a checksum that continues that of the command. Every place is tried, and one that fits nothing is skipped;
+    so are frames of other senders, and the single byte 01 of some heads. What looks like a confirmation may as well be
+    the beginning of an echo, and is none then; of echoes the beginning may be lost.
     """
     tilts, acknowledged, echoed, skipped = [], False, 0, 0
     while data:
-        short, size = data[:GENERAL], 1
+        short, size, fresh = data[:GENERAL], 1, not (tilts or acknowledged or echoed or skipped)
         if data.startswith(sent):
             echoed += (size := FRAME)
-        elif (frames := split_frames(data[:FRAME])[0]) and frames[0].tells_tilt(sent[1]):
-            tilts, size = [*tilts, frames[0].value], FRAME
+        elif found := tilt_in(data[:FRAME], sent[1]) or tilt_in(bytes([SYNC, 0]) + data[:SHORT], 0):
+            tilts, size = [*tilts, *found], FRAME if data[0] else SHORT
         elif (len(short) == GENERAL and sent[3] != QUERY_TILT and not sent.startswith(short)
               and short[0] == SYNC and short[3] == (sent[6] + short[2]) & 0xFF):  # fmt: skip
             acknowledged, size = True, GENERAL
+        elif fresh and (end := next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)):
+            echoed += (size := end)
         else:
             skipped += 1
         data = data[size:]

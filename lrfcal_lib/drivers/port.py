@@ -58,7 +58,7 @@ def guard(device):
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores SIGHUP: go on
+            if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP: go on
                 signal.signal(number, _on_signal)
 
 

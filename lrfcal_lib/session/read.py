@@ -64,14 +64,22 @@ def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
     file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
     if file.suffix == ".npz":
+        if not os.path.lexists(file) and os.path.lexists(path / "lrf") and parts_of(path):
+            remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
+            raise SessionError(f"{path}: the recording was interrupted; {remedy}")
         return read_npz(file, path), None
     scans, log = read_telegrams(file, path)
     with naming(file):
         return check_scans(scans), log
 
 
+def parts_of(path):
+    """Files of a session's sweeps in their order, until it is finished."""
+    return sorted(stated.checked(path / "lrf" / "any", path).parent.glob("part_*.npz"))
+
+
 def read_npz(file, within):
-    """The arrays of a scans.npz, checked by :func:`check_scans`; no other is unpacked."""
+    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
     if not os.path.lexists(file):
         raise SessionError(f"{file}: no such file; a session needs the scan lines")
     scans, values = {}, 0
