@@ -1,13 +1,13 @@
 """Outlines by likelihood: exact widths of drawn boards, statistics, bad input."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from test_scan import facing
 
-from lrfcal_lib.calibrate.outline import EdgeModel, face_surface, measure_outline
+from lrfcal_lib.calibrate.outline import face_surface, measure_outline
 from lrfcal_lib.fit.residuals import edge_shift
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
@@ -15,7 +15,15 @@ from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar
 HEAD = RigidTransform.from_components([0.0, 0.01, 0.05], Rotation.from_rotvec([0.0, 0.02, -0.01]))
 BOARD = Board("plate", ("top", "right", "bottom", "left"), np.array([[0, 0], [0.5, 0], [0.5, 0.4], [0, 0.4]]))
 SENSOR = {"edge_log_odds": -0.8, "edge_log_softness": np.log(0.05), "range_offset": 0.004}
-MODEL = EdgeModel(SENSOR, T_head_lrf=HEAD)
+
+
+def told(sensor=SENSOR, sigma=None, spread=0.0):
+    """What a joint estimate knows about how a sensor sees edges."""
+    sides = {"noise": {"side_sigma": spread}, "unknowns": SimpleNamespace(sides=True)}
+    return SimpleNamespace(sensor=sensor, sigma=sigma or {}, T_head_lrf=HEAD, **sides)
+
+
+MODEL = told()
 STEP = np.radians(0.25)
 
 
@@ -67,7 +75,7 @@ def test_the_wrong_odds_make_the_board_larger_by_twice_the_shift():
     rng = np.random.default_rng(2)
     cells, face, names = sweep(poses(1)[0], rng)
     right = measure_outline(cells, face, names, BOARD.edges, MODEL)
-    model = replace(MODEL, sensor=SENSOR | {"edge_log_odds": 0.4})
+    model = told(SENSOR | {"edge_log_odds": 0.4})
     wrong = measure_outline(cells, face, names, BOARD.edges, model)
     shift = np.subtract(*(edge_shift(v, np.median(cells.radius))[0] for v in (-0.8, 0.4)))
     for name in BOARD.edges:
@@ -77,7 +85,7 @@ def test_the_wrong_odds_make_the_board_larger_by_twice_the_shift():
 def test_uncertain_odds_show_in_the_lengths():
     cells, face, names = sweep(poses(1)[0], np.random.default_rng(3))
     sure, common, each = (
-        measure_outline(cells, face, names, BOARD.edges, replace(MODEL, **given)).sigma["top"]
+        measure_outline(cells, face, names, BOARD.edges, told(**given)).sigma["top"]
         for given in ({}, {"sigma": {"edge_log_odds": 0.3}}, {"spread": 0.3})
     )
     assert common > each > 2 * sure  # what is common to opposite sides adds up, what differs adds in squares

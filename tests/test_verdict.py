@@ -40,11 +40,10 @@ def test_a_range_offset_that_no_maker_admits(monkeypatch, offset, sigma, answers
     """Millimetres; of as much of a joint calibration as tells it. By as much all ranges may be wrong."""
     monkeypatch.setattr(verdict, "doubtful", lambda *arguments: [])
     monkeypatch.setattr(verdict, "not_an_offset", lambda *arguments: None)
-    inner = SimpleNamespace(names=("range_offset",), trusted_sigma=np.array([sigma / 1000]))
     seen, sensor = SimpleNamespace(face_range=np.array([2.0])), {"range_offset": offset / 1000, "pitch_scale": 0.0}
-    level = {"converged": True, "noise": {"face_scale": 1.0}}
+    level = {"converged": True, "noise": {"face_scale": 1.0}, "sigma": {"range_offset": sigma / 1000}}
     solution = SimpleNamespace(
-        solution=inner, sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0, **level
+        sensor=sensor, observations=seen, transforms={}, boards={}, edge_bias=0.0, **level
     )
     prepared = SimpleNamespace(
         session=SimpleNamespace(lrf=lrf(systematic_error=0.004), T_head_lrf=None, cameras={}),

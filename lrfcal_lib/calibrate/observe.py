@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -38,7 +38,7 @@ def stack(prefix, parts):
 
 def observe(
     prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
-    faces=FACE_POINTS, made=None,
+    faces=FACE_POINTS,
 ):
     """Pair what the LRF and one camera saw of the board.
 
@@ -56,8 +56,6 @@ def observe(
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
     crossings, faces : int
         Kept of each edge and of the face of a placement, evenly spread; without `faces` only crossings are paired.
-    made : dict, optional
-        Filled with what other calls with the same `T_head_lrf`, `correct` and `faces` need not work out again.
 
     Returns
     -------
@@ -68,7 +66,7 @@ def observe(
     pattern = np.zeros((0, 3)) if board.pattern is None else raised_points(board.pattern, prepared.relief)
     n, k = len(posed), len(pattern)
     pixels = [np.full((k, 2), np.nan) if view.pixels is None else view.pixels for view in posed.values()]
-    planes, crossed, one_scan, made = [], [], variant == ONE_SCAN, {} if made is None else made
+    planes, crossed, one_scan = [], [], variant == ONE_SCAN
     variant = "last_beam" if one_scan else variant
     for placement, scan in prepared.scans.items():
         view = prepared.views[camera].get(placement)
@@ -76,13 +74,10 @@ def observe(
             continue
         turn = source_of(prepared, camera, placement, T_head_lrf, correct)
         if placement in posed and faces:
-            if (camera, placement) not in made:
-                points, pitch, covariance = face_points(scan, faces)
-                R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
-                points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-                face = {"points": points, "covariance": covariance, "pitch": pitch, "placement": number}
-                made[camera, placement] = face
-            planes.append(made[camera, placement])
+            points, pitch, covariance = face_points(scan, faces)
+            R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
+            points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
+            planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
         crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
     return CameraObservations(
         camera=camera,
@@ -96,14 +91,14 @@ def observe(
         pattern_sigma_px=max(model.rms_px or 0.0, 0.05),
         **stack("plane_", planes),
         **stack("crossing_", crossed),
-        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf, made) if faces else ()),
+        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf) if faces else ()),
     )
 
 
 def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
-    keys, made = [(camera, variant) for camera in prepared.views for variant in (*VARIANTS, ONE_SCAN)], {}
-    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, made=made) for camera, variant in keys}
+    keys = product(prepared.views, (*VARIANTS, ONE_SCAN))
+    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
 
 
 def source_of(prepared, camera, placement, T_head_lrf, correct=as_recorded):
@@ -156,16 +151,14 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf, made):
+def _corners(prepared, camera, variant, T_head_lrf):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges meet."""
     edges, mount = prepared.board.edges, prepared.session.cameras[camera].mount
     for placement in prepared.names:
         view = prepared.views[camera].get(placement)
         if view is None or placement not in prepared.scans or placement not in prepared.swept[variant]:
             continue
-        if (placement, variant) not in made:  # the same for all cameras
-            made[placement, variant] = outline_of(prepared, placement, variant, T_head_lrf)[0]
-        board = made[placement, variant]
+        board = outline_of(prepared, placement, variant, T_head_lrf)[0]
         for before, name in zip(edges[-1:] + edges[:-1], edges, strict=True):
             seen = view.edge(name), view.edge(before)
             if name not in board.corners or None in seen:
@@ -223,21 +216,31 @@ def name_sides(prepared):
     """
     rough, problems = rough_poses(prepared)
     names = {}
-    for placement, along in prepared.edges["half_step"].items() if prepared.board.corners is not None else ():
-        views = {camera: prepared.views[camera].get(placement) for camera in rough}
-        posed = [camera for camera, view in views.items() if view is not None and view.T_camera_board is not None]
-        if not posed:
-            continue
-        turn = source_of(prepared, posed[0], placement, platform_of(prepared))
-        T_board_source = views[posed[0]].T_camera_board.inv() * rough[posed[0]]
+    for placement, on_board in board_maps(prepared, rough).items() if prepared.board.corners is not None else ():
         sides = {}
-        for found in (along, prepared.swept["half_step"].get(placement)):
+        for found in (edges["half_step"].get(placement) for edges in (prepared.edges, prepared.swept)):
             for side in () if found is None else np.unique(found.side[found.side >= 0]):
                 rows = found.side == side
-                sides.setdefault(int(side), T_board_source.apply(turn(found.points[rows], found.pitch[rows])))
+                sides.setdefault(int(side), on_board(found.points[rows], found.pitch[rows]))
         names[placement], crooked = nearest_edges(prepared.board, sides)
         problems |= {f"{placement} {side}": f"placement {placement}: {why}" for side, why in crooked.items()}
     return names, problems
+
+
+def board_maps(prepared, rough):
+    """Where points of each sweep lie on the board, through the first camera that sees it: dict of int to callable.
+
+    From LRF points (n, 3) and their pitch (n,) to the board frame (n, 3); `rough` are poses by camera, and those of
+    :func:`rough_poses` are good to about a centimetre.
+    """
+    maps = {}
+    for camera, T_camera_source in rough.items():
+        for placement, view in prepared.views[camera].items():
+            if view.T_camera_board is not None and placement in prepared.scans and placement not in maps:
+                turn = source_of(prepared, camera, placement, platform_of(prepared))
+                T = view.T_camera_board.inv() * T_camera_source
+                maps[placement] = lambda p_lrf, pitch, T=T, turn=turn: T.apply(turn(p_lrf, pitch))
+    return maps
 
 
 def rough_poses(prepared):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,24 +29,6 @@ ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
 def as_recorded(placement, p_lrf, pitch):
     """Corrects nothing."""
     return p_lrf, np.asarray(pitch)
-
-
-@dataclass(frozen=True)
-class EdgeModel:
-    """What a calibration knows about how a sensor sees edges.
-
-    `sensor` and `sigma` are values and standard deviations by name, as in a
-    :class:`lrfcal_lib.solvers.joint.JointSolution`: log odds and log softness of the edge, and range offset. `spread`
-    is the standard deviation of the log odds from side to side, because backgrounds are not equally bright.
-    ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of the pitch; what it does to points
-    is not used, the range offset is.
-    """
-
-    sensor: dict
-    sigma: dict = field(default_factory=dict)
-    spread: float = 0.0
-    T_head_lrf: RigidTransform = field(default_factory=RigidTransform.identity)
-    correct: Callable = as_recorded
 
 
 @dataclass(frozen=True)
@@ -181,7 +162,7 @@ def cells_of(prepared, placement):
 
 
 def likely_outline_of(prepared, placement, model):
-    """Measure the board's outline in one sweep by likelihood, with an EdgeModel from other placements.
+    """Measure the board's outline in one sweep by likelihood, with a JointSolution of other placements.
 
     Returns and raises what :func:`outline_of` does; also raises DegenerateGeometry when no side has enough beams.
     """
@@ -201,7 +182,8 @@ def measure_outline(cells, face, names, edges, model):
 
     `cells` are its beams about the edges, `face` points on it (LRF frame, metres), their pitch (radians)
     and the standard deviation of a range (metres), `names` the edge of each side, `edges` all edges in order around the
-    board. Raises DegenerateGeometry if the face does not span a plane, or no side has enough cells.
+    board, `model` a JointSolution: backgrounds are not equally bright, so the log odds of the edge differ from side to
+    side. Raises DegenerateGeometry if the face does not span a plane, or no side has enough cells.
     """
     pose, bend = face_surface(face, model)
     found = {side: name for side, name in names.items() if np.sum(cells.side == side) >= FEWEST_CELLS}
@@ -215,7 +197,8 @@ def measure_outline(cells, face, names, edges, model):
     slope = np.sum(slope * rays["used"], axis=1) / rays["used"].sum(axis=1)
     # beside the beams' own: the log odds common to all sides, and what differs from side to side
     common = model.sigma.get("edge_log_odds", 0.0) * slope
-    covariance[::2, ::2] += np.outer(common, common) + np.diag((model.spread * slope) ** 2)
+    spread = model.noise["side_sigma"] * model.unknowns.sides
+    covariance[::2, ::2] += np.outer(common, common) + np.diag((spread * slope) ** 2)
 
     outline, sigma = sized(lines, middle, covariance, list(found.values()), edges)
     by_face = _by_face(pose, face, model)

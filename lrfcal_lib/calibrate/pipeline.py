@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
-from lrfcal_lib.calibrate.outline import EdgeModel, as_recorded
+from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
@@ -113,13 +113,6 @@ class JointCalibration:
         solution = solution or self.solution
         return observe(self.prepared, camera, "half_step", solution.T_head_lrf, solution.correct, **options)
 
-    def edge_model(self, placement=None):
-        """What the estimate knows about how the sensor sees edges, an EdgeModel: from all placements but one."""
-        solution = self.without.get(placement, self.solution)
-        sigma = dict(zip(solution.solution.names, solution.solution.trusted_sigma.tolist(), strict=True))
-        spread = solution.noise["side_sigma"] if self.settings["sides"] else 0.0
-        return EdgeModel(solution.sensor, sigma, spread, solution.T_head_lrf, solution.correct)
-
 
 @dataclass(frozen=True)
 class Calibration:
@@ -144,7 +137,7 @@ class Calibration:
 
 
 @cached
-def calibrate(session, methods=tuple(METHODS), joint=True):
+def calibrate(session, methods=tuple(METHODS)):
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
@@ -152,16 +145,15 @@ def calibrate(session, methods=tuple(METHODS), joint=True):
     session : Session
     methods : sequence of str
         Of :data:`lrfcal_lib.solvers.METHODS`.
-    joint : bool
 
     Returns
     -------
     Calibration
     """
     prepared = prepare(session)
-    together = [partial(joint_or_words, prepared, all_views(prepared))] if joint and prepared.views else []
-    *together, found = spread(lambda stage: stage(), [*together, partial(_by_themselves, prepared, methods)])
-    return with_joint(found, *together) if together else found
+    stages = [partial(joint_or_words, prepared, all_views(prepared))] if prepared.views else []
+    *joint, found = spread(lambda stage: stage(), [*stages, partial(_by_themselves, prepared, methods)])
+    return with_joint(found, *joint) if joint else found
 
 
 def _by_themselves(prepared, methods):
@@ -350,8 +342,8 @@ def with_joint(calibration, joint):
     platform = calibration.platform
     if isinstance(joint, str):
         return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
-    cameras, made = joint.observations.cameras, {}
-    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
+    cameras = joint.observations.cameras
+    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance

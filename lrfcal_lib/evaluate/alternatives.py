@@ -25,7 +25,6 @@ FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
 ALIKE = 0.15  # log odds; sides are expected to deviate no more than this while statements are weighed
 LEVER = 0.2  # metres, weighs turns against shifts
-LARGER = ("larger", "smaller")
 BETTER = 3.0  # times less scatter of ranges with the other sense
 AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
 
@@ -48,11 +47,11 @@ class Alternative:
     """
 
     change: Callable
-    worth: float
-    unit: float
-    signs: tuple
     words: str
     remedy: str
+    signs: tuple = ("larger", "smaller")
+    worth: float = 0.004
+    unit: float = 100.0
 
 
 def _views(obs, s):
@@ -61,40 +60,43 @@ def _views(obs, s):
     return replace(obs, view_pose=pose)
 
 
+def _bearings(obs, s):
+    turned = (MIDDLE + (bearing - MIDDLE) * (1 + s) for bearing in (obs.face_bearing, obs.beam_bearing))
+    return replace(obs, **dict(zip(("face_bearing", "beam_bearing"), turned, strict=True)))
+
+
+def _lag(obs, s):
+    late = {"face_pitch": s * obs.direction[obs.face_placement], "beam_pitch": s * obs.direction[obs.beam_placement]}
+    return replace(obs, **{name: getattr(obs, name) + by for name, by in late.items()})
+
+
 ALTERNATIVES = {
     "squares": Alternative(
-        _views, 0.004, 100.0, LARGER, "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
+        _views, "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
     "outline": Alternative(
-        lambda obs, s: replace(obs, corners=obs.corners * (1 + s)), 0.004, 100.0, LARGER,
+        lambda obs, s: replace(obs, corners=obs.corners * (1 + s)),
         "the board's outline is {size} +- {sigma} % {sign} than stated", "measure the board's edges",
     ),
     "ranges": Alternative(
-        lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)), 0.004, 100.0,
-        ("too short, or board and squares smaller than stated", "too long, or board and squares larger than stated"),
-        "all ranges are {size} +- {sigma} % {sign}",
+        lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)), "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
+        ("too short, or board and squares smaller than stated", "too long, or board and squares larger than stated"),
     ),
     "bearings": Alternative(
-        lambda obs, s: replace(obs, **{
-            f"{group}_bearing": MIDDLE + (getattr(obs, f"{group}_bearing") - MIDDLE) * (1 + s)
-            for group in ("face", "beam")
-        }), 0.004, 100.0, ("small", "large"),
-        "bearings are {size} +- {sigma} % too {sign}", "check the angular step that session.json states",
+        _bearings, "bearings are {size} +- {sigma} % too {sign}",
+        "check the angular step that session.json states", ("small", "large"),
     ),
     "spot": Alternative(
-        lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)), 0.2, 100.0, LARGER,
+        lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
-        "check spot_exit_m and spot_divergence_rad, or leave them out",
+        "check spot_exit_m and spot_divergence_rad, or leave them out", worth=0.2,
     ),
     "lag": Alternative(
-        lambda obs, s: replace(obs, **{
-            f"{group}_pitch": getattr(obs, f"{group}_pitch") + s * obs.direction[getattr(obs, f"{group}_placement")]
-            for group in ("face", "beam")
-        }), np.radians(0.05), np.degrees(1.0), ("late", "early"),
-        "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
+        _lag, "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
+        ("late", "early"), np.radians(0.05), np.degrees(1.0),
     ),
 }  # fmt: skip
 
@@ -169,9 +171,9 @@ def not_an_offset(solution):
 
     Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with the offset held.
     """
-    names, offset = solution.solution.names, solution.sensor["range_offset"]
-    if "range_offset" in names:
-        square = (offset / solution.solution.trusted_sigma[names.index("range_offset")]) ** 2
+    offset, sigma = solution.sensor["range_offset"], solution.sigma.get("range_offset")
+    if sigma is not None:
+        square = (offset / sigma) ** 2
         best = weigh(solution, HELD)[0] if square > ASKED**2 else None
         asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and abs(best.value) > LEAST_INSTEAD
         if asked and best.kind == "bearings":

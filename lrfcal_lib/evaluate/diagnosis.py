@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from lrfcal_lib.calibrate.observe import rough_poses
-from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.calibrate.observe import board_maps, rough_poses
 from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import lrf_to_source
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.preprocess.steadiness import camera_steadiness
@@ -44,26 +42,8 @@ def diagnose(prepared, pitch_errors=None):
     `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
     """
     steadiness = {camera: camera_steadiness(prepared, camera) for camera in prepared.views}
-    return Diagnosis(steadiness, board_bends(prepared, board_maps(prepared)), pitch_errors, dict(prepared.problems))
-
-
-def board_maps(prepared):
-    """Where points of each sweep lie on the board, through the first camera that sees it: dict of int to callable.
-
-    From LRF points (n, 3) and their pitch (n,) to the board frame (n, 3). Cameras posed from the planes alone, so good
-    to about a centimetre.
-    """
-    rough, _ = rough_poses(prepared)  # its findings are in the problems already
-    head, maps = platform_of(prepared), {}
-    for camera, T_camera_source in rough.items():
-        mount = prepared.session.cameras[camera].mount
-        for placement, view in prepared.views[camera].items():
-            if view.T_camera_board is not None and placement in prepared.scans and placement not in maps:
-                T, pitch = view.T_camera_board.inv() * T_camera_source, 0.0 if mount == "platform" else view.pitch
-                maps[placement] = lambda p_lrf, pitches, T=T, mount=mount, image_pitch=pitch: T.apply(
-                    lrf_to_source(p_lrf, pitches, head, mount, image_pitch)
-                )
-    return maps
+    maps = board_maps(prepared, rough_poses(prepared)[0])  # whose findings are in the problems already
+    return Diagnosis(steadiness, board_bends(prepared, maps), pitch_errors, dict(prepared.problems))
 
 
 def bends_table(bends):

@@ -54,8 +54,7 @@ def calibration_record(calibration, method, judged=None):
         "cameras": {c: _camera(calibration, c, method, found) for (c, name), found in every if name == method},
     }
     if method == "joint":  # what it says about range finder and pitch, and what it left out in words
-        joint = calibration.joint.solution
-        sigma = dict(zip(joint.solution.names, joint.solution.trusted_sigma.tolist(), strict=True))
+        joint, sigma = calibration.joint.solution, calibration.joint.solution.sigma
         sensor = {name: {"value": joint.sensor[name], "sigma": sigma[name]} for name in joint.sensor if name in sigma}
         record["sensor"] = sensor | {"noise": joint.noise, "excluded": list(joint.excluded.values())}
     return record
@@ -97,17 +96,9 @@ def file_hashes(session):
 
 def write_calibration(path, record):
     """Write a :func:`calibration_record` as JSON; NaN becomes null."""
-
-    def plain(value):
-        if isinstance(value, dict):
-            return {key: plain(v) for key, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not np.isfinite(value) else value
-
-    path = Path(path)
+    path, plain = Path(path), json.loads(json.dumps(record), parse_constant=lambda name: None)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(plain(record), indent=1, allow_nan=False) + "\n")
+    path.write_text(json.dumps(plain, indent=1) + "\n")
 
 
 def write_clouds(folder, calibration, method):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.special import ndtr
 
 from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
-from lrfcal_lib.fit.residuals import edge_shift, flip_sigma, named_blocks
+from lrfcal_lib.fit.residuals import named_blocks, rays
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
@@ -32,9 +30,7 @@ LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried a
 IMAGES = 3  # of each camera on the head, spread over the pitch angles at which every camera sees the board
 MARGIN = 0.02  # of the image, that a board keeps from its border
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
-Z_NODES = np.array([-3.0, -1.5, 0.0, 1.5, 3.0])  # distances of sampled beams from where readings flip, in softnesses
-ALONG = (np.arange(5) + 0.5) / 5  # an edge
-CHUNK = 400  # placements at a time: memory
+THINNED = 3  # times fewer ranges and beams than a placement has, each counted as often: time
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 LARGE, MOST = 0.5, 3  # of a direction, components above this share of the largest are named, and so many of them
 
@@ -98,55 +94,6 @@ def camera_poses(solution, name, pitch):
     return np.broadcast_to(geometry.pose_array(solution.camera_at(name, pitch)), (len(pitch), 3, 4))
 
 
-def measure_yield(solution, models, features=None):
-    """What a placement of this recording brings, by comparing its placements with what is predicted for the same poses.
-
-    `features`, shape (k, 3), is what the cameras see of the board (its pattern), metres; all over it when left out.
-    Returned are, by name, `bearing_step` and `pitch_step` of the scans (radians), `spot` (how the radius of a spot
-    grows with distance, and its constant), `background` (see :mod:`lrfcal_lib.fit.residuals`), `faces` and `cells`
-    (most ranges of a placement, and most beams about an edge), `features`, `face_share` and `edge_share` (of the beams
-    that hit a board, and of the information about its edges, that really arrive), and `pixels` (6,): standard
-    deviations of the board's pose in an image, relative to that from features at 1 px each.
-    """
-    obs, boards = solution.observations, solution.state.boards
-    radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
-    distance, spot = np.linalg.norm(boards[radius.index, :, 3], axis=1), np.array([0.0, 0.005])
-    if len(radius):
-        grows = np.ptp(distance) >= 0.1 and np.ptp(radius) >= 1e-6
-        spot = np.polyfit(distance, radius, 1) if grows else np.array([0.0, np.median(radius)])
-    cells = np.bincount(obs.beam_placement * len(obs.edges) + obs.beam_edge).max(initial=0)
-    features = _inner(solution, 8) if features is None else np.asarray(features, float)
-    background = np.median(obs.beam_background) if len(radius) else 0.0
-    faces, ratios = np.bincount(obs.face_placement, minlength=len(boards)), []
-    rate = SimpleNamespace(spot=spot, background=background, faces=faces.max(), cells=cells, features=features)
-    rate.bearing_step, rate.pitch_step = _step(obs, "bearing"), _step(obs, "pitch")
-    rate.face_share = rate.edge_share = 1.0
-    bare = replace(solution.state, sweeps=0 * solution.state.sweeps, sides=0 * solution.state.sides)
-    expected = _edge_information(bare, replace(solution.data, beam=_beams(boards, solution, rate)), solution.unknowns)
-    found = _edge_information(solution.state, solution.data, solution.unknowns)
-    hits = np.sum(_faces(boards, solution, rate)["used"] ** 2, axis=1)
-    for number, name in enumerate(solution.transforms):
-        mine = obs.view_camera == number
-        both = obs.view_covariance[mine], _view_covariance(obs.view_pose[mine], features, models[name])
-        ratios.append(np.sqrt(np.divide(*(np.diagonal(C, axis1=1, axis2=2) for C in both))))
-    rate.pixels = np.median(np.concatenate(ratios), axis=0) if len(obs.view_camera) else np.ones(6)
-    rate.face_share, rate.edge_share = _share(faces, hits), _share(found, expected)
-    return rate
-
-
-def _step(obs, name):
-    """Median step between neighbouring beams ('bearing') or scan lines ('pitch'), radians."""
-    group = obs.group("beam" if len(obs.beam_hit) else "face")
-    order = np.lexsort((group[name], group["placement"]))
-    steps = np.diff(group[name][order].round(7))[np.diff(group["placement"][order]) == 0]
-    return float(np.median(steps[steps > 1e-5])) if np.any(steps > 1e-5) else np.radians(0.5)
-
-
-def _share(found, expected):
-    good = (expected > 0) & (found > 0)
-    return float(np.clip(np.median(found[good] / expected[good]), 0.05, 1.5)) if good.any() else 1.0
-
-
 def _view_covariance(pose, features, model):
     """Covariance of board poses (n, 4, 4) in a camera from features of the board, 1 px each, shape (n, 6, 6)."""
     turned = geometry.rotate_points(pose[:, :3], features)
@@ -155,75 +102,47 @@ def _view_covariance(pose, features, model):
     return np.linalg.inv(np.einsum("nkai,nkaj->nij", J, J))
 
 
-def _inner(solution, number):
-    """Points spread over the board, shape (n, 3)."""
-    corners, middle = outline(solution), (np.arange(number) + 0.5) / number
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    x = low + np.stack(np.meshgrid(middle, middle, [0.0]), axis=-1).reshape(-1, 3) * (high - low)
-    side = np.cross(np.roll(corners, -1, axis=0) - corners, x[:, None] - corners)[..., 2]
-    return x[np.all(side > 0, axis=1) | np.all(side < 0, axis=1)]
+def typical_placement(solution):
+    """What the placement of median information recorded: data, state, and points (1, n, 3) of faces and of beams.
+
+    The points are where their rays meet the board's plane, metres in its frame.
+    """
+    told = np.diagonal(information(solution), axis1=1, axis2=2) @ scales_of(solution, solution.solution.names) ** 2
+    k, state, groups, points = np.argsort(told)[[len(told) // 2]], solution.state, {}, []
+    state = replace(state, boards=state.boards[k], sweeps=state.sweeps[k], sides=state.sides[k])
+    data = replace(solution.data, middle=solution.data.middle[k], direction=solution.data.direction[k])
+    for name, weight in (("face", THINNED**0.5), ("beam", THINNED)):  # a whitener of ranges, a number of beams
+        group, board = getattr(data, name), state.boards[0]
+        some = np.flatnonzero(group["used"][k[0]])[::THINNED]
+        groups[name] = {key: v[k][:, some] for key, v in group.items()} | {"used": np.full((1, len(some)), weight)}
+        o, d = rays(state, data, groups[name])[:2]
+        way = (board[:, 3] - o) @ board[:, 2] / (d @ board[:, 2])
+        points.append((o + way[..., None] * d - board[:, 3]) @ board[:, :3])
+    return replace(data, **groups), state, points
 
 
-def _sampled(boards, local, solution, rate):
-    """Beams to points of boards: bearing, pitch, range, direction (board frame), beams per square metre across it."""
-    points = geometry.apply_pose(boards, local)
-    bearing, pitch, distance = beams_to(points, solution.T_head_lrf)
-    ray = ((points - solution.T_head_lrf.translation) @ boards[:, :, :3]) / distance[..., None]
-    solid_angle = rate.bearing_step * rate.pitch_step * np.maximum(np.sin(bearing), 0.1)
-    return bearing, pitch, distance, ray, 1 / (distance**2 * solid_angle)
+def spot_growth(solution):
+    """Radius of the spot by distance, a polynomial."""
+    obs = solution.observations
+    radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
+    distance = np.linalg.norm(solution.state.boards[radius.index, :, 3], axis=1)
+    if len(radius) < 2 or np.ptp(distance) < 0.1 or np.ptp(radius) < 1e-6:
+        return np.array([0.0, radius.median() if len(radius) else 0.005])
+    return np.polyfit(distance, radius, 1)
 
 
-def _faces(boards, solution, rate):
-    """Weighted samples of the boards' faces: `used` is the root of how many beams there are (a whitener)."""
-    corners, local, stated = outline(solution), _inner(solution, 5), solution.observations.face_sigma
-    bearing, pitch, distance, ray, density = _sampled(boards, local, solution, rate)
-    area = np.linalg.norm(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)) / 2
-    number = density * np.abs(ray[..., 2]) * area / len(local)
-    used = np.sqrt(number * np.minimum(rate.face_share, rate.faces / number.sum(axis=1, keepdims=True)))
-    sigma = np.full(bearing.shape, np.median(stated) if len(stated) else 1.0)
-    rays = geometry.polar_to_points(1.0, bearing)
-    return {"range": distance, "bearing": bearing, "pitch": pitch, "sigma": sigma, "ray": rays, "used": used}
-
-
-def _beams(boards, solution, rate):
-    """Weighted samples of beams about the edges, as hits and as misses; `used`: how many of them read so."""
-    corners, n, edges = outline(solution), len(boards), len(solution.observations.edges)
-    along = np.roll(corners, -1, axis=0) - corners
-    length, edge = np.linalg.norm(along, axis=1), np.repeat(np.arange(edges), len(ALONG))
-    local = (corners[:, None] + ALONG[:, None] * along[:, None]).reshape(-1, 3)
-    direction, normal = (along / length[:, None])[edge], solution.observations.lines()[edge] * [1, 1, 0]
-    bearing, _, distance, ray, density = _sampled(boards, local, solution, rate)
-    across = np.linalg.norm(np.cross(ray, direction), axis=-1)
-    radius = np.maximum(np.polyval(rate.spot, distance), 1e-4)
-    step = np.sqrt(rate.bearing_step * rate.pitch_step) * distance
-    sigma = flip_sigma(np.exp(solution.sensor["edge_log_softness"]), radius, step)[0]
-    shift = edge_shift(solution.sensor["edge_log_odds"], radius, rate.background)[0]
-    # beams per metre off the edge; those near a corner are not used
-    number = density * np.maximum(length[edge] - 4 * radius, 0.0) * across / len(ALONG)
-    rows = np.sum((number * 4 * step).reshape(n, edges, -1), axis=2)
-    kept = np.minimum(1.0, rate.cells / np.maximum(rows, 1e-9))[:, edge] * rate.edge_share
-    number = number * sigma * (Z_NODES[1] - Z_NODES[0]) * kept
-    outside = (shift[..., None] - Z_NODES * sigma[..., None]) * (across / np.abs(ray[..., 2]))[..., None]
-    points = local[:, None] + outside[..., None] * normal[:, None]
-    bearing, pitch, _ = beams_to(geometry.apply_pose(boards, points.reshape(n, -1, 3)), solution.T_head_lrf)
-    chance = np.stack([ndtr(Z_NODES), ndtr(-Z_NODES)])[:, None]
-    number = number[:, None, :, None] * chance  # (n, 2, points, nodes): first the hits
-    bearing, pitch = (v.reshape(n, 1, -1, len(Z_NODES)) for v in (bearing, pitch))
-    group = {"bearing": bearing, "pitch": pitch, "edge": edge[:, None], "background": rate.background, "used": number}
-    group |= {"radius": radius[:, None, :, None], "step": step[:, None, :, None]}
-    group["hit"] = np.array([True, False])[:, None, None]
-    group = {name: np.broadcast_to(value, number.shape).reshape(n, -1) for name, value in group.items()}
-    return group | {"ray": geometry.polar_to_points(1.0, group["bearing"])}
-
-
-def _views(boards, pitches, solution, models, rate):
-    """Poses of the boards in all images."""
-    parts = []
-    for number, (name, mount) in enumerate(zip(solution.transforms, solution.observations.mounts, strict=True)):
+def _views(boards, pitches, solution, models, features):
+    """Poses of the boards in all images, as well known as the recorded ones are beside those from features at 1 px."""
+    obs, parts, corners = solution.observations, [], outline(solution)
+    features = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]) if features is None else features
+    for number, (name, mount) in enumerate(zip(solution.transforms, obs.mounts, strict=True)):
+        mine = obs.view_camera == number
+        recorded = np.diagonal(obs.view_covariance[mine], axis1=1, axis2=2)
+        expected = np.diagonal(_view_covariance(obs.view_pose[mine], features, models[name]), axis1=1, axis2=2)
+        pixels = np.sqrt(np.median(recorded / expected, axis=0)) if mine.any() else np.ones(6)
         for pitch in (pitches if mount == "head" else pitches[:, :1]).T:
             pose = geometry.pose_transform(camera_poses(solution, name, pitch)) * geometry.pose_transform(boards)
-            covariance = _view_covariance(pose.as_matrix(), rate.features, models[name])
-            covariance = covariance * np.outer(rate.pixels, rate.pixels)
+            covariance = _view_covariance(pose.as_matrix(), features, models[name]) * np.outer(pixels, pixels)
             camera = np.full(len(pitch), number)
             parts.append({"camera": camera, "pitch": pitch, "pose": pose.as_matrix(), "covariance": covariance})
     if not parts:
@@ -233,36 +152,48 @@ def _views(boards, pitches, solution, models, rate):
     return group | {"whitener": whitener, "used": np.ones(group["pitch"].shape, bool)}
 
 
-def _edge_information(state, data, unknowns):
-    """Sum of the information about the distances of edges, of each placement."""
-    block = named_blocks(state, data, unknowns).get("beam")
-    if block is None:
-        return np.zeros(len(state.boards))
-    shift = block.jacobian[..., unknowns.shared + 3 : unknowns.shared + 6]
-    return np.sum((np.linalg.norm(shift, axis=-1) * block.whitener) ** 2, axis=1)
-
-
-def candidate_information(boards, pitches, solution, models, rate):
+def candidate_information(boards, pitches, solution, models, features=None):
     """Information that each candidate would add about the shared unknowns, shape (n, c, c).
 
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images; `rate` is that of
-    :func:`measure_yield`. The candidate's own pose and sweep are eliminated; at the noise levels of the solution.
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. A candidate shows what the
+    typical placement of the recording showed, points of the face and beams about the edges, from where it stands: spots
+    grow with the distance, and beams get fewer the smaller the board looks. Cameras see `features` of it (k, 3), those
+    of its outline when left out. Its own pose and sweep are eliminated; at the noise levels of the solution.
     """
-    c, found = solution.unknowns.shared, []
-    for first in range(0, len(boards), CHUNK):
-        some = boards[first : first + CHUNK]
-        view = _views(some, pitches[first : first + CHUNK], solution, models, rate)
-        groups = {"face": _faces(some, solution, rate), "beam": _beams(some, solution, rate), "view": view}
-        for name, group in groups.items():
-            group["used"] = group["used"] * (len(getattr(solution.observations, f"{name}_placement")) > 0)
-        middle, direction = np.nanmean(groups["face"]["pitch"], axis=1), np.ones(len(some), int)
-        data = replace(solution.data, **groups, middle=middle, direction=direction)
-        sides = np.zeros((len(some), solution.state.sides.shape[1]))
-        state = replace(solution.state, boards=some, sweeps=np.zeros((len(some), 2)), sides=sides)
-        blocks = named_blocks(state, data, solution.unknowns).values()
-        hessian = sum(np.swapaxes(J, -1, -2) @ J for J in (whiten(block)[1] for block in blocks))
-        found.append(reduced_hessian(hessian, c) / solution.solution.inflation)
-    return np.concatenate([*found, np.zeros((0, c, c))])
+    (data, home, (face, beam)), n = typical_placement(solution), len(boards)
+    line, middle = data.lines[data.beam["edge"]], outline(solution).mean(axis=0, keepdims=True)
+    (_, distance, size), (pitch, away, seen) = (_as_seen(b, middle, solution.T_head_lrf) for b in (home.boards, boards))
+    spot = spot_growth(solution)
+    grown, off = np.polyval(spot, away) / np.polyval(spot, distance), np.sum((beam + [0, 0, 1.0]) * line, axis=-1)
+    most = np.sqrt(solution.data.face["used"].sum(axis=1).max() / max(THINNED * face.shape[1], 1))
+    factors = {"radius": grown, "step": away / distance, "used": np.minimum(seen / size, most)}
+    moved = beam + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
+    groups = {name: _beams(getattr(data, name), p, boards, solution) for name, p in (("face", face), ("beam", moved))}
+    groups["beam"] |= {key: groups["beam"][key] * factor for key, factor in factors.items()}
+    groups["face"]["used"] = groups["face"]["used"] * factors["used"]
+    groups["view"] = _views(boards, pitches, solution, models, features)
+    state = replace(home, boards=boards, sweeps=np.zeros((n, 2)), sides=np.repeat(home.sides, n, axis=0))
+    data = replace(data, **groups, middle=pitch[:, 0], direction=np.ones(n, int))
+    blocks = named_blocks(state, data, solution.unknowns)
+    hessian = sum(np.swapaxes(J, -1, -2) @ J for J in (whiten(block)[1] for block in blocks.values()))
+    return reduced_hessian(hessian, solution.unknowns.shared) / solution.solution.inflation
+
+
+def _as_seen(boards, middle, T_head_lrf):
+    """Pitch and range of beams to the middle (1, 3) of boards (n, 3, 4), and how wide a board looks, shapes (n, 1)."""
+    points = geometry.apply_pose(boards, middle)
+    _, pitch, away = beams_to(points, T_head_lrf)
+    cosine = np.abs(np.vecdot(points - T_head_lrf.translation, boards[:, None, :, 2])) / away
+    return pitch, away, np.sqrt(cosine) / away
+
+
+def _beams(group, points, boards, solution):
+    """The beams of a group to points (k, 3) of other boards (n, 3, 4)."""
+    bearing, pitch, distance = beams_to(geometry.apply_pose(boards, points), solution.T_head_lrf)
+    recorded = pitch / (1 + solution.sensor["pitch_scale"])
+    every = {key: np.broadcast_to(value, (len(boards), *value.shape[1:])) for key, value in group.items()}
+    ray = geometry.polar_to_points(1.0, bearing)
+    return every | {"bearing": bearing, "pitch": recorded, "range": distance, "ray": ray}
 
 
 @dataclass(frozen=True)
@@ -386,7 +317,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     field_of_view : tuple of float
         Bearings that the LRF measures, radians.
     features : ndarray, shape (k, 3), optional
-        See :func:`measure_yield`.
+        What the cameras see of the board (its pattern), metres.
     places : dict of str to sequence of float, optional
         Replaces entries of `PLACES`.
 
@@ -407,7 +338,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
             f"{low:.0f} to {high:.0f} deg: give other distances, wider limits, or check the calibration"
         )
     known = information(solution).sum(axis=0)
-    added = candidate_information(boards[rows], pitches, solution, models, measure_yield(solution, models, features))
+    added = candidate_information(boards[rows], pitches, solution, models, features)
     # what is not observed counts as known to a metre at 2 m, not better, so that it can be compared as well
     unit = np.multiply.outer(*[scales_of(solution, solution.solution.names)] * 2)
     covariances = (np.linalg.inv(H * unit + np.eye(len(unit))) * unit for H in (known, known + added))

@@ -452,7 +452,7 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         combined = combined_outlines(joint)
         measure["combined"] = lambda placement: combined.get(placement, (None, None))
         measure["fused"] = lambda placement: fused_outline_of(joint, placement)
-        measure["likelihood"] = lambda placement: likely_outline_of(prepared, placement, joint.edge_model(placement))
+        measure["likelihood"] = lambda p: likely_outline_of(prepared, p, joint.without.get(p, joint.solution))
     edges, rows = prepared.board.edges, []
     for variant, placement in product(measure, prepared.session.board_placements):
         measured, weak = None, None

@@ -308,12 +308,12 @@ def contradicts_stated(joint):
 
     What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
     """
-    solution, lrf, reasons, doubt = joint.solution.solution, joint.prepared.session.lrf, [], 0.0
+    lrf, reasons, doubt = joint.prepared.session.lrf, [], 0.0
     hopeless = not alternatives.plausible(joint.solution) or joint.solution.noise["face_scale"] > ABSURD
     if hopeless and (words := alternatives.other_sense(joint)):  # what else is found wrong comes from that
         return [Reason(NO, "sense", words)], doubt
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
-    sigma = dict(zip(solution.names, solution.trusted_sigma, strict=True))
+    sigma = joint.solution.sigma
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     asked, instead = _asked(joint)
     doubt = abs(offset) if instead in asked else 0.0

@@ -113,6 +113,11 @@ class JointSolution:
         return geometry.axis_of(self.T_head_lrf)
 
     @property
+    def sigma(self):
+        """Standard deviations to rely on of the shared unknowns, by name."""
+        return dict(zip(self.solution.names, self.solution.trusted_sigma.tolist(), strict=True))
+
+    @property
     def edge_bias(self):
         """Where readings flip with a background as far and bright as the board, spot radii outside the edge."""
         return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
