@@ -8,8 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate import next_placement
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
-from lrfcal_lib.evaluate.tables import range_residuals, view_residuals
-from lrfcal_lib.evaluate.uncertainty import beams_to, information
+from lrfcal_lib.evaluate.uncertainty import beams_to
 from lrfcal_lib.evaluate.verdict import diagnose, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry, apply_pose
 from lrfcal_lib.model.observations import JointObservations
@@ -49,14 +48,6 @@ def suggested(good):
     return next_placement.suggest_placement(solution, models_of(rig), features=CORNERS)
 
 
-def test_information_of_own_placements_is_predicted(good):
-    rig, _, solution = good
-    boards, pitches = solution.state.boards, solution.data.view["pitch"][:, :3]
-    forecast = next_placement.candidate_information(boards, pitches, solution, models_of(rig), CORNERS).sum(axis=0)
-    sigma, wanted = (np.sqrt(np.diag(np.linalg.inv(H))) for H in (forecast, information(solution).sum(axis=0)))
-    assert np.allclose(sigma, wanted, rtol=0.15)
-
-
 def test_the_suggested_placement_brings_what_it_promises(good, suggested):
     rig, poses, solution = good
 
@@ -81,20 +72,6 @@ def test_the_suggestion_in_words(suggested):
     assert fixed.words() == f"{ahead}, 20 deg to the right, upright"
     place.towards, place.lean, place.turn, place.elevation = "left", *np.radians([35, 60, -12])
     assert fixed.words().endswith("12 deg down, turned 60 deg in its plane, facing left by 35 deg")
-
-
-def test_candidates_stand_where_their_words_say(good):
-    head = good[2].T_head_lrf
-    angles = np.radians([[20.0], [10.0], [0.0]])
-    places, boards = next_placement.board_grid(good[2], (1.5,), *angles, np.radians([0.0, 30.0]))
-    p = head.inv().apply(boards[:, :, :3] @ [0.105, 0.38 / 3, 0.0] + boards[:, :, 3])
-    assert np.allclose(np.linalg.norm(p, axis=1), 1.5)
-    assert np.allclose(np.degrees(np.arctan2(-p[:, 0], p[:, 1])), 20)
-    assert np.allclose(np.degrees(np.arcsin(p[:, 2] / 1.5)), 10)
-    facing = dict(zip(places.towards, head.rotation.inv().apply(boards[:, :, 2]), strict=True))
-    assert np.allclose(facing[""], -p[0] / 1.5)  # upright boards face the LRF
-    assert facing["back"][2] > facing[""][2] > facing["forward"][2]
-    assert facing["left"][0] < facing[""][0] < facing["right"][0]
 
 
 def test_only_poses_that_all_see(good):
@@ -216,14 +193,3 @@ def test_large_errors_forbid_trust(good):
     wide = replace(solution, solution=replace(solution.solution, covariance=4e4 * solution.solution.covariance))
     found = verdict(wide, models_of(rig), suggest=False)
     assert found.answer == "no" and "the expected error at 2 m is" in found.sentences()[0]
-
-
-def test_residuals_are_what_the_noise_makes(good):
-    rig, _, solution = good
-    distance, residual = range_residuals(solution)
-    assert np.std(residual) == pytest.approx(rig.sigma_range, rel=0.05) and len(distance) == len(residual)
-    uv, shift = view_residuals(solution, "left", rig.model)
-    assert len(uv) == 24 and (uv > 0).all() and (uv < [rig.model.width, rig.model.height]).all()
-    assert 0.02 < np.sqrt(np.mean(shift**2)) < 0.5  # a board's middle is better known than a corner's 0.3 px
-    with pytest.raises(ValueError, match="got 'rear'"):
-        view_residuals(solution, "rear", rig.model)

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from synthetic import numeric
 
 from lrfcal_lib.model import camera as c
 
@@ -28,18 +27,6 @@ def test_undistort_undoes_the_lens(points):
 def test_points_behind_the_camera_are_nan():
     behind = np.array([0.1, 0.1, -1.0])
     assert np.isnan(c.project(behind, MODEL)).all() and np.isnan(c.pinhole(behind, MODEL)).all()
-
-
-def test_jacobians_are_the_numeric_ones(points):
-    for p in points[:5]:
-        by_point, by_intrinsics = c.project_jacobians(p, MODEL)
-        for found, function, at in (
-            (by_point, lambda x: c.project(x, MODEL), p),
-            (c.pinhole_jacobian(p, MODEL), lambda x: c.pinhole(x, MODEL), p),
-            (by_intrinsics, lambda k, p=p: c.project(p, MODEL.with_parameters(k)), MODEL.parameters),
-        ):
-            expected = numeric(lambda s, f=function, at=at: f(at + s), len(at))
-            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-5)
 
 
 def test_line_distance_is_signed_and_in_pixels():

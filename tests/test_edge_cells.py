@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_scan import HEAD, SQUARE, edge_points, scene, sweep_edges
+from test_scan import HEAD, edge_points, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
-from lrfcal_lib.preprocess.edges_in_scan import background_odds, edge_cells
+from lrfcal_lib.preprocess.edges_in_scan import edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
 LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)
@@ -82,11 +82,6 @@ def test_background_follows_from_its_distance(made, found):
     assert (cells.background < wall + 0.05).all() and (cells.background > wall - 0.6).all()
 
 
-def test_the_spot_is_taken_as_given(found):
-    cells = found[1]
-    np.testing.assert_allclose(cells.radius, (0.01 + 0.004 * cells.range_m) / 2)
-
-
 def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_close_wall_is_not(made):
     first = np.flatnonzero(made.on[75])[0]
 
@@ -100,20 +95,3 @@ def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_c
     assert not ((cells.line >= 50) & (cells.line < 65) & ~cells.across).any()
     _, near = cells_of(scene(wall=2.3, sigma=0.004))
     assert len(near) > 500 and not near.background.any()
-
-
-def test_clouds_cut_to_the_board_have_no_background(made):
-    _, cells = cells_of(made, change=lambda r: np.where(made.on, r, np.nan))
-    assert len(cells) > 500 and not cells.background.any()
-    np.testing.assert_array_equal(cells.hit, made.on[cells.line, cells.beam])
-
-
-def test_odds_of_backgrounds():
-    np.testing.assert_allclose(background_odds(1.0, [2.0, 1.5, np.inf]), [-2 * np.log(2.0), 0.0, 0.0])
-
-
-def test_single_shot_gives_cells_at_both_ends():
-    made = scene(pitch=(0, 0.001), sigma=0.002)
-    board = board_in_scan.find_board(made.sweep, SQUARE, HEAD)
-    cells = edge_cells(board, edge_points(board), None, LRF)
-    assert set(cells.side) == {0, 1} and not cells.across.any()

@@ -1,11 +1,9 @@
 """Tables of residuals, stereo check and edge lengths."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 
 from lrfcal_lib.evaluate import tables
@@ -34,15 +32,6 @@ def test_placements_without_which_too_little_is_left_do_not_count(observed):
     obs = observed[0.0]
     some = obs.select(obs.placements[:3])
     assert [len(found) for found in left_out(some, "zhang_pless", solve_camera(obs, "zhang_pless"))] == [0, 0]
-
-
-def test_stereo_check_is_zero_for_exact_cameras():
-    rng = np.random.default_rng(6)
-    T = {c: RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng)) for c in ("left", "right")}
-    solutions = {(camera, "line"): SimpleNamespace(transform=pose) for camera, pose in T.items()}
-    table = tables.stereo_check(solutions, ("left", "right"), T["right"] * T["left"].inv())
-    assert table.method.tolist() == ["line"]
-    assert table[["baseline_error_mm", "translation_error_mm", "rotation_error_deg"]].abs().max(axis=None) < 1e-6
 
 
 def test_the_method_handed_over_does_well_on_both_features():

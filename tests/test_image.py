@@ -1,6 +1,5 @@
 """Corners, intrinsics, poses, straight edges and outlines from images whose truth is computed, and from real ones."""
 
-import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,13 +13,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
-from lrfcal_lib.preprocess import edges_in_image, intrinsics, pattern_in_image, survey
+from lrfcal_lib.preprocess import edges_in_image, intrinsics, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
 from lrfcal_lib.preprocess.edges_in_image import picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders
-from lrfcal_lib.report.notebook import ROOT
-from lrfcal_lib.session.read import EdgePick, ImageRecord, open_session
+from lrfcal_lib.session.read import EdgePick, ImageRecord
 
 SIZE = 640, 480
 MODEL = CameraModel(*SIZE, 600.0, 598.0, 322.0, 236.0, np.array([-0.15, 0.05, 0.001, -0.0005, 0.0]))
@@ -153,20 +151,13 @@ def seen(picture, board=SHEET, picks=()):
 
 
 # squares along the pixel grid are the hard case of the sector-based detector (and no limit on real prints)
-@pytest.mark.parametrize(("roll", "limit"), [(0.0, 0.1), (-1.2, 0.05)])
-def test_corners_are_found_at_subpixel_level(roll, limit):
+@pytest.mark.parametrize(("roll", "negative", "limit"), [(0.0, False, 0.1), (-1.2, False, 0.05), (-1.2, True, 0.1)])
+def test_corners_are_found_at_subpixel_level(roll, negative, limit):
+    """Also of white squares on a dark board."""
     pose = pose_of(roll)
-    off = up_to_a_turn(find_pattern(render(pose)), on_board(pose, PATTERN.points()[:, :2], project))
+    picture = 255 - render(pose) if negative else render(pose)
+    off = up_to_a_turn(find_pattern(picture), on_board(pose, PATTERN.points()[:, :2], project))
     assert np.sqrt(np.mean(off**2)) < limit
-
-
-def test_white_squares_on_a_dark_board_are_found():
-    finder = PatternFinder(PATTERN)
-    for pose in view_poses(2, seed=4):
-        off = up_to_a_turn(finder(255 - render(pose)), pixels_of([pose])[0])
-        assert np.sqrt(np.mean(off**2)) < 0.1
-    # a finder that has seen the negative still finds the positive
-    np.testing.assert_array_equal(finder(render(pose)), find_pattern(render(pose)))
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
@@ -175,14 +166,6 @@ def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
     x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
     np.testing.assert_allclose(find_pattern(picture[..., 0]), find_pattern(picture), atol=0.01)
-
-
-@pytest.mark.parametrize("broken", ["sectors", "classic"])
-def test_the_second_detector_helps_where_the_first_fails(broken, monkeypatch):
-    picture = render(pose_of())
-    exact = find_pattern(picture)
-    monkeypatch.setattr(pattern_in_image, broken, lambda *a: None)
-    assert np.abs(up_to_a_turn(find_pattern(picture), exact)).max() < 0.3
 
 
 @pytest.mark.parametrize(("shape", "kind", "message"), [
@@ -197,44 +180,20 @@ def test_no_pattern_and_no_image(shape, kind, message):  # OpenCV refuses narrow
         find_pattern(np.full(shape, 90, kind))
 
 
-def drawn_plate(turn, square=18.0, middle=(230.0, 165.0)):
-    """A dark plate with a chessboard of 9 x 5 inner corners on paper, seen straight on and turned (degrees)."""
-    x, y = np.meshgrid(np.arange(460) - middle[0], np.arange(330) - middle[1])
-    c, s = np.cos(np.radians(turn)) / square, np.sin(np.radians(turn)) / square
-    u, v = c * x + s * y, c * y - s * x
-    shade, squares = np.full(x.shape, 160.0), 25.0 + 200.0 * ((u // 1 + v // 1) % 2)
-    for half, value in (((6.4, 4.7), 70.0), ((5.25, 3.25), 225.0), ((5.0, 3.0), squares)):
-        shade = np.where((np.abs(u) < half[0]) & (np.abs(v) < half[1]), value, shade)
-    return cv2.GaussianBlur(shade, (0, 0), 0.8).round().astype(np.uint8)
-
-
-@pytest.mark.parametrize("turn", [100, 280])
-def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(turn):
-    pattern, picture = Chessboard(9, 5, 0.036), drawn_plate(turn)
-    whole = find_pattern(picture, pattern)
-    for beyond in (-5, 3, 20):
+@pytest.mark.parametrize("roll", [1.7, -1.4])
+def test_a_pattern_that_the_image_cuts_is_not_taken_a_row_off(roll):
+    picture = render(pose_of(roll, (0.0, 0.0)))
+    whole = find_pattern(picture)
+    for beyond in (-5, 3, 45):
         try:
-            found = find_pattern(np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond]), pattern)
+            found = find_pattern(np.ascontiguousarray(picture[: int(whole[:, 1].max()) + beyond]))
         except PatternNotFound:
-            assert beyond < 18  # where all squares are seen it is found
+            assert beyond < 30  # where all squares are seen it is found
         else:
             assert np.abs(up_to_a_turn(found, whole)).max() < 0.3
 
 
 # --- adjustment ----------------------------------------------------------------------------------------------------
-
-
-def test_adjustment_jacobian_is_the_numeric_one():
-    mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])[:, :3]
-    poses, points = np.stack([p.as_matrix()[:3] for p in view_poses(2)]), PATTERN.points()
-    basis = intrinsics.waves(points)
-    state = np.stack([MODEL.parameters, MODEL.parameters * 1.05]), mounts, poses, np.linspace(-1e-3, 2e-3, 21)
-    pixels, jacobian = intrinsics.predict(state, points, basis)
-    analytic = jacobian.reshape(pixels.size, -1)
-    for i, step in enumerate(np.eye(analytic.shape[1])):
-        h = 1e-6 * max(1.0, np.abs(analytic[:, i]).max() ** -1)
-        up, down = (intrinsics.predict(intrinsics.moved(state, s * step), points, basis)[0] for s in (h, -h))
-        np.testing.assert_allclose((up - down).ravel() / (2 * h), analytic[:, i], rtol=2e-5, atol=2e-4)
 
 
 def test_intrinsics_without_noise_are_exact():
@@ -381,7 +340,7 @@ def test_an_edge_that_contradicts_the_corners_is_left_out():
 # --- edges ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("roll", [0.0, np.pi / 2, -2.5])
+@pytest.mark.parametrize("roll", [0.0, -2.5])
 def test_edges_of_a_known_board_at_any_roll(roll):
     pose = pose_of(roll)
     view = seen(render(pose))
@@ -536,37 +495,6 @@ def test_one_image_a_placement_is_the_middle_one_that_shows_the_board(session):
     assert [v.file for v in one_each([replace(r, pitch=np.nan) for r in records[:3]], read)] == ["0_0.png"]
 
 
-def test_one_image_a_placement_of_a_plain_board_and_of_no_placement():
-    picture = render(triangle_pose(), TRIANGLE)
-    records, read = at_three_pitches(lambda r: picture, {"1_2"})
-    records += [replace(r, placement=-1, file=Path(f"/s/left/x{i}.png")) for i, r in enumerate(records[:2])]
-    shown = one_each(records, read, TRIANGLE)
-    assert [v.file for v in shown] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png", "x0.png", "x1.png"]
-    assert all(v.reason == "" for v in shown)
-
-
-def test_intrinsics_use_a_spread_of_the_images(monkeypatch):
-    pixels, used = pixels_of(view_poses(40)), []
-
-    def finder(r):
-        if r.placement == 0:
-            raise PatternNotFound("no board")
-        return pixels[r.placement]
-
-    def estimate(corners, *_):
-        used.append([int(np.flatnonzero((pixels == own).all(axis=(1, 2)))[0]) for own in corners])
-        raise ValueError("enough")
-
-    monkeypatch.setattr(survey, "PatternFinder", lambda pattern: finder)
-    monkeypatch.setattr(survey, "estimate_intrinsics", estimate)
-    for own in (20, 0):
-        records = [record("left", "a", i, purpose="intrinsics" if i < own else "board") for i in range(40)]
-        with pytest.raises(ValueError, match="camera 'left': enough"):
-            survey.survey(records, lambda r: SimpleNamespace(shape=BLANK.shape, **vars(r)), SHEET, {"left": None})
-    assert len(used[0]) == survey.VIEWS_FOR_INTRINSICS and set(range(1, 20)) <= set(used[0])
-    assert used[1] == list(range(1, 40))
-
-
 def test_surveys_that_cannot_work(session, surveyed):
     _, records, read = session
     both, triple = {"left": MODEL, "right": MODEL}, replace(UNKNOWN, edges=("a", "b", "c"))
@@ -637,13 +565,6 @@ def test_picked_edges_tell_which_side_is_which_and_all_of_them_need_no_detector(
     np.testing.assert_allclose(nearest(view, pose).T_camera_board.as_matrix(), pose.as_matrix(), atol=1e-6)
 
 
-def test_a_plain_quadrilateral_is_over_determined():
-    board = Board("slab", ("a", "b", "c", "d"), np.array([[0, 0], [0.4, 0], [0.35, 0.3], [0, 0.25]]))
-    pose = triangle_pose(at=(0.0, 0.0, 1.0))
-    view = view_board(render(pose, board), board, MODEL)
-    assert view.reason == "" and turned(view.T_camera_board, pose) < 0.02 and worst_edge(view, pose, board) < 0.05
-
-
 def test_plain_boards_that_cannot_be_used():
     blank = np.full((480, 640, 3), 200, np.uint8)
     square = Board("square", ("a", "b", "c", "d"), np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
@@ -660,23 +581,6 @@ def test_plain_boards_that_cannot_be_used():
 # --- a simulated session, and real recordings ----------------------------------------------------------------------
 
 
-def test_poses_in_a_simulated_session_are_as_good_as_they_say():
-    session = open_session(ROOT / "data" / "sim_quick")
-    truth, models, chi2 = json.loads((session.path / "truth.json").read_text()), {}, []
-    for name, info in session.cameras.items():
-        stated = truth["cameras"][name]["intrinsics"]
-        lens = [stated[key] for key in ("fx", "fy", "cx", "cy")]
-        models[name] = CameraModel(info.width, info.height, *lens, np.array(stated["distortion"]))
-    for view in (v for group in survey.views_of(session, models, one_per_placement=True).views.values() for v in group):
-        stated = truth["images"][f"images/{view.camera}/{view.file}"]["T_camera_board"]
-        turn = Rotation.from_rotvec(stated["rotation_vector_rad"])
-        exact = RigidTransform.from_components(stated["translation_m"], turn)
-        chi2.append(score(view.T_camera_board, view.covariance, exact))
-        assert len(view.edges) == 3
-    assert len(chi2) == len(session.cameras) * len(session.board_placements)
-    assert 0.2 < np.mean(chi2) < 2.0
-
-
 def test_real_cameras_edges_and_outline(lms400):
     found = lms400.prepared
     for camera, model in found.models.items():
@@ -689,15 +593,6 @@ def test_real_cameras_edges_and_outline(lms400):
         assert length == pytest.approx(0.858, abs=0.004), name
         assert found.outline.length_sd[name] < 0.007
     assert np.all(found.outline.line_sd < 0.0035)
-    ends = found.board.corners
-    for name, middle in zip(found.board.edges, (ends + np.roll(ends, -1, axis=0)) / 2, strict=True):
-        offsets = []  # of the edge where it is seen, by placement
-        for camera, views in found.views.items():
-            shown = {p: v.edge(name) for p, v in views.items() if v.edge(name)}
-            lines = {p: edges_in_image.board_line(views[p], e, found.models[camera]) for p, e in shown.items()}
-            offsets.append({p: line_distance(middle, line) for p, line in lines.items()})
-        left, right = offsets
-        assert np.median([abs(left[p] - right[p]) for p in left.keys() & right.keys()]) < 0.001, name
 
 
 def test_real_stereo(lms400):

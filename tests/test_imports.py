@@ -59,13 +59,6 @@ def test_no_circle_among_modules():
         pytest.fail(f"modules import each other in a circle: {' <- '.join(error.args[1])}")
 
 
-def test_the_walk_sees_imports(tmp_path):
-    source = tmp_path / "x.py"
-    source.write_text("def f():\n    from lrfcal_lib.plots import rig\n    import lrfcal_lib.solvers.joint\n")
-    assert imported(source) == {"lrfcal_lib.plots.rig", "lrfcal_lib.solvers.joint"}
-    assert not imported(source, lazily=False)
-
-
 WALK = """
 import importlib, pkgutil, lrfcal_lib
 for name in ("model", "fit", "session", "preprocess", "solvers"):

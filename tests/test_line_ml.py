@@ -4,15 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from notebook_runs import GOLDEN
-from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import camera_case, numeric
 
 from lrfcal_lib.evaluate.monte_carlo import observations, start_near
-from lrfcal_lib.fit.residuals import sight_normals
-from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.simulate.draw import ShotSetup, draw_shots
 from lrfcal_lib.solvers import solve_camera
-from lrfcal_lib.solvers.lines import edge_bias, freeze_intervals, interval_block, move_biased
 
 BIASES = (-0.5, -0.25, 0.0, 0.25, 0.5)
 
@@ -40,16 +35,6 @@ def test_the_bias_is_found_and_its_uncertainty_is_not_played_down(errors):
     assert (errors.bias_error.line_ml < 0.05).all() and errors.nees.line_ml.mean() < 1.2
 
 
-def test_score_is_the_derivative_of_the_cost():
-    rig, obs = camera_case(3, noise=1.0)
-    state = np.concatenate([pose_array(rig.T_camera_lrf), [[0.4], [0.0], [0.0]]], axis=1)
-    sight, lengths = sight_normals(obs.crossing_lines, obs.model)
-    frozen = (obs, sight, *freeze_intervals(state, obs, sight, lengths, 0.2))
-    block = interval_block(state, *frozen)
-    cost = numeric(lambda s: np.sum(interval_block(move_biased(state, s), *frozen).cost), 7)
-    np.testing.assert_allclose(block.jacobian.T @ block.residuals, cost, rtol=1e-4, atol=1e-2)
-
-
 def test_many_trials_equal_single_ones():
     setup = ShotSetup(bias=0.3)
     shots = draw_shots(setup, np.random.default_rng(5), 3)
@@ -60,24 +45,6 @@ def test_many_trials_equal_single_ones():
             one = {name: values[i : i + 1] for name, values in shots.items()}
             single = solve_camera(observations(one, setup), method, T0[i])
             np.testing.assert_allclose(single.parameters[0], batch.parameters[i], atol=1e-6)
-
-
-def test_the_start_does_not_matter():
-    setup = ShotSetup(bias=-0.2)
-    shots = draw_shots(setup, np.random.default_rng(7), 1)
-    rng = np.random.default_rng(8)
-    truth = RigidTransform.from_matrix(np.concatenate([shots["T_camera_lrf"][0], [[0, 0, 0, 1.0]]]))
-    turn = Rotation.from_rotvec(rng.normal(0, 0.15, (40, 3))) * truth.rotation
-    T0 = RigidTransform.from_components(truth.translation + rng.normal(0, 0.1, (40, 3)), turn)
-    pose = solve_camera(observations(shots, setup), "line_ml", T0).transform.as_matrix()
-    np.testing.assert_allclose(pose, np.broadcast_to(np.median(pose, axis=0), pose.shape), atol=1e-6)
-
-
-def test_bias_in_metres_follows_the_radius():
-    found = solve_camera(camera_case(10, noise=1.0)[1], "line_ml")
-    shift, sigma = edge_bias(found, 0.02)
-    assert (shift, sigma) == pytest.approx(tuple(0.02 * v for v in edge_bias(found)))
-    assert edge_bias(found, background=-1.0)[0] > edge_bias(found)[0]
 
 
 def test_boards_that_cannot_be_drawn_are_refused():

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from test_scan import facing
 
-from lrfcal_lib.calibrate.outline import face_surface, measure_outline
+from lrfcal_lib.calibrate.outline import measure_outline
 from lrfcal_lib.fit.residuals import edge_shift
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points
@@ -80,23 +80,6 @@ def test_the_wrong_odds_make_the_board_larger_by_twice_the_shift():
     shift = np.subtract(*(edge_shift(v, np.median(cells.radius))[0] for v in (-0.8, 0.4)))
     for name in BOARD.edges:
         assert wrong.lengths[name] - right.lengths[name] == pytest.approx(2 * shift, rel=0.15)
-
-
-def test_uncertain_odds_show_in_the_lengths():
-    cells, face, names = sweep(poses(1)[0], np.random.default_rng(3))
-    sure, common, each = (
-        measure_outline(cells, face, names, BOARD.edges, told(**given)).sigma["top"]
-        for given in ({}, {"sigma": {"edge_log_odds": 0.3}}, {"spread": 0.3})
-    )
-    assert common > each > 2 * sure  # what is common to opposite sides adds up, what differs adds in squares
-
-
-def test_a_bent_board_is_seen_as_such():
-    rng, pose = np.random.default_rng(4), facing(1.5, 20.0, 25.0, centre=(0.25, 0.2))
-    made = sweep(pose, rng, bend=0.25)  # 16 mm from the middle to the ends
-    assert np.abs(face_surface(made[1], MODEL)[1]).max() > 0.1
-    assert np.abs(errors(measure_outline(*made, BOARD.edges, MODEL))[0]).max() < 0.004
-    assert not face_surface(sweep(pose, rng)[1], MODEL)[1].any()
 
 
 def test_sides_that_were_not_seen_have_no_length():

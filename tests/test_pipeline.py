@@ -12,7 +12,7 @@ from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
-from lrfcal_lib.preprocess.prepared import PitchNoise, Prepared
+from lrfcal_lib.preprocess.prepared import Prepared
 
 SIGMA = (np.radians(0.5), 0.010)
 STATED = pipeline.stated_covariance(SIGMA)
@@ -34,11 +34,6 @@ def estimate(T_head_lrf, covariance, scatter=None):
     return SimpleNamespace(T_head_lrf=T_head_lrf, solution=Solution(**inner | {"covariance_placements": scatter}))
 
 
-def test_the_chart_of_the_axis_is_undone():
-    again = pipeline.axis_from_chart(chart_parameters(pose_array(head(0))))
-    assert max(axis_difference(axis_of(head(0)), again)) < 1e-12
-
-
 @pytest.mark.parametrize(("scale", "scatter", "wins"), [
     (1e-8, None, head(2)),
     (1e8, None, head(1)),
@@ -52,21 +47,10 @@ def test_the_better_known_axis_wins(scale, scatter, wins):
     assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
 
 
-def test_combining_keeps_what_no_data_can_show():
-    found, _ = pipeline.combine(estimate(head(2), STATED), (head(2), STATED))
-    np.testing.assert_allclose(found.as_matrix(), head(2).as_matrix(), atol=1e-12)
-
-
 def test_without_a_stated_platform_the_data_stand_alone():
     data = head(3)
     found, covariance = pipeline.combine(estimate(data, np.eye(4)), None)
     assert found is data and (covariance == np.eye(4)).all()
-
-
-def test_pitch_noise_grows_away_from_the_middle():
-    noise = PitchNoise(offset=0.003, stretch=0.04)
-    np.testing.assert_allclose(noise.sigma([0.1, 0.2], 0.1), [0.003, 0.005])
-    assert pipeline.pitch_noise(None) == PitchNoise()  # no pitch errors
 
 
 BOARD = triangle_board()

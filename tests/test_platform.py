@@ -5,20 +5,16 @@ from functools import partial
 
 import numpy as np
 import pytest
-import scipy.optimize
 import synthetic
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic import CORNERS, TRIANGLE, edge_sweeps, numeric, sweep_boards
+from synthetic import CORNERS, TRIANGLE, edge_sweeps, sweep_boards
 
-from lrfcal_lib.fit.residuals import move_head, prior_terms
-from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, head_from_axis, lrf_to_platform, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, head_from_axis, lrf_to_platform
 from lrfcal_lib.model.observations import PlatformObservations
-from lrfcal_lib.solvers import pitch as pitch_solver
 from lrfcal_lib.solvers import platform
-from lrfcal_lib.solvers.pitch import MODELS, estimate_pitch_errors
-from lrfcal_lib.solvers.platform import projected_block, solve_platform, solve_projected
+from lrfcal_lib.solvers.pitch import estimate_pitch_errors
+from lrfcal_lib.solvers.platform import solve_platform, solve_projected
 
 DIRECTION = np.array([0.9993, 0.02, -0.0317])
 TRUTH = head_from_axis(geometry.TiltAxis(DIRECTION / np.linalg.norm(DIRECTION), np.array([0.0, -0.05, -0.12])))
@@ -74,14 +70,6 @@ def pairs(obs, placements):
     return [[np.flatnonzero((obs.edge_placement == p) & (obs.edge_number == e)) for e in (1, 2)] for p in placements]
 
 
-@pytest.mark.parametrize("printed", [False, True])
-def test_projected_jacobian_against_a_numeric_one(printed):
-    obs, head = make(6, noise=1.0), pose_array(ROUGH)
-    groups, chart = pairs(obs, range(1, 21)), {"printed": printed}
-    J = numeric(lambda s: projected_block(move_head(head, s), obs, groups, **chart).residuals, 4)
-    np.testing.assert_allclose(projected_block(head, obs, groups, **chart).jacobian, J, rtol=1e-5, atol=1e-6)
-
-
 def test_level_edges_are_reported_not_divided_by_zero():
     rng = np.random.default_rng(7)
     upright = Rotation.from_euler("x", 90, degrees=True)
@@ -90,42 +78,6 @@ def test_level_edges_are_reported_not_divided_by_zero():
     assert "parallel to the x" in found.skipped[9] and miss(found)[1] < 1e-9
     with pytest.raises(DegenerateGeometry, match="projected fits: no placement can be used.*parallel to the x"):
         solve_projected(swept(rng, boards[-1:]), TRUTH)
-
-
-def platform_problem(seed, count, head, bend, sigma_pitch):
-    """Residuals of exact or noisy sweeps as a function of increments of the axis and, alike, of every board."""
-    *data, boards, _ = platform.prepare_boards(make(seed, count=count, noise=1.0), head)
-    state = (pose_array(head), np.array(list(boards.values())), np.full((count, 2), bend))
-
-    def blocks(step):
-        moved = platform.move_platform(state, (step[:4], np.tile(step[4:], (count, 1))))
-        return platform.platform_blocks(moved, *data, sigma_pitch)
-
-    return blocks
-
-
-def test_platform_jacobians_against_numeric_ones():
-    blocks = platform_problem(8, 4, ROUGH, 0.02, 1e-3)
-    for i, block in enumerate(blocks(np.zeros(12))):
-        J = numeric(lambda s, i=i: blocks(s)[i].residuals, 12)
-        used = np.repeat(np.any(block.whitener != 0, axis=(-1, -2)), block.size, axis=-1) if block.size > 1 else ...
-        np.testing.assert_allclose(block.jacobian[used], J[used], atol=2e-6)
-
-
-def test_prior_jacobian_against_a_numeric_one():
-    prior, head = PlatformPrior(TRUTH, 0.01, 0.02), pose_array(ROUGH)
-    J = numeric(lambda s: prior_terms(move_head(head, s), prior)[0], 4)
-    np.testing.assert_allclose(prior_terms(head, prior)[1], J, atol=1e-8)
-
-
-def test_projected_fits_agree_with_scipy():
-    obs = make(10, noise=0.5)
-    found = solve_projected(obs, ROUGH)
-    start, groups = pose_array(found.T_head_lrf), pairs(obs, found.placements)
-    theirs = scipy.optimize.least_squares(
-        lambda d: projected_block(move_head(start, d), obs, groups).residuals, np.zeros(4), xtol=1e-15, gtol=1e-15
-    )
-    np.testing.assert_allclose(theirs.x, 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("faces", [True, False])
@@ -165,11 +117,6 @@ def test_pitch_that_never_changes_leaves_the_axis_open():
     flat = replace(obs, edge_pitch=0 * obs.edge_pitch, face_pitch=0 * obs.face_pitch)
     with pytest.raises(DegenerateGeometry, match="do not determine .*offset of the axis"):
         solve_platform(flat, ROUGH)
-
-
-def test_one_placement_leaves_the_axis_uncertain():
-    found = solve_platform(make(17, count=1, noise=1.0), ROUGH).solution
-    assert found.covariance_placements is None and np.linalg.norm(found.trusted_sigma[2:]) > 0.02
 
 
 @pytest.mark.parametrize(("field", "value", "message"), [
@@ -237,16 +184,6 @@ def test_an_honest_platform_asks_for_nothing():
     assert 0.4 < np.std(scores) < 1.6
 
 
-def test_a_common_offset_cannot_be_seen():
-    """It turns the platform frame; the cameras' poses take it up."""
-    rig, sweeps = pitched(22, np.radians(1.0), 0.0)
-    found = estimate_pitch_errors(*sweeps)
-    assert abs(found.direction_offset) < 1e-8
-    T = found.models["none"].transforms["left"]
-    turned = rig.T_camera_lrf * RigidTransform.from_rotation(Rotation.from_rotvec([np.radians(1.0), 0, 0]))
-    np.testing.assert_allclose(T.as_matrix(), turned.as_matrix(), atol=1e-7)
-
-
 def test_offsets_and_stretches_of_single_sweeps_are_recovered():
     rng = np.random.default_rng(23)
     offset, stretch = np.radians(rng.normal(0, 0.3, 24)), rng.normal(0, 0.03, 24)
@@ -256,29 +193,6 @@ def test_offsets_and_stretches_of_single_sweeps_are_recovered():
     assert found.wanted == "sweep_stretch" and model.converged
     assert np.degrees(np.abs(model.offset - offset + offset.mean())).max() < 0.02
     assert np.abs(model.stretch - stretch).max() < 0.003
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_pitch_jacobians_against_numeric_ones(name):
-    _, sweeps = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))
-    data = pitch_solver.gather(*sweeps)
-    pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
-    state = (np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03))
-    shared = 12 + (name == "direction")
-
-    def blocks(step):
-        moved = pitch_solver.move_pitch_state(state, (step[:shared], np.tile(step[shared:], (5, 1))), name)
-        return pitch_solver.pitch_blocks(moved, data, name)
-
-    k = pitch_solver.pitch_blocks(state, data, name)[0].jacobian.shape[-1]
-    for i, block in enumerate(blocks(np.zeros(k))):
-        np.testing.assert_allclose(block.jacobian, numeric(lambda s, i=i: blocks(s)[i].residuals, k), atol=1e-7)
-
-
-def test_sweeps_all_one_way_have_no_direction_offset():
-    _, (cameras, direction, middle) = pitched(27, 0.0, 0.0)
-    found = estimate_pitch_errors(cameras, dict.fromkeys(direction, 1), middle)
-    assert np.isnan(found.direction_offset) and "direction" not in found.models
 
 
 def test_pitch_errors_need_cameras_on_the_base():

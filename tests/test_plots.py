@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from figure_checks import complaints
 from matplotlib.colors import to_hex
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
-from lrfcal_lib.evaluate.next_placement import Direction
 from lrfcal_lib.evaluate.uncertainty import SigmaMap
-from lrfcal_lib.model.board import Board, Chessboard, outline_lines
+from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel, pinhole, project, undistort
 from lrfcal_lib.plots import recording, results, rig
 from lrfcal_lib.session.read import Sweep
@@ -82,22 +81,10 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, scan):
     assert shown.mask[5, 0] and shown.mask.sum() == 1, "what did not come back stays blank"
 
 
-def test_range_image_numbers_lines_when_the_head_stands_still(ax, scan):
-    recording.range_image(ax, replace(scan.sweep, pitch=np.zeros(6)))
-    assert labels(ax)[1] == "scan line"
-
-
 def test_range_images_that_share_colours_are_cut_to_the_board(ax, scan):
     drawn = recording.range_image(ax, scan.sweep, scan.mask, (0.0, 2.5))
     assert drawn.get_clim() == (0.0, 2.5) and len(ax.figure.axes) == 1, "the colour bar is the caller's"
     assert ax.get_xlim() == pytest.approx((105, 74)), "6 deg beside the board, which is seen from 80 to 99 deg"
-
-
-def test_scan_line_is_to_scale_with_the_board_in_the_colour_of_the_lrf(ax, scan):
-    recording.scan_line(ax, scan.sweep, 2, scan.mask, scan.fitted)
-    np.testing.assert_allclose(np.linalg.norm(lines_of(ax, "fit")[0].get_xydata(), axis=1), 2.001)
-    np.testing.assert_allclose(np.linalg.norm(lines_of(ax, "lrf")[0].get_xydata(), axis=1), 2.0)
-    assert ax.get_aspect() == 1 and labels(ax) == ("x [m]", "y [m]")
 
 
 @pytest.mark.parametrize(("end", "bearing"), [(1, 99.5), (-1, 79.5)])
@@ -109,14 +96,6 @@ def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
     assert mark.get_xdata()[0] == pytest.approx(bearing)
     with pytest.raises(ValueError, match="no beam of scan line 0 is on the board of placement 4"):
         recording.edge_of_line(ax, scan, 0)
-
-
-def test_crossings_are_coloured_by_side_and_the_rest_crossed_out(ax):
-    points = np.array([[0.1, 2.0, 0.0], [0.2, 2.0, 0.0], [-0.1, 2.0, 0.0], [0.0, 2.1, 0.0]])
-    side = np.array([0, 0, 3, -1])
-    recording.crossings(ax, SimpleNamespace(points=points, pitch=np.radians([1.0, 2, 3, 4]), side=side))
-    assert legend(ax) == ["side 0", "side 3", "not used"] and ax.get_aspect() == 1
-    assert lines_of(ax, "outlier")[0].get_ydata() == pytest.approx([4.0])
 
 
 def test_projection_picks_its_plane_and_draws_fits_over_their_points(ax):
@@ -145,25 +124,6 @@ def test_board_view_is_cut_to_the_board_and_names_what_is_missing(ax):
     assert ax.get_xlim()[1] == pytest.approx(320.0) and falls(ax.get_ylim())
 
 
-def test_board_view_without_anything_shows_the_whole_image(ax):
-    recording.board_view(ax, np.zeros((48, 64), np.uint8), a_view(), MODEL)
-    assert ax.get_xlim() == (-0.5, 63.5) and ax.get_ylim() == (47.5, -0.5)
-
-
-def test_points_of_two_methods_stay_apart(ax):
-    uv = {"line": np.array([[100.0, 90.0], [np.nan, np.nan]]), "zhang_pless": np.array([[404.0, 395.0]])}
-    view = a_view(image_edge((200.0, 180.0), (201.0, 220.0)))
-    recording.seen_points(ax, view, np.zeros((480, 640, 3), np.uint8), MODEL, uv, 30)
-    assert legend(ax) == ["edge in the image", "line", "zhang_pless"]
-    assert [line.get_marker() for line in ax.lines[1:]] == ["o", "x"]
-    assert ax.get_xlim() == (70.0, 434.0) and ax.get_title() == "right, placement 3"
-
-
-def test_pictures_are_shown_in_their_colours(ax):
-    recording.picture(ax, np.full((2, 2, 3), [255, 0, 0], np.uint8))  # blue first
-    assert ax.images[0].get_array()[0, 0].tolist() == [0, 0, 255]
-
-
 def test_dark_pictures_are_brightened_and_say_so(ax):
     recording.picture(ax, np.full((8, 8, 3), [10, 20, 50], np.uint8))
     assert ax.images[0].get_array()[0, 0].tolist() == [150, 60, 30] and texts(ax.texts) == ["brightened 3.0 times"]
@@ -175,55 +135,6 @@ def test_board_plan_has_sizes_and_squares_where_they_are(ax):
     assert texts(ax.texts) == ["AB 300.0 mm", "BC 500.0 mm", "CA 400.0 mm"] and ax.get_aspect() == 1
     squares = np.array([p.get_xy() for p in ax.patches[1:]])
     assert len(squares) == 6 and np.allclose(squares.min(axis=0), 0.01), "half of 4 x 3, one square before the first"
-
-
-def test_outline_tells_lengths_and_exaggerated_spread(ax):
-    corners = np.array([[0.0, 0.0], [0.8, 0.0], [0.8, 0.6], [0.0, 0.6]])
-    board = Board("b", ("top", "right", "bottom", "left"), corners, Chessboard(3, 2, 0.1, (0.2, 0.2)))
-    spread = np.array([0.001, 0.002, np.nan, 0.001])
-    measured = SimpleNamespace(lines=outline_lines(corners), line_sd=spread, board=board)
-    recording.outline(ax, measured, exaggerate=10)
-    assert texts(ax.texts) == ["top\n800.0 mm", "right\n600.0 mm", "bottom\n800.0 mm", "left\n600.0 mm"]
-    assert len(ax.patches) == 3, "no band where there is no spread"
-    assert np.ptp(ax.patches[0].get_xy()[:, 1]) == pytest.approx(0.02)
-
-
-def test_residual_strips_show_every_residual_in_its_placement_and_the_rms(ax):
-    placement, residuals = np.array([7, 3, 3, 7, 7, 12]), np.array([1.0, -2.0, 2.0, 1.0, 1.0, 0.5])
-    results.residual_strips(ax, residuals, placement, "distance [mm]", "red")
-    dots = max(ax.lines, key=lambda line: len(line.get_xdata()))
-    np.testing.assert_array_equal(np.rint(dots.get_xdata()), [1, 0, 0, 1, 1, 2])
-    assert len(set(dots.get_xdata())) == 6, "side by side"
-    np.testing.assert_array_equal(dots.get_ydata(), residuals)
-    np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [4.0, 2.0, 1.0])
-    assert texts(ax.get_xticklabels()) == ["3", "7", "12"] and sum(ax.get_ylim()) == pytest.approx(0.0)
-
-
-def test_pitch_offsets_are_in_degrees_and_apart_by_direction(ax):
-    results.pitch_offsets(ax, [1, 2, 3], np.radians([0.3, -0.2, 0.1]), np.radians([0.1, 0.1, 0.1]), [1, -1, 1])
-    heights = {round(bar.get_x() + bar.get_width() / 2): bar.get_height() for bar in ax.patches}
-    assert heights == pytest.approx({0: 0.3, 1: -0.2, 2: 0.1}) and legend(ax) == ["upwards", "downwards"]
-
-
-def test_parameter_comparison_draws_bars_only_where_a_sigma_is_known(ax):
-    results.parameter_comparison(ax, {"line": 1.0, "bauermann": 2.0}, {"line": 0.2, "bauermann": np.nan}, "tx [mm]")
-    assert [len(c.lines[2]) for c in ax.containers] == [1, 0]
-    assert falls(ax.get_ylim()) and texts(ax.get_yticklabels()) == ["line", "bauermann"], "first method on top"
-
-
-def test_edge_errors_show_each_edge_and_the_mean(ax):
-    results.edge_errors(ax, {"last beam": [-5.0, -3.0], "half step": [1.0, 2.0, 0.0]})
-    means = [line.get_xdata()[0] for line in ax.lines if line.get_linewidth() == 2.5]
-    assert means == pytest.approx([-4.0, 1.0]) and texts(ax.get_yticklabels()) == ["last beam", "half step"]
-
-
-@IN_SPACE
-def test_frames_draw_the_columns_of_their_rotation(ax):
-    pose = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, 0.2, 0.3]))
-    rig.frames(ax, {"left": pose}, length=0.5)
-    tips = np.array([np.array(line.get_data_3d())[:, 1] for line in ax.lines])
-    np.testing.assert_allclose(tips, pose.translation + 0.5 * pose.rotation.as_matrix().T)
-    assert [to_hex(line.get_color()) for line in ax.lines] == list(recording.AXES_RGB)
 
 
 def test_feature_surfaces_lie_where_the_feature_puts_them():
@@ -239,13 +150,6 @@ def test_feature_surfaces_lie_where_the_feature_puts_them():
     line, face, parallel = ((curve - point) @ direction for curve in curves)
     np.testing.assert_allclose(line, [-2.0, 2.0])
     np.testing.assert_allclose(np.r_[face, parallel], np.repeat([0.0, 0.4], 5), atol=1e-12)
-
-
-@IN_SPACE
-def test_space_is_to_scale(ax):
-    rig.rays(ax, np.zeros(3), np.eye(3))
-    rig.space(ax, [[0, 0, 0], [1.0, 2.0, 4.0]])
-    assert ax._box_aspect[2] / ax._box_aspect[0] == pytest.approx(4.0) and ax.get_zlim() == (0.0, 4.0)
 
 
 IDENTITY = RigidTransform.identity()
@@ -267,12 +171,6 @@ def test_measured_edges_lie_on_the_rendered_corners(ax):
     picture = rig.render(cloud, np.zeros((2, 3)), IDENTITY, (100, 120), 150, splat=0)
     drawn = np.rint(ax.lines[0].get_xydata()).astype(int)
     assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == ["BC 499.0 mm\ntrue 500.0 mm"]
-
-
-@IN_SPACE
-def test_lines_in_space_are_named(ax):
-    rig.lines(ax, {"tilt axis": ("red", np.array([[0.0, 0, 0], [1, 0, 0]]))})
-    assert [line.get_label() for line in ax.lines] == ["tilt axis"]
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
@@ -300,12 +198,6 @@ def test_look_at_refuses_an_impossible_view(eye):
         rig.look_at(eye, [0, 0, 1])
 
 
-def test_every_sensor_has_one_colour_of_its_own():
-    assert len(set(recording.COLORS.values())) == len(recording.COLORS)
-    assert recording.color_of("left") == recording.COLORS["left"]
-    assert recording.color_of("cam0", 9) == recording.SERIES[1]
-
-
 SIGMA = SigmaMap(np.array([10.0, 20, 30]), np.array([5.0, 15]), np.array([1.0, 2.0]), np.array([
     [[1.0, 2, 3], [4, 5, 6]], [[np.inf, np.inf, np.inf], [2, 2, 2]]]), {"axis": np.full((2, 2, 3), 1e-3),
     "range noise": np.zeros((2, 2, 3))})  # fmt: skip
@@ -329,26 +221,6 @@ def test_map_of_points_in_degrees_and_millimetres(ax):
     assert falls(ax.get_xlim())  # bearings grow to the left, as one sees them
 
 
-def test_parts_of_a_point_by_distance(ax):
-    results.point_parts(ax, replace(SIGMA, sigma=SIGMA.sigma[:, 1:]))
-    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
-    assert set(drawn) == {"axis", "calibration"} and np.allclose(drawn["axis"], 1.0)
-    assert labels(ax) == ("distance [m]", "standard deviation [mm]")
-
-
-def test_observability_bars_name_what_is_lost(ax):
-    results.observability_bars(ax, [Direction("the range offset", np.inf), Direction("the edge bias", 0.002)])
-    assert texts(ax.texts) == [" not determined", " 2 mm"] and ax.get_title() == "1 motions are not determined"
-    assert texts(ax.get_yticklabels()) == ["the range offset", "the edge bias"]
-    assert [to_hex(p.get_facecolor()) for p in ax.patches] == [recording.COLORS["outlier"], recording.COLORS["fit"]]
-
-
-def test_misfit_bars_mark_outliers(ax):
-    results.misfit_bars(ax, {1: 1.0, 4: 0.9, 7: 9.0})
-    assert to_hex(ax.patches[2].get_facecolor()) == recording.COLORS["outlier"]
-    assert ax.get_title() == "1 of 3 placements fit much worse than the others"
-
-
 def test_residuals_by_range_show_a_trend(ax):
     distance = np.linspace(1, 3, 200)
     results.residuals_by_range(ax, distance, 0.001 * (distance - 2))
@@ -362,11 +234,6 @@ def test_residuals_by_region_are_arrows(ax):
     arrows = ax.collections[0]
     assert np.allclose([arrows.U, arrows.V], [[3.0], [4.0]]) and arrows.scale == pytest.approx(5 / 80)
     assert ax.get_title() == "left: 5 px rms, predicted - seen" and ax.get_ylim() == (480, 0)
-
-
-def test_residuals_of_a_camera_without_boards(ax):
-    results.residuals_by_region(ax, np.zeros((0, 2)), np.zeros((0, 2)), MODEL, "right")
-    assert ax.get_title() == "right: no board in any image"
 
 
 FAULTS = {

@@ -61,12 +61,3 @@ def test_zhang_pless_reaches_the_reference(cameras):
     stereo = found["right"] * found["left"].inv()
     assert 1000 * np.linalg.norm(stereo.translation) == pytest.approx(117.76, abs=0.02)
     np.testing.assert_allclose(np.degrees(stereo.rotation.as_rotvec()), [0.529, 0.330, -0.014], atol=2e-3)
-
-
-def test_weights_leave_the_planes_about_as_well_fitted(cameras):
-    for side, limit in (("left", 7.1), ("right", 7.25)):
-        found = solve_camera(cameras[side], "zhang_pless")
-        assert 1000 * np.sqrt(np.mean(plane_residuals_m(cameras[side], found.transform) ** 2)) < limit
-        assert np.all(found.sigma_placements[3:] > 3 * found.sigma[3:])  # errors are common to a placement
-
-

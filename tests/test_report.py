@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 
 import matplotlib.pyplot as plt
 import nbformat
@@ -20,7 +19,6 @@ from shared import ROOT
 from test_session import wall, write
 
 from lrfcal_lib.report import notebook, report
-from lrfcal_lib.report.page import formula
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 GOOD = """
@@ -163,13 +161,6 @@ def test_nothing_is_cut_off_and_nothing_fetched(finished, stored, browser, width
     view.close()
 
 
-def test_a_displayed_formula_can_be_broken():
-    made = formula(r"a = b + \left( c + d \right), \qquad e = \frac{1}{2}", display=True)
-    parts = re.findall("<math.*?</math>", made)
-    assert [re.sub("<[^>]+>", "", part) for part in parts] == ["a", "=b", "+(c", "+d),", "e", "=12"]
-    assert formula("a = b").count("<math") == 1
-
-
 def test_tables_and_findings_are_kept_as_data_and_only_what_a_report_wrote_is_removed(finished):
     out, _ = finished
     assert (out / "tables" / "errors.csv").read_text() == "method,error_mm\njoint,-2\nline_ml,\n"
@@ -203,29 +194,6 @@ def wait_until_there(line):
 
 def parts(folder):
     return [*folder.glob(".report-*"), *folder.glob(".lrfcal-*")]
-
-
-def keys(out):
-    return [found["key"] for found in json.loads((out / "findings.json").read_text())]
-
-
-def test_two_reports_at_once_lose_nothing(session, tmp_path, line):
-    out = tmp_path / "out"
-    other = write_notebook(tmp_path / "05_other.ipynb", GOOD, 'notebook.finding("other", 1, "Other")')
-    late, runs = [waiting(tmp_path / "00_late.ipynb", tmp_path)], []
-    slow = threading.Thread(target=lambda: runs.extend(report.make_report(session, out, notebooks=late)))
-    slow.start()
-    wait_until_there(line)
-    assert [run.error for run in report.make_report(session, out, notebooks=[other])] == [""]
-    assert keys(out) == ["other"]
-    (out / "mine.txt").write_text("kept")
-    (out / "mine" / "figures").mkdir(parents=True)
-    os.write(line[1], b".")
-    slow.join()
-    assert [run.error for run in runs] == [""]
-    assert keys(out) == ["late"] and parts(tmp_path) == []
-    written = ["00_late.html", "findings.json", "index.html", "mine.txt"]
-    assert sorted(path.name for path in out.glob("*.*")) == written and (out / "mine" / "figures").is_dir()
 
 
 RUN = """import sys, pathlib
@@ -303,24 +271,6 @@ def test_outside_a_report_run_nothing_is_written(monkeypatch, tmp_path):
     made = notebook.table(pd.DataFrame({"a": [0.12345]}), "numbers", digits=2).data
     assert notebook.report_file("cloud.ply") is None and list(tmp_path.iterdir()) == []
     assert ">0.12<" in made and "numbers" in made
-
-
-def test_saving_leaves_what_was_placed_by_hand(monkeypatch, tmp_path, recwarn):
-    monkeypatch.setenv("LRFCAL_REPORT", str(tmp_path))
-    with plt.rc_context():
-        notebook.set_up()
-        fig = plt.figure(layout="none")
-        fig.add_axes([0.1, -0.5, 0.8, 2.0])
-        notebook.save(fig, "by_hand", "Axes larger than the figure.")
-        fig.canvas.draw()
-    assert (tmp_path / "figures" / "by_hand.png").is_file() and not fig.get_layout_engine()
-    assert not [warning for warning in recwarn.list if "layout" in str(warning.message)]
-
-
-def test_an_unknown_number_is_said_to_be_unknown(capsys):
-    notebook.finding("x", np.float64("nan"), "Offset", "mm")
-    notebook.finding("y", -0.0001, "Offset", "mm")
-    assert capsys.readouterr().out == "Offset: unknown mm\nOffset: 0.000 mm\n"
 
 
 @pytest.mark.parametrize("name", ["../x", "A b", "", "x.png"])

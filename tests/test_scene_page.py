@@ -31,12 +31,6 @@ def test_the_page_holds_everything_itself(tmp_path):
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "nothing comes from the network"
 
 
-def test_too_many_points_are_thinned(tmp_path, monkeypatch):
-    whole = page(tmp_path).stat().st_size
-    monkeypatch.setattr(interactive, "MOST_POINTS", 500)
-    assert page(tmp_path).stat().st_size < whole - 1500 * 16
-
-
 @pytest.mark.parametrize("browser", [BY_THE_PROCESSOR], indirect=True, ids=["webgl"])
 def test_a_browser_draws_it(tmp_path, browser):
     view = browser.new_page(viewport={"width": 900, "height": 700})

@@ -8,7 +8,7 @@ from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.evaluate import uncertainty
-from lrfcal_lib.evaluate.uncertainty import Chain, beams_to, carried, point_sigma, projection_sigma
+from lrfcal_lib.evaluate.uncertainty import Chain, beams_to, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.simulate.draw import ShotSetup
@@ -41,21 +41,6 @@ def moved_points(chain, bearing, pitch, distance, change, image_pitch):
 def solved(request):
     obs, _, rig = draw(np.random.default_rng(3), 10, mount=request.param, pitch_step=np.radians(0.5))
     return rig, solve_joint(obs, required=False)
-
-
-@pytest.mark.parametrize(("mount", "camera"), [("head", CAMERA), ("platform", CAMERA), ("head", None)])
-def test_jacobian_of_the_chain(mount, camera):
-    rng = np.random.default_rng(0)
-    chain = random_chain(mount, rng, camera)
-    bearing, pitch, distance = rng.uniform(1.0, 2.0, 5), rng.uniform(-0.3, 0.3, 5), rng.uniform(1, 4, 5)
-    points, J, by_pitch = carried(chain, bearing, pitch, distance, 0.1)
-    assert np.allclose(points, moved_points(chain, bearing, pitch, distance, np.zeros(13), 0.1), atol=1e-12)
-    for column in range(13):
-        step = 1e-6 * np.eye(13)[column]
-        ends = [moved_points(chain, bearing, pitch, distance, s * step, 0.1) for s in (1, -1)]
-        assert np.allclose(J[..., column], (ends[0] - ends[1]) / 2e-6, atol=1e-7), uncertainty.COLUMNS[column]
-    turned = [moved_points(chain, bearing, pitch + s * 1e-6, distance, np.zeros(13), 0.1) for s in (1, -1)]
-    assert np.allclose(by_pitch, (turned[0] - turned[1]) / 2e-6, atol=1e-7)
 
 
 def test_beams_to_inverts_the_platform():
@@ -99,34 +84,9 @@ def test_point_sigma_is_what_perturbed_calibrations_show():
     assert (found.parts["axis"][0, [0, 2]] > 1e-5).all()
 
 
-def test_the_axis_cancels_at_the_pitch_of_the_image(solved):
-    rig, solution = solved
-    found = projection_sigma(solution, "left", rig.model, 2.0, (5, 5), image_pitch=0.0)
-    axis = found.parts["axis"][0]
-    assert (axis[0] > 0).all()
-    if rig.mount == "head":
-        assert axis[2].max() < 0.75 * axis[[0, 4]].min()  # the middle row is measured near the pitch of the image
-    else:
-        assert (found.parts["camera"] > found.sigma).any()  # errors of axis and camera compensate
-
-
-def test_scatter_over_placements_only_adds(solved):
-    rig, solution = solved
-    noise_only = replace(solution, solution=replace(solution.solution, covariance_placements=None))
-    plain, both = (projection_sigma(s, "right", rig.model, 2.0, (4, 3)).sigma for s in (noise_only, solution))
-    assert (both >= plain - 1e-12).all() and (both > plain).any()
-    assert point_sigma(solution, 1.5, 0.1, 2.0).parts["range noise"] == pytest.approx(rig.sigma_range, rel=0.1)
-
-
 def test_undetermined_motions_have_no_bound():
     chain = replace(random_chain("head", np.random.default_rng(5)), unseen=np.eye(13)[[2]])
     assert np.isinf(uncertainty.spread(chain, np.eye(13)[[[2], [5]]])).tolist() == [True, False]
-
-
-def test_errors_of_single_sweeps_count_in_the_cloud():
-    chain = replace(random_chain("head", np.random.default_rng(6), None, size=1e-9), sweep_sigma=(0.01, 0.1))
-    found = point_sigma(chain, np.pi / 2, [0.0, 0.2], 2.0)
-    assert np.allclose(found.sigma[0, :, 0], np.hypot(0.01, [0.0, 0.02]) * np.hypot(2.03, 0.05), rtol=0.03)
 
 
 def test_pixels_beyond_the_sweeps_stay_empty(solved):

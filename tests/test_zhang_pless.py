@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.optimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
-from synthetic import CORNERS, camera_case, camera_observations, numeric, random_board_poses, random_rig
+from synthetic import CORNERS, camera_case, camera_observations, random_board_poses, random_rig
 
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m
-from lrfcal_lib.model.camera import project
-from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import find_outlying_placements, planes, solve_camera
 from lrfcal_lib.solvers.planes import (
     board_whitener,
@@ -19,41 +17,9 @@ from lrfcal_lib.solvers.planes import (
     correct_and_compress,
     plane_block,
     plane_sets,
-    plane_terms,
 )
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
-
-
-@pytest.mark.parametrize("source", ["lrf", "platform"])
-def test_closed_form_is_exact_on_exact_data(source):
-    rig, obs = camera_case(1, source=source)
-    sets = plane_sets(obs)
-    triangles = compress(sets, 1.0)
-    assert planes.common_plane(triangles)[1] == (source == "lrf")
-    found = pose_transform(planes.closed_form(triangles, sets.boards, np.arange(12)[None], source == "platform")[0])
-    assert max(transform_difference(found, rig.T_camera_lrf)) < 1e-9
-
-
-def test_compression_keeps_every_sum_of_squares():
-    rig, obs = camera_case(3, noise=1.0, source="platform")
-    sets, rng = plane_sets(obs), np.random.default_rng(4)
-    triangles = compress(sets, 1.0)
-    for _ in range(5):
-        T = rig.T_camera_lrf * RigidTransform.from_components(rng.normal(size=3), Rotation.random(rng=rng))
-        found = np.sum(plane_block(pose_array(T), triangles, sets.boards).residuals ** 2)
-        assert found == pytest.approx(np.sum(plane_residuals_m(obs, T) ** 2), rel=1e-12)
-
-
-def test_plane_jacobians_against_numeric_ones():
-    rig, obs = camera_case(5, noise=1.0)
-    sets, pose = plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
-    triangles = compress(sets, 100.0)
-    _, by_pose, by_board = plane_terms(pose, triangles, sets.boards)
-    expected = numeric(lambda s: plane_terms(move_pose(pose, s), triangles, sets.boards)[0], 6)
-    np.testing.assert_allclose(by_pose, expected, atol=1e-6 * np.abs(by_pose).max())
-    expected = numeric(lambda s: plane_terms(pose, triangles, move_pose(sets.boards, np.tile(s, (12, 1))))[0], 6)
-    np.testing.assert_allclose(by_board, expected, atol=1e-6 * np.abs(by_board).max())
 
 
 def test_correlated_weighting_equals_the_full_covariance():
@@ -76,17 +42,6 @@ def test_correlated_weighting_equals_the_full_covariance():
     assert compressed == pytest.approx(expected, rel=1e-3)
 
 
-def test_robust_loss_resists_bad_board_poses():
-    rig, obs = camera_case(12, count=16, noise=1.0)
-    poses = obs.board_poses.copy()
-    poses[[2, 7], :3, 3] += 0.15 * poses[[2, 7], :3, 2]
-    spoiled = replace(obs, board_poses=poses)
-    plain = transform_difference(solve_camera(spoiled, "zhang_pless").transform, rig.T_camera_lrf)[1]
-    robust = transform_difference(solve_camera(spoiled, "zhang_pless", loss="cauchy").transform, rig.T_camera_lrf)[1]
-    assert robust < 0.03 < plain
-    assert set(find_outlying_placements(spoiled)[1]) == {3, 8}
-
-
 def test_joint_refinement_repairs_the_intrinsics():
     rig, obs = camera_case(13, count=25, noise=0.3, sigma_px=0.05)
     wrong = rig.model.with_parameters(rig.model.parameters + [8, -6, 5, -4, 0.02, -0.02, 0, 0, 0])
@@ -98,27 +53,7 @@ def test_joint_refinement_repairs_the_intrinsics():
     assert found.model.rms_px == pytest.approx(0.3 * 0.05 * np.sqrt(2), rel=0.15)
 
 
-def test_joint_solution_agrees_with_scipy(monkeypatch):
-    monkeypatch.setattr(planes, "plane_error", lambda obs, solution: 0.0)
-    rig, obs = camera_case(14, count=4, noise=1.0, source="platform")
-    ours = solve_camera(obs, "zhang_pless_joint")
-    sets = plane_sets(obs)
-    triangles, offset, _ = correct_and_compress(sets, pose_array(solve_camera(obs, "zhang_pless").transform))
-
-    def residuals(d):
-        pose = move_pose(pose_array(ours.transform), d[:6])
-        model = obs.model.with_parameters(ours.parameters[6:] + d[6:15] * 100)
-        boards = move_pose(obs.board_poses[:, :3], d[15:].reshape(-1, 6))
-        distances = plane_terms(pose, triangles, boards, offset)[0]
-        seen = project(obs.pattern_points @ boards[:, :, :3].swapaxes(1, 2) + boards[:, None, :, 3], model)
-        return np.concatenate([distances.ravel(), (seen - obs.pattern_pixels).ravel() / obs.pattern_sigma_px])
-
-    theirs = scipy.optimize.least_squares(residuals, np.zeros(15 + 24), xtol=1e-15, ftol=1e-15, x_scale="jac")
-    assert np.sum(ours.residuals**2) == pytest.approx(2 * theirs.cost, rel=1e-6)
-    np.testing.assert_allclose(theirs.x[:6], 0, atol=0.02 * ours.sigma[:6].max())
-
-
-def test_joint_refinement_bears_errors_common_to_a_placement(monkeypatch):
+def test_joint_refinement_bears_errors_common_to_a_placement():
     """Boards that bend by some millimetres must not bend the intrinsics."""
     rig, obs = camera_case(20, count=20, noise=1.0, sigma_px=0.1, source="platform", face=400)
     rng = np.random.default_rng(21)
@@ -128,10 +63,8 @@ def test_joint_refinement_bears_errors_common_to_a_placement(monkeypatch):
     found = solve_camera(bent, "zhang_pless_joint")
     own = plane_residuals_m(bent, found.transform, found.board_poses)
     assert found.board_poses.shape == (20, 4, 4) and np.sqrt(np.mean(own**2)) < 0.013
-    monkeypatch.setattr(planes, "plane_error", lambda obs, solution: 0.0)
-    without = solve_camera(bent, "zhang_pless_joint")
-    good, bad = (np.abs(f.model.parameters[:2] - rig.model.parameters[:2]).max() for f in (found, without))
-    assert good < 0.5 * bad
+    error = np.abs(found.model.parameters - rig.model.parameters)
+    assert (error < 3 * np.sqrt(np.diag(found.model.covariance))).all(), "and they know of it"
 
 
 def test_joint_refinement_needs_a_pattern():

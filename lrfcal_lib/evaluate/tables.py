@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -186,8 +186,10 @@ def left_out(obs, judge, method, full):
 
 def jointly_left_out(joint, camera):
     """The same of the joint estimate (JointCalibration), which is judged with its own platform and range offset."""
+    ready = joint.prepared
     for placement, solution in joint.without.items():
-        yield joint.seen_by(camera, solution).along().select([placement]), solution.camera(camera)
+        alone = replace(joint, prepared=replace(ready, scans={placement: ready.scans[placement]}))
+        yield alone.seen_by(camera, solution).along().select([placement]), solution.camera(camera)
 
 
 def left_out_residuals(pairs):

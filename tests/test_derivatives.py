@@ -1,0 +1,185 @@
+"""Derivatives that are worked out by hand are those of differences: one table of all residuals."""
+# ruff: noqa: B007,B023 (each function is used before the next one is made)
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joint_draws import draw, rng
+from scipy.spatial.transform import RigidTransform, Rotation
+from synthetic import camera_case, numeric
+from test_image import MODEL, PATTERN, pose_of, view_poses
+from test_platform import ROUGH, TRUTH, make, pairs, pitched
+from test_uncertainty import CAMERA, moved_points, random_chain
+
+from lrfcal_lib.evaluate.uncertainty import carried
+from lrfcal_lib.fit import residuals
+from lrfcal_lib.fit.least_squares import whiten
+from lrfcal_lib.fit.residuals import move_head, move_state, prior_terms
+from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.model import camera
+from lrfcal_lib.model.geometry import move_pose, pose_array
+from lrfcal_lib.preprocess import intrinsics, steadiness
+from lrfcal_lib.solvers import lines, pitch, planes, platform
+
+OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
+MARGINS = np.array([-0.03, -0.011, -0.004, -0.001, 0.0, 0.002, 0.006, 0.02])
+EVERY = residuals.Unknowns(2, 3, sensor=residuals.SENSOR, sweep="offset_stretch", sides=True)
+
+
+def projection():
+    points = rng(0).uniform([-1, -0.6, 1.5], [1, 0.6, 3], (5, 3))
+    by_point, by_intrinsics = camera.project_jacobians(points, MODEL)
+    yield by_point, lambda s: camera.project(points + s, MODEL), 3
+    yield camera.pinhole_jacobian(points, MODEL), lambda s: camera.pinhole(points + s, MODEL), 3
+    yield by_intrinsics, lambda s: camera.project(points, MODEL.with_parameters(MODEL.parameters + s)), 9
+
+
+def camera_methods():
+    rig, obs = camera_case(9, noise=1.0)
+    pose = pose_array(rig.T_camera_lrf * OFF)
+    for residual in (residuals.line_block, lines.distance_block, lines.point_block):
+        def block(s):
+            return residual(move_pose(pose, s), obs)
+
+        yield block(np.zeros(6)).jacobian, lambda s: block(s).residuals, 6
+        r, J = whiten(block(np.zeros(6)))  # with what the weights change
+        yield J.T @ r, lambda s: 0.5 * np.sum(whiten(block(s))[0] ** 2), 6
+
+
+def intervals():
+    rig, obs = camera_case(3, noise=1.0)
+    state = np.concatenate([pose_array(rig.T_camera_lrf), [[0.4], [0.0], [0.0]]], axis=1)
+    sight, lengths = residuals.sight_normals(obs.crossing_lines, obs.model)
+    frozen = (obs, sight, *lines.freeze_intervals(state, obs, sight, lengths, 0.2))
+    block = lines.interval_block(state, *frozen)
+    score = block.jacobian.T @ block.residuals
+    yield score, lambda s: np.sum(lines.interval_block(lines.move_biased(state, s), *frozen).cost), 7
+
+
+def board_planes():
+    rig, obs = camera_case(5, noise=1.0)
+    sets, pose = planes.plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
+    triangles, boards = planes.compress(sets, 100.0), sets.boards
+    _, by_pose, by_board = planes.plane_terms(pose, triangles, boards)
+    yield by_pose, lambda s: planes.plane_terms(move_pose(pose, s), triangles, boards)[0], 6
+    yield by_board, lambda s: planes.plane_terms(pose, triangles, move_pose(boards, np.tile(s, (12, 1))))[0], 6
+
+
+def tilt_axis():
+    obs, head, prior = make(6, noise=1.0), pose_array(ROUGH), PlatformPrior(TRUTH, 0.01, 0.02)
+    yield prior_terms(head, prior)[1], lambda s: prior_terms(move_head(head, s), prior)[0], 4
+    for printed in (False, True):
+        def block(s):
+            return platform.projected_block(move_head(head, s), obs, pairs(obs, range(1, 21)), printed=printed)
+
+        yield block(np.zeros(4)).jacobian, lambda s: block(s).residuals, 4
+    *data, boards, _ = platform.prepare_boards(make(8, count=4, noise=1.0), ROUGH)
+    state = head, np.array(list(boards.values())), np.full((4, 2), 0.02)
+
+    def blocks(s):
+        return platform.platform_blocks(platform.move_platform(state, (s[:4], np.tile(s[4:], (4, 1)))), *data, 1e-3)
+
+    for i, block in enumerate(blocks(np.zeros(12))):
+        used = np.repeat(np.any(block.whitener != 0, axis=(-1, -2)), block.size, axis=-1) if block.size > 1 else ...
+        yield block.jacobian[used], lambda s: blocks(s)[i].residuals[used], 12
+
+
+def recorded_pitch():
+    data = pitch.gather(*pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1])
+    pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
+    state = np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03)
+    for name in pitch.MODELS:
+        shared, count = 12 + (name == "direction"), pitch.pitch_blocks(state, data, name)[0].jacobian.shape[-1]
+
+        def blocks(s):
+            moved = pitch.move_pitch_state(state, (s[:shared], np.tile(s[shared:], (5, 1))), name)
+            return pitch.pitch_blocks(moved, data, name)
+
+        for i, block in enumerate(blocks(np.zeros(count))):
+            yield block.jacobian, lambda s: blocks(s)[i].residuals, count
+
+
+def single_beams():
+    """Cost, score and information of beams and of pairs of them, as the margin moves by its sigma."""
+    for sigma, half in ((0.0004, 0.001), (0.003, 0.005)):
+        def interval(s):
+            return residuals.interval_terms(MARGINS + sigma * s + half, MARGINS + sigma * s - half, sigma)
+
+        found = interval(0.0)
+        yield sigma * found[1][:, None], lambda s: interval(s[0])[0], 1
+    for hit in (True, False):
+        for lapse in (0.0, 0.01):
+            def beam(s):
+                return residuals.beam_terms(MARGINS + 0.004 * s, 0.004, hit, lapse)
+
+            yield 0.004 * beam(0.0)[1][:, None], lambda s: beam(s[0])[0], 1
+            assert (beam(0.0)[2] >= 0).all()
+        sharp = residuals.beam_terms(MARGINS, 0.004, hit)[2]
+        yield 0.004 * sharp[:, None], lambda s: residuals.beam_terms(MARGINS + 0.004 * s[0], 0.004, hit)[1], 1
+
+
+def joint_estimate():
+    """The gradient of each placement's cost, and for least squares the Jacobian itself."""
+    for mount in ("head", "platform"):
+        own = rng(1)
+        obs, truth, _ = draw(own, 3, mount=mount)
+        places = {name: getattr(obs, f"{name}_placement") for name in ("face", "beam", "view")}
+        obs = obs.keep(**{name: own.random(len(place)) < max(0.1, 9 / len(place)) for name, place in places.items()})
+        off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
+        state = move_state(truth, off, EVERY)
+        for lapse in (0, 0.05):
+            data = replace(residuals.gather(obs), lapse=lapse)
+
+            def block(s):
+                step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))
+                return residuals.named_blocks(move_state(state, step, EVERY), data, EVERY)[name]
+
+            def costs(s):
+                found = block(s)
+                return np.sum(found.cost if found.cost is not None else 0.5 * whiten(found, False)[0] ** 2, axis=1)
+
+            count = EVERY.shared + EVERY.own
+            for name in ("beam",) if lapse else ("face", "beam", "view", "sweep", "side"):
+                here = block(np.zeros(count))
+                r, J = whiten(here)
+                yield np.sum(r[..., None] * J, axis=1), costs, count
+                if here.cost is None:
+                    yield J, lambda s: whiten(block(s), False)[0], count
+
+
+def chain_of_a_rig():
+    for mount, pose in (("head", CAMERA), ("platform", CAMERA), ("head", None)):
+        own = rng(0)
+        chain = random_chain(mount, own, pose)
+        beams = bearing, up, away = own.uniform(1.0, 2.0, 5), own.uniform(-0.3, 0.3, 5), own.uniform(1, 4, 5)
+        _, by_links, by_pitch = carried(chain, *beams, 0.1)
+        yield by_links, lambda s: moved_points(chain, *beams, s, 0.1), 13
+        turned = by_pitch[..., None]
+        yield turned, lambda s: moved_points(chain, bearing, up + s[0], away, np.zeros(13), 0.1), 1
+
+
+def images():
+    mounts = np.stack([np.eye(4), pose_of(0.1, (0.02, 0.03), (-0.1, 0.01, 0.02), (0, 0)).as_matrix()])[:, :3]
+    poses, points = np.stack([p.as_matrix()[:3] for p in view_poses(2)]), PATTERN.points()
+    state = np.stack([MODEL.parameters, MODEL.parameters * 1.05]), mounts, poses, np.linspace(-1e-3, 2e-3, 21)
+    pixels, jacobian = intrinsics.predict(state, points, basis := intrinsics.waves(points))
+    count = jacobian[0].size // pixels[0].size
+    jacobian = jacobian.reshape(*pixels.shape, count)
+    yield jacobian, lambda s: intrinsics.predict(intrinsics.moved(state, s), points, basis)[0], count
+    first, turn = rng(0).uniform(-0.6, 0.6, (30, 2)), Rotation.from_rotvec([0.02, -0.03, 0.01])
+
+    def misses(s):
+        return steadiness.motion_misses(first, 0 * first, Rotation.from_rotvec(s[:3]) * turn, 1.01 + s[3])
+
+    yield -misses(np.zeros(4))[1], lambda s: misses(s)[0], 4
+
+
+@pytest.mark.parametrize("cases", [projection, camera_methods, intervals, board_planes, tilt_axis, recorded_pitch,
+                                   single_beams, joint_estimate, chain_of_a_rig, images])  # fmt: skip
+def test_derivatives_are_those_of_differences(cases):
+    for number, (found, function, count) in enumerate(cases()):
+        expected = numeric(function, count)
+        assert found.any() or not expected.any()
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * scale, err_msg=f"{cases.__name__} {number}")
