@@ -1,7 +1,6 @@
 """Pelco-D frames: verified bytes, round trips, every kind of reply, echoes, and garbage."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -69,12 +68,6 @@ def test_every_tilt_survives():
     assert pelco_d.encode_tilt(2 * math.pi + 0.5) == pelco_d.encode_tilt(0.5)
 
 
-@pytest.mark.parametrize("address", [-1, 256])
-def test_an_address_that_no_frame_carries(address):
-    with pytest.raises(ValueError, match="must be in range"):
-        encode_frame(address)
-
-
 # --------------------------------------------------------------------------------------------------- streams
 
 
@@ -135,37 +128,20 @@ def test_reply_after_every_kind_of_noise():
     assert lost < 20  # one in 256 of the places where noise and reply look like another reply
 
 
-# -------------------------------------------------------------------------------------------------------- fuzz
-
-
-def mutated(rng, count):
-    """Byte strings: half of random bytes, half frames and replies with damage."""
-    seeds = [STOP, QUERY, LEVEL, PAN_45, QUERY + LEVEL, bytes.fromhex("00 59 00 64 BD"), STOP[:4], b"\xff" * 9,
-             QUERY[:5] + PAN_45]  # fmt: skip
-    noise = rng.bytes(count)
-    lengths, rows = rng.integers(0, 25, count).tolist(), rng.integers(0, len(seeds), count).tolist()
-    places, values = rng.integers(0, count - 25, count).tolist(), rng.integers(0, 14, count).tolist()
-    for length, row, place, value in zip(lengths, rows, places, values, strict=True):
-        if row & 1:
-            yield noise[place : place + length]
-        else:
-            seed = seeds[row]
-            yield noise[place : place + value // 3] + seed[:value] + noise[place : place + 1] + seed[value + 1 :]
-
-
 def test_fuzz():
-    sent = [STOP, QUERY, encode_extended(1, pelco_d.SET_TILT), MOTION]
-    blocks = sys.getallocatedblocks()
-    found = 0
-    for row, data in enumerate(mutated(np.random.default_rng(0), STRINGS)):
-        if row % 3:
-            received = split_replies(data, sent[row % 4])
-            used = received.echoed + received.skipped + 5 * len(received.tilts)
-            assert used == len(data) or used < len(data) and (received.tilts or received.acknowledged)
-            found += len(received.tilts) + received.acknowledged
-        else:
-            frames, pending = split_frames(data)
-            assert 7 * len(frames) <= pending <= len(data)
-            found += len(frames)
+    """Random bytes, and frames and replies in which a byte is another one, behind others."""
+    rng, found = np.random.default_rng(0), 0
+    seeds = [STOP, QUERY, LEVEL, PAN_45, QUERY + LEVEL, bytes.fromhex("00 59 00 64 BD"), STOP[:4], b"\xff" * 9]
+    for row in range(STRINGS):
+        data, sent = rng.bytes(int(rng.integers(25))), (STOP, QUERY, MOTION)[row % 3]
+        if row % 2:
+            seed = seeds[row // 2 % len(seeds)]
+            at = int(rng.integers(2 * len(seed)))
+            data = data[:4] + seed[:at] + data[5:6] * (at < len(seed)) + seed[at + 1 :]
+        received = split_replies(data, sent)
+        used = received.echoed + received.skipped + 5 * len(received.tilts)
+        assert used == len(data) or used < len(data) and (received.tilts or received.acknowledged)
+        frames, pending = split_frames(data)
+        assert 7 * len(frames) <= pending <= len(data)
+        found += len(frames) + len(received.tilts) + received.acknowledged
     assert found > STRINGS / 10
-    assert sys.getallocatedblocks() < blocks + 5000

@@ -1,6 +1,5 @@
 """A session of telegrams gives the sweeps that were sent, and tells about every telegram it could not use."""
 
-import json
 import shutil
 
 import numpy as np
@@ -84,22 +83,6 @@ def test_sweeps_are_what_the_device_measured(path):
     np.testing.assert_allclose(second.pitch, 0.1)
 
 
-def test_bytes_are_kept_as_they_came(path):
-    stored = telegrams(path).read_bytes()
-    assert stored == configuration() + b"".join(scans(room()) + scans(room(seed=1)))
-    rows = (path / "lrf" / "index.csv").read_text().splitlines()
-    assert rows[:3] == ["t_s,offset,length,placement,pitch_deg", ",0,42,,", "1.0,42,812,1,-0.5"]
-
-
-def test_special_values_are_counted_by_reason(path):
-    session = open_session(path)
-    report = session.telegrams.report(1)
-    assert report["telegrams"] == report["outcomes"]["scan"] == 4 and report["wrong_crc_offsets"] == ()
-    counts = {k: v for k, v in report["values"].items() if v}
-    assert counts == {"valid": 4 * 401 - 2, "not valid": 1, "larger than maximum": 1}
-    assert session.telegrams.report()["telegrams"] == 9 and session.telegrams.report()["outcomes"]["other"] == 1
-
-
 @pytest.mark.parametrize("values, first, step", [(101, 40, 1), (201, 40, 0.5), (181, 0, 1), (361, 0, 0.5)])
 def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, step):
     session = recorded((1, scans(room(beams=values)), PITCH))
@@ -132,12 +115,6 @@ def test_a_lost_part_stays_empty_and_is_not_filled_from_another_turn(recorded):
     sweep = recorded((1, sent, 0.0)).sweep(1)
     found = [{int(k) for k in np.arange(721)[np.isfinite(line)] % 4} for line in sweep.ranges]
     assert found == [{0, 1}, {2, 3}, {0, 1, 2, 3}]
-
-
-def test_parts_at_different_pitch_or_placement_are_not_merged(recorded):
-    four = interlaced(np.full(721, 3.0))
-    session = recorded((1, four, [0, 0, 0.1, 0.1]), (2, four[:2], 0), (3, four[2:], 0))
-    assert [session.sweep(p).ranges.shape[0] for p in (1, 2, 3)] == [2, 1, 1]
 
 
 def test_the_measuring_mode_follows_the_device(recorded):
@@ -287,17 +264,3 @@ def test_the_writer_refuses_what_it_could_not_read_again(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------- real recordings
-
-
-def test_a_real_recording_becomes_a_session(real_data, tmp_path):
-    file = real_data / "lms200_captures" / "2017_Aug_05__18-52-56.jsonl"
-    lines = [json.loads(line) for line in file.open()]
-    sent = [bytes.fromhex(line["hex"]) for line in lines if line["dir"] == "lms->host"]
-    half = LrfInfo("LMS200", (0.0, np.pi), np.radians(0.5), 0.005, max_range=16.0)
-    with SessionWriter(tmp_path / "s", triangle_board(), half) as writer:
-        writer.add_telegrams(1, sent, 0.0)
-    session = open_session(tmp_path / "s")
-    assert session.problems == () and session.sweep(1).ranges.shape == (165, 361)
-    outcomes = session.telegrams.report(1)["outcomes"]
-    assert outcomes == {"scan": 165, "other": len(sent) - 165, "wrong CRC": 0, "truncated": 0}
-    assert 0.1 < np.nanmedian(session.sweep(1).ranges) < 16

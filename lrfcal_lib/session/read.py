@@ -413,7 +413,11 @@ def _disorder(session):
             seen.setdefault(what, line)
             key = tuple(row[key] for key in group)
             if row.get("t_s") and row["placement"] and row.get("purpose") != DROPPED:
-                time = float(row["t_s"])
+                try:
+                    time = float(row["t_s"])
+                except ValueError:  # of a placement that was not finished: no other reader looks at it
+                    yield f"{where}: t_s is {row['t_s']!r}: a number of seconds is needed"
+                    continue
                 if time < last.get(key, -math.inf):
                     back = f"t_s runs back from {last[key]:.9g} to {time:.9g}"
                     yield f"{where}: {back}: two writers at once? Record the placement again"
