@@ -1,7 +1,7 @@
 """Speed and memory, every figure beside a named alternative in the same run: ``make bench``.
 
-Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: `make bench`
-installs it, and its ratio is null where it cannot be had.
+Writes bench.json and bench.csv into reports/bench. GTSAM is no part of the environment: `make bench` installs it, and
+its ratio is null where it cannot be had.
 """
 
 import argparse
@@ -11,13 +11,12 @@ import shutil
 import subprocess
 import sys
 import time
-import tracemalloc
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from joint_draws import draw, none
@@ -36,15 +35,14 @@ from lrfcal_lib.solvers.joint_start import start_states, thin
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = {
-    "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "core": 5, "points": 10_000_000,
-    "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
+    "repeats": 7, "trials": 1000, "joint": 100, "points": 10_000_000, "painted": 100_000_000, "telegrams": 20_000,
+    "session": "sim_lms221",
 }  # fmt: skip
 TINY = {  # for the test, which only asks whether everything is written
-    "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "core": 0, "points": 10_000, "growth": (1_000,),
-    "telegrams": 100, "session": None,
+    "repeats": 1, "trials": 2, "joint": 10, "points": 10_000, "painted": 1_000, "telegrams": 100, "session": None,
 }  # fmt: skip
+CHUNK = 1_000_000  # points that are handed over at a time
 SHORT = 0.02  # seconds
-CHUNK = 1_000_000  # points that growth hands over at a time
 ROWS = {"face": 40, "beam": 30}
 MODEL = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
 
@@ -68,15 +66,6 @@ def elapsed(function, calls=1):
     return (time.perf_counter() - begin) / calls
 
 
-def memory(function):
-    """Largest size of what Python and NumPy hold during a call, MB."""
-    tracemalloc.start()
-    function()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return peak / 1e6
-
-
 def cameras(size):
     """One line calibration of twenty placements, and many at once, against scipy with a numeric Jacobian."""
     rng = np.random.default_rng(0)
@@ -86,7 +75,7 @@ def cameras(size):
     x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
     T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
     points = obs.crossing_points + rng.normal(0, 0.002, (size["trials"], *obs.crossing_points.shape))
-    trials = replace(obs, crossing_points=points)
+    trials, some = replace(obs, crossing_points=points), points[: max(1, len(points) // 20)]
 
     def scipy(points):
         def residuals(x):
@@ -95,18 +84,13 @@ def cameras(size):
 
         return least_squares(residuals, x0, method="lm").x
 
-    def one():
-        return solve_camera(obs, "line", T0, search=False)
-
-    def many():
-        return solve_camera(trials, "line", T0)
-
-    ours, theirs = seconds(3 * size["repeats"], one, lambda: scipy(obs.crossing_points))
-    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours, one
-    some = points[: max(1, len(points) // 20)]
-    batch, loop = seconds(size["repeats"], many, lambda: [scipy(p) for p in some])
-    faster = loop * len(points) / len(some) / batch
-    yield "monte_carlo_1000_s", batch, "monte_carlo_vs_scipy", "scipy in a loop", faster, many
+    calls = [lambda: solve_camera(obs, "line", T0, search=False), lambda: scipy(obs.crossing_points)]
+    ours, theirs = seconds(3 * size["repeats"], *calls)
+    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours
+    calls = [lambda: solve_camera(trials, "line", T0), lambda: [scipy(p) for p in some]]
+    ours, theirs = seconds(size["repeats"], *calls)
+    faster = theirs * len(points) / len(some) / ours
+    yield "monte_carlo_1000_s", ours, "monte_carlo_vs_scipy", "scipy in a loop", faster
 
 
 def problem(count):
@@ -119,53 +103,35 @@ def problem(count):
     return obs.keep(**masks)
 
 
-def core(count):
-    """Ranges and views of a problem: a start value, and whitened residuals and Jacobian of increments about one."""
-    obs = none(problem(count), "beam")
-    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
-
-    def rows(shared, own, start=start, data=data):
-        parts = [whiten(block) for block in joint_blocks(move_state(start, (shared, own), unknowns), data, unknowns)]
-        return np.concatenate([r for r, _ in parts], axis=1), np.concatenate([J for _, J in parts], axis=1)
-
-    return start, data, unknowns, rows
-
-
-def with_gtsam(count, at_once):
+def with_gtsam(count):
     """What runs GTSAM's iterations from the start value, with a Python factor a placement.
 
-    Every factor works out its own placement, or (`at_once`, the most that can be done for GTSAM from Python) the first
-    one that meets a new state works out all of them.
+    Ranges and views only; residuals and Jacobian of increments about the start are ours, whitened.
     """
     import gtsam
 
-    start, data, unknowns, rows = core(count)
-    c, last, pieces = unknowns.shared, [np.full(unknowns.shared, np.nan), np.zeros((count, unknowns.own)), None], []
+    obs = none(problem(count), "beam")
+    data, unknowns, start = gather(obs), Unknowns(2, 3, sensor=("range_offset",)), next(start_states(obs))[0]
+    c, pieces = unknowns.shared, []
     for p in range(count):
         groups = {name: {k: v[[p]] for k, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
         piece = replace(data, **groups, middle=data.middle[[p]], direction=data.direction[[p]])
         pieces.append((of_placements(start, [p]), piece))
 
-    def look(p, values):
-        shared, own = values.atVector(0), values.atVector(p + 1)
-        if not at_once:
-            return (part[0] for part in rows(shared, own[None], *pieces[p]))
-        if not (np.array_equal(shared, last[0]) and np.array_equal(own, last[1][p])):
-            last[:2] = shared, np.stack([values.atVector(i + 1) for i in range(count)])
-            last[2] = rows(*last[:2])
-        return (part[p] for part in last[2])
-
     def error(p, values, jacobians):
-        r, J = look(p, values)
+        at, piece = pieces[p]
+        moved = move_state(at, (values.atVector(0), values.atVector(p + 1)[None]), unknowns)
+        parts = [whiten(block) for block in joint_blocks(moved, piece, unknowns)]
+        r, J = (np.concatenate(rows, axis=1)[0] for rows in zip(*parts, strict=True))
         if jacobians is not None:
             jacobians[0], jacobians[1] = np.asfortranarray(J[:, :c]), np.asfortranarray(J[:, c:])
         return r
 
     graph, first = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise = gtsam.noiseModel.Unit.Create(rows(np.zeros(c), last[1])[0].shape[1])
     first.insert(0, np.zeros(c))
     for p in range(count):
         first.insert(p + 1, np.zeros(unknowns.own))
+        noise = gtsam.noiseModel.Unit.Create(len(error(p, first, None)))
         graph.add(gtsam.CustomFactor(noise, [0, p + 1], lambda _, values, H, p=p: error(p, values, H)))
 
     def run():
@@ -180,38 +146,14 @@ def with_gtsam(count, at_once):
 
 def joint(size):
     """The whole joint estimate, start values included, against GTSAM's iterations alone (on less: no beams)."""
-    obs, count, none_of_them = problem(size["joint"]), size["joint"], [np.nan, np.nan]
-    ours = [lambda: solve_joint(obs)]
+    obs, calls = problem(size["joint"]), []
     try:
-        theirs = [with_gtsam(count, at_once) for at_once in (False, True)]
+        calls = [with_gtsam(size["joint"])]
     except ImportError:
-        print("no GTSAM here: its ratios stay empty", file=sys.stderr)
-        theirs = []
-    taken, *others = seconds(size["repeats"], *ours, *theirs)
-    for key, how, other in zip(("", "_at_once"), ("a factor each", "at once"), others or none_of_them, strict=True):
-        against = f"GTSAM's iterations, placements evaluated {how}"
-        yield "joint_100_s", taken, f"joint_vs_gtsam{key}", against, other / taken, ours[0]
-
-
-def joint_core(size):
-    """The joint estimate's core against scipy's dense trust region with a numeric Jacobian."""
-    count = size["core"]
-    if not count:
-        return
-    start, data, unknowns, rows = core(count)
-    c = unknowns.shared
-
-    def residuals(x):
-        return rows(x[:c], x[c:].reshape(count, -1))[0].ravel()
-
-    ours = seconds(size["repeats"], lambda: converged(start, data, unknowns, 1e-4))[0]
-    begin = time.perf_counter()
-    x = least_squares(residuals, np.zeros(c + count * unknowns.own), method="trf", x_scale="jac").x
-    theirs = time.perf_counter() - begin
-    other = move_state(start, (x[:c], x[c:].reshape(count, -1)), unknowns)
-    apart = np.abs(converged(start, data, unknowns, 1e-4).cameras - other.cameras).max()
-    assert apart < 1e-5, "scipy and we end in different places"
-    yield "joint_core_5_ms", 1000 * ours, "joint_core_vs_scipy", "scipy trf, numeric Jacobian", theirs / ours, None
+        print("no GTSAM here: its ratio stays empty", file=sys.stderr)
+    ours, *others = seconds(size["repeats"], lambda: solve_joint(obs), *calls)
+    faster = others[0] / ours if others else np.nan
+    yield "joint_100_s", ours, "joint_vs_gtsam", "GTSAM's iterations, a factor a placement", faster
 
 
 def scene(rng, count):
@@ -250,7 +192,7 @@ def colouring(size):
 
     ours, tenth = seconds(size["repeats"], paint, with_opencv)
     against = "cv2.projectPoints, depth buffer, cv2.remap"
-    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours, paint
+    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours
 
 
 def decoding(size):
@@ -263,7 +205,7 @@ def decoding(size):
         return decode_scans(data, stream.offset, stream.length)
 
     ours, theirs = seconds(size["repeats"], whole, lambda: [decode_scan(one) for one in raw])
-    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours, whole
+    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours
 
 
 def commands(size):
@@ -273,73 +215,44 @@ def commands(size):
         if size["session"]:
             with TemporaryDirectory() as folder:
                 shutil.copytree(ROOT / "data" / size["session"], Path(folder, "session"))
-                out = ["--out", "out"] if verb == "report" else []
+                command = [sys.executable, "-m", "lrfcal_lib", verb, "session", *["--out", "out"] * (verb == "report")]
                 environment = os.environ | {"LRFCAL_CACHE": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
-                begin = time.perf_counter()
-                command = [sys.executable, "-m", "lrfcal_lib", verb, "session", *out]
-                subprocess.run(command, check=True, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
-                taken = time.perf_counter() - begin
-        yield key, taken, None, "", np.nan, None
+                where = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL}
+                taken = elapsed(partial(subprocess.run, command, check=True, **where))
+        yield key, taken, None, "", np.nan
 
 
 def paint_blocks(count):
-    """Colour so many points block by block: seconds and the largest memory of this process, MB."""
+    """Colour so many points block by block; the largest memory of this process, MB."""
     image = np.random.default_rng(1).integers(0, 255, (768, 1024, 3), dtype=np.uint8)
-    one, ahead, taken = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1)), 0.0
-    one.paint(scene(np.random.default_rng(0), 10), ahead[:10])  # loads the compiled loops
+    one, ahead = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1))
     for work in (one.hide, lambda points: one.paint(points, ahead)):
         rng = np.random.default_rng(2)  # the same points again
         for start in range(0, count, CHUNK):
-            points = scene(rng, min(CHUNK, count - start))
-            begin = time.perf_counter()
-            work(points)
-            taken += time.perf_counter() - begin
+            work(scene(rng, min(CHUNK, count - start)))
     status = Path("/proc/self/status").read_text()  # getrusage would count the parent's memory
-    return taken, int(status.split("VmHWM:")[1].split()[0]) / 1024
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def growth(size):
-    """Time and memory by number of points (a process each) and of placements."""
-    for count in size["growth"]:
-        command = [sys.executable, __file__, "--paint", str(count)]
-        taken, peak = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        yield "colouring", "points", count, taken, peak
-    for count in size["placements"]:
-        obs = problem(count)
-        taken = seconds(min(size["repeats"], 3), lambda obs=obs: solve_joint(obs))[0]
-        yield "joint estimate", "placements", count, taken, memory(lambda obs=obs: solve_joint(obs))
-
-
-def plot(table, path):
-    """Time and memory over size, both logarithmic."""
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    for ax, (what, rows) in zip(axes, table.groupby("what"), strict=True):
-        ax.loglog(rows["count"], rows["seconds"], "o-", label="seconds")
-        ax.loglog(rows["count"], rows["peak_mb"], "s--", label="memory, MB")
-        ax.set(title=what, xlabel=rows["of"].iloc[0])
-        ax.grid(alpha=0.3)
-        ax.legend()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+def memory(size):
+    """Of colouring many points, in a process of its own."""
+    command = [sys.executable, __file__, "--paint", str(size["painted"])]
+    peak = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    yield "peak_mb_1e8_points", peak, None, "", np.nan
 
 
 def main(out, size=None):
-    """Measure everything at a size and write bench.json, bench.csv and growth.png."""
+    """Measure everything at a size and write bench.json and bench.csv."""
     size, rows, figures = size or FULL, [], {}
-    for part in (cameras, joint, joint_core, colouring, decoding, commands):
-        for key, value, ratio_key, against, times_faster, call in part(size):
-            rows.append([key, value, against, times_faster, memory(call) if call else np.nan])
+    for part in (cameras, joint, colouring, decoding, commands, memory):
+        for key, value, ratio_key, against, times_faster in part(size):
+            rows.append([key, value, against, times_faster])
             figures |= {key: value, ratio_key: times_faster} if ratio_key else {key: value}
             print(f"{key} {value:.4g}" + (f", {times_faster:.3g} times {against}" if against else ""), flush=True)
-    grown = pd.DataFrame(growth(size), columns=["what", "of", "count", "seconds", "peak_mb"])
-    figures["peak_mb_1e8_points"] = grown[grown["of"] == "points"]["peak_mb"].iloc[-1]
-    print(grown.round(3).to_string(index=False))
     out.mkdir(parents=True, exist_ok=True)
-    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster", "memory_mb"])
+    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster"])
     table.to_csv(out / "bench.csv", index=False, float_format="%.5g")
-    plot(grown, out / "growth.png")
     figures = {key: None if np.isnan(value) else float(f"{value:.5g}") for key, value in figures.items()}
-    figures["growth"] = json.loads(grown.to_json(orient="records"))
     figures["sizes"], figures["machine"] = size, {"cpus": os.cpu_count(), "load": os.getloadavg()[0]}
     (out / "bench.json").write_text(json.dumps(figures, indent=1) + "\n")
 
@@ -351,6 +264,6 @@ if __name__ == "__main__":
     parser.add_argument("--paint", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.paint:
-        print(json.dumps(paint_blocks(options.paint)))
+        print(paint_blocks(options.paint))
     else:
         main(options.out, FULL | ({"session": None} if options.without_commands else {}))

@@ -9,25 +9,21 @@ import numpy as np
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
 from lrfcal_lib.emulators.head import EmulatedHead
-from lrfcal_lib.emulators.lms2xx import ACK, BAUD_WORD, DONE, REPLY_S, RESET_S, EmulatedLms
+from lrfcal_lib.emulators.lms2xx import ACK, BAUD_WORD, RESET_S, EmulatedLms
 from lrfcal_lib.session import lms2xx_codec as codec
 
-DELAY_S, PAUSE_S, AWAY_S, SLIP_S, SLOW_MODE_S, JUMP = 0.7, 0.08, 0.5, 0.3, 2.8, 1000  # JUMP in hundredths of a degree
+DELAY_S, AWAY_S, SLIP_S, JUMP = 0.7, 0.5, 0.3, 1000  # JUMP in hundredths of a degree
 BYTES = {  # what some do to the bytes of a reply, about a place in it
     "drop": lambda data, i, _: data[:i] + data[i + 1 :],
     "flip": lambda data, i, rng: data[:i] + bytes([data[i] ^ 1 << int(rng.integers(8))]) + data[i + 1 :],
-    "duplicate": lambda data, i, _: data[: i + 1] + data[i:],
     "insert": lambda data, i, rng: data[: i + 1] + rng.bytes(1) + data[i + 1 :],
-    "swap": lambda data, i, _: data[:i] + data[i : i + 2][::-1] + data[i + 2 :],
-    "blank": lambda data, i, _: data[:i] + bytes(len(data[i : i + 4])) + data[i + 4 :],
     "cut": lambda data, i, _: data[:i],
-    "headless": lambda data, i, _: data[i + 1 :],
     "noise": lambda data, _, rng: rng.bytes(int(rng.integers(1, 21))) + data,
     "checksum": lambda data, _, rng: data[:-1] + bytes([data[-1] ^ int(rng.integers(1, 256))]),
 }
 REQUEST = {"request_drop": BYTES["drop"], "request_flip": BYTES["flip"], "deaf": lambda *_: b""}
-LINE = (*BYTES, *REQUEST, "address", "foreign", "silence", "delay", "pause", "twice", "stale", "echo", "unplug")
-LMS = (*LINE, "length", "nak", "no_ack", "refused", "reboot", "rate", "stuck", "slow_mode", "skip", "status")
+LINE = (*BYTES, *REQUEST, "address", "foreign", "silence", "delay", "twice", "stale", "echo", "unplug")
+LMS = (*LINE, "nak", "no_ack", "refused", "reboot", "rate", "skip", "status")
 HEAD = (*LINE, "mute", "stall", "slip", "jump")
 
 
@@ -55,11 +51,6 @@ class Faults:
         for switches in (self._times, self._until):
             switches.clear() if name is None else switches.pop(name, None)
 
-    @property
-    def armed(self):
-        """Names of the faults that can still happen."""
-        return {*+self._times, *(name for name, end in self._until.items() if end > self._now())}
-
     def hit(self, name):
         """Whether the fault happens at this opportunity, which is then counted."""
         hit = bool(self._times[name] > 0 or self._now() < self._until.get(name, 0))
@@ -81,7 +72,7 @@ class FaultyLine:
 
     def __init__(self, *args, seed=0, **options):
         super().__init__(*args, seed=seed, **options)
-        self.faults = Faults(self.known, seed, self.host.now, lambda: getattr(self.port, "wake", lambda: None)())
+        self.faults = Faults(self.known, seed, self.host.now, lambda: self.port.wake())
         self.hit, self._last = self.faults.hit, {}
 
     def advance(self):
@@ -107,10 +98,6 @@ class FaultyLine:
         data = b"" if self.hit("silence") else data
         for _ in range(self.hit("twice")):
             super().reply(data, at)
-        if len(data) > 1 and self.hit("pause"):
-            half = len(data) // 2
-            self.write(data[:half], at)
-            data, at = data[half:], at + half * self.byte_s + PAUSE_S
         super().reply(data, at, then)
 
 
@@ -134,16 +121,6 @@ class FaultyLms(FaultyLine, EmulatedLms):
             memory.baudrate = int(self.faults.rng.choice([rate for rate in BAUD_WORD if rate != memory.baudrate]))
         return self.answer(at, 0x92) if self.hit("refused") else super().obey(telegram, at)
 
-    def set_mode(self, data, at):
-        streamed, mode = self.streaming, self.memory.mode
-        super().set_mode(data, at)
-        if streamed and self.memory.mode != mode and self.hit("stuck"):
-            self.memory.mode = mode
-
-    def answer(self, at, code, data=b"", effect=None, delay=REPLY_S):
-        slow = (code, data, effect) == (0xA0, DONE, None) and self.hit("slow_mode")
-        super().answer(at, code, data, effect, SLOW_MODE_S if slow else delay)
-
     def emit(self, scan, at, then=None):
         if then is None and self.hit("skip"):
             self.telegrams += 1
@@ -157,10 +134,6 @@ class FaultyLms(FaultyLine, EmulatedLms):
             status = 0xD3 if self.hit("status") else told.status
             address = 0x80 | (told.address + 5) % 0x80 if self.hit("address") else told.address
             raw = codec.encode_telegram(told.code, told.data, status=status, address=address)
-        if self.hit("length"):
-            length = (len(raw) - 5 + int(self.faults.rng.integers(40))) % 800
-            raw = raw[:2] + length.to_bytes(2, "little") + raw[4:-2]
-            raw += codec.crc16(raw).to_bytes(2, "little")
         return codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
 
 
@@ -180,9 +153,9 @@ class FaultyHead(FaultyLine, EmulatedHead):
     def stop(self, at):
         super().stop(at + SLIP_S * self.hit("slip"))
 
-    def tell(self, opcode, at):
+    def tell(self, at):
         if not self.hit("mute"):
-            super().tell(opcode, at)
+            super().tell(at)
 
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""
@@ -191,4 +164,4 @@ class FaultyHead(FaultyLine, EmulatedHead):
         if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and self.hit("address"):
             other = raw[1] % 255 + 1
             raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
-        return encode_extended(self.address, pelco_d.ZOOM, 0x1234) + raw if self.hit("foreign") else raw
+        return encode_extended(self.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw

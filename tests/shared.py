@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,6 +24,14 @@ def shared_folder():
 def stages():
     """Folder for the stages that notebooks and fixtures begin with (see lrfcal_lib.session.cache)."""
     return shared_folder() / "stages"
+
+
+def until(holds, longest_s=120.0):
+    """Wait for a state, not for a time; the limit guards against hanging only."""
+    end = time.monotonic() + longest_s
+    while not holds():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.01)
 
 
 def chromium():

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -98,32 +97,6 @@ def test_a_folder_that_others_may_write_to_is_refused(folder, session, mode):
     assert stage.calls == 1
 
 
-def test_a_folder_of_somebody_else_is_refused(folder, session, monkeypatch):
-    folder.mkdir()
-    found = folder.stat()
-    monkeypatch.setattr(cache.os, "geteuid", lambda: found.st_uid and found.st_uid + 1)
-    if found.st_uid == 0:  # who may write anywhere
-        os.chown(folder, 1, -1)
-    with pytest.raises(ValueError, match="others may write"):
-        Stage().run(session)
-
-
-def test_the_folder_is_made_for_oneself(folder, session):
-    before = os.umask(0)
-    try:
-        Stage().run(session)
-    finally:
-        os.umask(before)
-    assert folder.stat().st_mode & 0o777 == 0o700
-
-
-def test_a_stage_that_fails_leaves_nothing(folder, session):
-    for _ in range(2):
-        with pytest.raises(ValueError, match="no board"):
-            Stage().run(session, fail=True)
-    assert list(folder.glob("*.pickle")) == []
-
-
 def test_of_two_at_the_same_time_the_second_waits(folder, session):
     stage = Stage()
     slow = cache.cached(lambda of: time.sleep(0.2) or stage.run.__wrapped__(of))
@@ -179,12 +152,3 @@ def test_what_another_process_cannot_do_is_done_here(two):
         cache.spread(fail, range(6))
     with pytest.raises(ChildProcessError):
         os.waitpid(-1, 0)  # none is left
-
-
-def test_a_process_with_threads_stays_alone():
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(int).result()
-        with cache.all_processors():
-            assert cache._processes == 1
-    with cache.all_processors():
-        assert cache._processes == (len(os.sched_getaffinity(0)) if threading.active_count() == 1 else 1)

@@ -1,25 +1,26 @@
 """Ten seconds of streaming at every rate, in virtual time: every scan of the device is accounted for."""
 
-import math
-
 import numpy as np
 import pytest
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import RATES
+from lrfcal_lib.drivers.lms2xx_link import RATES, TURN_S, interval_s
 
-STREAM_S, SCAN_S, TURNS, BYTES = 10.0, 2 * 0.01332, 2, 732 + 2  # of the variant 180/0.5
+# scans that a telegram takes by the manual's table 10-17: 812 (100/0.25), 732 (180/0.5), 372 bytes (180/1)
+TABLE = {9600: (16, 29, 30), 19200: (8, 15, 15), 38400: (4, 8, 8), 500000: (1, 1, 1)}
+VARIANTS = {(100, 25): 812, (180, 50): 732, (180, 100): 372}
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("rate", RATES)
-def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate):
-    device = lms(baudrate=rate, configuration=INDEXED)
+def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate, variant):
+    device = lms(baudrate=rate, variant=variant, configuration=INDEXED)
     with LMS2xx(device.path, host=device.host) as driver:
         before = driver.counts
         driver.start()
         readings = driver.take(1)
-        while readings[-1].time_s < readings[0].time_s + STREAM_S:
+        while readings[-1].time_s < readings[0].time_s + 10.0:
             readings += driver.take(1, after=readings[-1].time_s)
         counts = {key: value - before[key] for key, value in driver.counts.items()}
         driver.stop()
@@ -29,7 +30,19 @@ def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate)
     assert [reading.scan_index for reading in readings] == [record.turn % 256 for record in truth]
     assert counts["stale"] == counts["reconnects"] == device.counts["lost"] == 0
     # a telegram that takes longer than a scan keeps those in between from being sent; they are counted by the index
-    period = math.ceil(BYTES * 10 / rate / SCAN_S)
-    assert set(np.diff([record.turn for record in truth])) == {period * TURNS}
+    period, turns = TABLE[rate][[*VARIANTS].index(variant)], 100 // variant[1]
+    assert set(np.diff([record.turn for record in truth])) == {period * turns}
+    assert interval_s(VARIANTS[variant], rate, turns * TURN_S) == pytest.approx(period * turns * TURN_S)
     assert counts["dropped"] == (len(readings) - 1) * (period - 1)
     assert [r.time_s for r in readings] == pytest.approx([record.time_s for record in truth], abs=5e-4)
+
+
+def test_interlaced_scans_carry_the_instants_of_the_mirror():
+    device = lms(baudrate=500000, configuration=INDEXED)
+    with LMS2xx(device.path, host=device.host) as driver:
+        driver.start(interlaced=True)
+        readings = driver.take(20)
+        driver.stop()
+    begun = {record.telegram: record.time_s for record in device.scans}
+    assert [r.time_s for r in readings] == pytest.approx([begun[r.telegrams[0]] for r in readings], abs=5e-4)
+    assert all(len(r.ranges) == 721 for r in readings) and driver.variant == (100, 0.25)

@@ -6,13 +6,12 @@ import math
 import signal
 import subprocess
 import sys
-import textwrap
-import time
 
 import numpy as np
 import pytest
 import virtual
 from faults import HEAD
+from shared import until
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.head import PanTilt
@@ -49,10 +48,17 @@ class Contrary(Head):
         super().move(instant, -goal, speed)
 
 
-def emulated(*, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, **options):
+def terse(raw):
+    """Replies of some heads: tilts without sync and address, and one byte for a confirmation."""
+    return bytes([0, *raw[3:6], sum(raw[3:6]) % 256]) if len(raw) == pelco_d.FRAME else b"\x01"
+
+
+def emulated(*, head=Head, limits=(-math.pi / 2, math.pi / 2), settle=0.0, prepare=None, **options):
     """An emulated head on a virtual host; keywords are its habits."""
     options = {"baudrate": 38400, "speeds": SPEEDS, "go_speed": 120.0} | options
-    return virtual.head(head=head(Platform(settle=settle, limits=limits)), **options)
+    device = virtual.head(head=head(Platform(settle=settle, limits=limits)), **options)
+    device.prepare = prepare or device.prepare
+    return device
 
 
 def driven(device, settings=FAST):
@@ -113,9 +119,8 @@ def sent(device, opcode):
 
 HABITS = {
     "full": {},
-    "general replies and echo": {"reply": "general", "echo": True},
-    "5-byte replies": {"reply": "five"},
-    "single byte": {"reply": "single"},
+    "general replies and echo": {"confirms": True, "echo": True},
+    "short replies": {"confirms": True, "prepare": terse},
     "silent while moving, no set-tilt": {"feedback": "partial", "echo": True},
     "uneven": {"feedback": "partial", "head": Uneven},
     "watchdog": {"feedback": "partial", "watchdog_s": 0.3},
@@ -207,17 +212,6 @@ def test_what_happens_once_is_made_up_for(opened):
     assert device.faults.counts["jump"] == 1
 
 
-def test_late_reply_is_not_taken_for_the_next(opened):
-    device, head = opened(replace(FAST, retries=0))
-    device.faults.inject("delay")  # by 0.7 s
-    with pytest.raises(NoReply):
-        head.pitch()
-    device.host.sleep(0.5)
-    device.head.go(device.host.now(), 2 * DEGREE, 1e3)
-    device.host.sleep(0.05)
-    assert head.pitch()[0] == near(2, 0.01)
-
-
 # ------------------------------------------------------------------------------------------------- timed moves
 
 
@@ -242,7 +236,7 @@ def test_start_of_a_head_without_feedback(opened, caplog):
 
 # ------------------------------------------------------------------------------------------------------- sweeps
 
-SWEEPS = {"full": {}, "echo and general": {"echo": True, "reply": "general"}, "silent while moving": PARTIAL,
+SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "silent while moving": PARTIAL,
           "tells nothing": NONE}  # fmt: skip
 
 
@@ -316,14 +310,12 @@ def test_whatever_ends_a_move_stops_the_head(opened, monkeypatch, error):
 
 
 def test_close_stops_the_head_and_is_final(opened):
-    before = signal.getsignal(signal.SIGTERM)
     device, head = opened(SLOW)
-    assert signal.getsignal(signal.SIGTERM) is not before
     head.start_sweep(60 * DEGREE)
     device.host.sleep(0.2)
     head.close()
     head.close()
-    assert halted(device) and signal.getsignal(signal.SIGTERM) is before
+    assert halted(device)
     for call in (head.pitch, head.stop, lambda: head.move_to(0)):
         with pytest.raises(DeviceError, match="closed"):
             call()
@@ -336,60 +328,41 @@ def test_opening_stops_a_head_that_was_left_running():
         assert halted(device)
 
 
+SWEEPING = """
+import sys, time
+from lrfcal_lib.drivers.head import PanTilt
+from lrfcal_lib.drivers.rig_file import HeadSettings
+head = PanTilt(sys.argv[1], HeadSettings(baudrate=38400, gap_s=0.005))
+head.start_sweep(1.0, speed=1)
+try:
+    print("moving", flush=True)
+    time.sleep(float(sys.argv[2]))
+finally:
+    print("files closed", flush=True)
+"""
+
+
 @pytest.mark.parametrize("way", ["exit", "SIGTERM", "SIGINT"])
 def test_the_end_of_the_process_stops_the_head(tmp_path, way):
-    """In real time, on a pseudo-terminal."""
-    code = """
-    import sys, time
-    from lrfcal_lib.drivers.head import PanTilt
-    from lrfcal_lib.drivers.rig_file import HeadSettings
-    head = PanTilt(sys.argv[1], HeadSettings(baudrate=38400, gap_s=0.005))
-    head.start_sweep(1.0, speed=1)
-    try:
-        print("moving", flush=True)
-        time.sleep(float(sys.argv[2]))
-    finally:
-        print("files closed", flush=True)
-    """
+    """In real time, on a pseudo-terminal; at this speed the head gets to its limit after minutes."""
     with EmulatedHead(path=tmp_path / "head", baudrate=38400, speeds=(0.01, 1.0)) as device:
 
         def becomes(moving):
-            end = time.monotonic() + 30  # a guard against hanging; to its limit it takes much longer
-            while device.head.moving(device.host.now()) != moving and time.monotonic() < end:
-                time.sleep(0.01)
-            return time.monotonic() < end
+            until(lambda: device.head.moving(device.host.now()) == moving)
 
-        call = [sys.executable, "-c", textwrap.dedent(code), device.path, "0" if way == "exit" else "60"]
+        call = [sys.executable, "-c", SWEEPING, device.path, "0" if way == "exit" else "60"]
         process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         assert process.stdout.readline() == "moving\n"
         if way != "exit":
-            assert becomes(moving=True)
+            becomes(moving=True)
             process.send_signal(getattr(signal, way))
-        assert process.wait(60) == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
-        assert process.stdout.read() == "files closed\n"
-        process.stdout.close()
-        assert becomes(moving=False)
+        assert process.communicate(timeout=60)[0] == "files closed\n"
+        assert process.returncode == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
+        becomes(moving=False)
     assert device.error is None
 
 
 # ----------------------------------------------------------------------------------------------------- bad lines
-
-
-def test_line_that_comes_back_during_a_move(opened, caplog):
-    device, head = opened()
-    later(device, lambda: go_away(device), degrees=5)
-    assert head.move_to(40 * DEGREE) == near(40)
-    assert caplog.text.count("to the head is back") == 1
-
-
-def test_line_that_comes_back_finds_the_head_stopped(opened):
-    device, head = opened()
-    device.head.move(device.host.now(), 80 * DEGREE, 0.1)
-    device.port.unplug()
-    device.port.plug()
-    with contextlib.suppress(NoReply):
-        head.pitch()
-    assert halted(device)
 
 
 def test_line_that_stays_away(opened):
@@ -437,17 +410,6 @@ def test_what_was_stated_and_does_not_come(habits, changes, error, message):
         driven(device, replace(FAST, **changes))
     with pytest.raises(PortError, match="there is no port"):
         PanTilt("nowhere", FAST, host=device.host)
-
-
-@pytest.mark.parametrize(("name", "value"), [
-    ("address", 256), ("tilt_speed", 64), ("pitch_limits_deg", (10, -10)), ("feedback", "maybe"), ("baudrate", 0),
-    ("degrees_per_second", (4.0, 0.0)), ("repeat_s", 0.0), ("settle_s", -1.0), ("echo", "loud"),
-])  # fmt: skip
-
-
-def test_settings_that_no_head_has(name, value):
-    with pytest.raises(ValueError, match=rf"HeadSettings\n{name}.*\n  .* (is needed|should be .*|comes first)"):
-        HeadSettings(**{name: value})
 
 
 @pytest.mark.parametrize("kind", HEAD)

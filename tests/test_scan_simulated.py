@@ -4,7 +4,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from test_scan import edge_points, sweep_edges, turn_sigma
 
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
@@ -37,16 +36,6 @@ def seen(name, placement):
     return find_board(sweep, session.board, session.T_head_lrf), beyond, ranges
 
 
-def on_board(name, placement, edges):
-    """Edge points in the true board frame, shape (n, 2)."""
-    _, truth = opened(name)
-    recorded = opened(name)[0].sweep(placement).pitch
-    order = np.argsort(recorded)
-    pitch = np.interp(edges.pitch, recorded[order], truth.pitch[placement][order])
-    p = lrf_to_platform(edges.points, pitch, truth.T_head_lrf)
-    return truth.boards[placement].inv().apply(p)[:, :2]
-
-
 @pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
 def test_the_board_and_hardly_anything_else_is_found(name, placement):
     board, beyond, ranges = seen(name, placement)
@@ -55,23 +44,6 @@ def test_the_board_and_hardly_anything_else_is_found(name, placement):
     assert np.mean(beyond[board.mask] > WIDEST) < 0.01
     assert np.abs(board.sweep.ranges - ranges)[board.mask].max() < 0.07  # the post is 35 cm behind
     assert board.sigma_range == pytest.approx(0.01, rel=0.15)
-
-
-@pytest.mark.parametrize(("name", "placement"), PLACEMENTS)
-def test_each_edge_gives_one_side_with_its_direction(name, placement):
-    lines, number_of = opened(name)[1].board.lines(), {}
-    for edges in (edge_points(seen(name, placement)[0]), sweep_edges(seen(name, placement)[0])):
-        p, here = on_board(name, placement, edges), []
-        for side in edges.sides:
-            mine = p[edges.side == side.side]
-            along = np.linalg.svd(mine - mine.mean(axis=0))[2][0]
-            turned = np.arcsin(np.minimum(np.abs(lines[:, :2] @ along), 1.0))
-            edge = int(turned.argmin())
-            assert turned[edge] < 4 * turn_sigma(side)
-            assert np.abs(np.median(mine @ lines[edge, :2] + lines[edge, 2])) < WIDEST
-            assert number_of.setdefault(edge, side.side) == side.side
-            here.append(edge)
-        assert len(here) == len(set(here)) >= 2
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -11,12 +11,11 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.board import Board, Chessboard, triangle_board
+from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.session import stated
 from lrfcal_lib.session.read import image_size, open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
-from lrfcal_lib.session.write import SessionWriter
+from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
 LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)
@@ -100,33 +99,6 @@ def test_sweeps_keep_order_gaps_and_times(path):
     assert np.isnan(first.time_s).all() and second.time_s.tolist() == [0.5, 1.0, 1.5]
 
 
-def test_intensities_are_kept_where_all_sweeps_have_them(tmp_path):
-    write(tmp_path / "s", (*wall(), None, np.full((3, len(BEARINGS)), 7.0)))
-    assert (open_session(tmp_path / "s").sweep(1).intensities == 7).all()
-
-
-def test_images_are_found_by_camera_placement_and_purpose(path):
-    session = open_session(path)
-    assert len(session.images()) == 5 and len(session.images("left")) == 3 and len(session.images(placement=2)) == 2
-    (record,) = session.images("left", purpose="intrinsics")
-    assert record.placement == -1 and math.isnan(record.pitch)
-    (record,) = session.images("right", 1)
-    assert record.pitch == pytest.approx(0.1) and math.isnan(record.time_s)
-    np.testing.assert_array_equal(session.read_image(record), pixels(1))
-
-
-def test_boards_models_and_transforms_survive_json():
-    def through(data):
-        return json.loads(json.dumps(data))
-
-    board = Board("b", ("n", "e", "s", "w"), None, Chessboard(8, 6, 0.0775, (0.1, 0.2)), ("n", "w"))
-    assert stated.board_from_json(through(stated.board_to_json(board))) == board
-    model = stated.from_json(stated.LensStated, through(stated.model_to_json(MODEL))).made(32, 24)
-    np.testing.assert_array_equal(model.covariance, MODEL.covariance)
-    assert stated.transform_from_json(stated.transform_to_json(None)) is None and stated.model_to_json(None) is None
-    same(stated.transform_from_json(through(stated.transform_to_json(HEAD))), HEAD)
-
-
 def test_picks_override_by_camera_file_and_edge(path):
     pick("left,images/left/0001.png,ab,1,2,20,3.5")(path)
     session = open_session(path)
@@ -135,9 +107,33 @@ def test_picks_override_by_camera_file_and_edge(path):
     assert found.ends.tolist() == [[1, 2], [20, 3.5]]
 
 
-def test_zero_and_infinite_ranges_are_no_returns(path):
-    edit_scans(path, ranges=lambda ranges: np.where(np.arange(61) < 2, [[0.0], [np.inf]] * 3, ranges))
-    assert np.isnan(open_session(path).sweep(1).ranges[:, :2]).all()
+
+
+# ---------------------------------------------------------------------------------------------- crashes
+
+
+def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
+    path = tmp_path / "s"
+    with pytest.raises(RuntimeError, match="power"), SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer:
+        writer.add_sweep(4, *wall())
+        writer.add_image("left", pixels(), 4)
+        raise RuntimeError("power cut")
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images/left/00")
+    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"):
+        open_session(path)
+    finish(path)
+    session = open_session(path)
+    assert session.placements == (4,) and len(session.images("left", 4)) == 1
+    assert sorted(p.name for p in (path / "lrf").iterdir()) == ["scans.npz"]
+
+
+def test_finish_needs_sweeps(path):
+    with pytest.raises(SessionError, match="no sweep to finish"):
+        finish(path)
+    (path / "images").mkdir(exist_ok=True)
+    with pytest.raises(SessionError, match="lrf is missing; is this the folder of a session"):
+        finish(path / "images")
 
 
 def test_an_existing_target_is_refused(path):
@@ -188,6 +184,7 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
     ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
+    ("board.edges", ["a\x1b]0;title\x07", "ab", "ca"], "board.edges.0 is "),
     ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
     ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
     ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.lms2xx_codec import REASONS
 from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, measured, scan
 from lrfcal_lib.simulate.scene import Thing, World, plain, rectangle
@@ -33,13 +32,6 @@ def test_ranges_of_a_plane_are_unbiased(distance, turn):
     bearings, a = np.radians(np.arange(87.0, 93.1, 0.25)), np.radians(turn)
     true = distance * np.cos(a) / (np.sin(bearings) * np.cos(a) - np.cos(bearings) * np.sin(a))
     assert abs(np.mean(readings([sheet(distance, turn)], bearings) - true)) < 1e-4
-
-
-def test_the_plane_is_met_through_the_tilted_head():
-    head = RigidTransform.from_components([0.02, -0.03, 0.06], Rotation.from_rotvec([0.01, -0.02, 0.03]))
-    bearings, pitch = np.radians([85.0, 90.0, 100.0]), np.radians([-10.0, 0.0, 12.0])
-    p_lrf = polar_to_points(readings([sheet(2.0)], bearings, pitch=pitch, head=head), bearings)
-    np.testing.assert_allclose(lrf_to_platform(p_lrf, pitch, head)[:, 1], 2.0, atol=2e-4)
 
 
 @pytest.mark.parametrize("spot", [(0.012, 0.0044), (0.016, 0.0119)])  # of the LMS200 and the LMS221

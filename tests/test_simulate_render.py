@@ -72,13 +72,3 @@ def test_automatic_exposure_and_noise():
     )
     assert np.mean(image) == pytest.approx(200, abs=0.1) and np.mean(dark) == pytest.approx(50, abs=0.1)
     assert np.std(image) == pytest.approx(np.sqrt(1 + 2 + 1 / 12), rel=0.02)
-
-
-def test_a_light_casts_shadows():
-    things = [sheet(9, 1.0, [0, 0, 3.0]), sheet(0.4, 1.0, [0.6, 0, 2.0])]
-    world = World(things, Lights(np.array([[1.2, 0.0, 1.0]]), np.array([4.0]), 0.1))
-    directions = np.array([[0.0, 0.0, 1.0], [0.0, -0.9, 3.0]])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.zeros((2, 3))
-    light = world.radiance(origins, directions, world.cast(origins, directions))
-    assert light[0, 0] == pytest.approx(0.1) and light[1, 0] > 0.3

@@ -12,55 +12,10 @@ from tiny_sessions import CAMERAS, MODEL, record, rectangle
 
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess import survey
-from lrfcal_lib.preprocess.survey import alike, decide
 from lrfcal_lib.session.read import ImageRecord, open_session
 from lrfcal_lib.session.stated import transform_from_json
 
 HALF, MIRROR = Rotation.from_rotvec([0, 0, np.pi]), Rotation.from_rotvec([np.pi, 0, 0])
-RECTANGLE = Rotation.concatenate([Rotation.identity(), HALF, MIRROR, MIRROR * HALF])
-QUARTER = Rotation.from_rotvec([0, 0, np.pi / 2])
-SQUARE = Rotation.concatenate([Rotation.identity(), HALF, QUARTER, QUARTER * HALF, MIRROR, MIRROR * HALF,
-                               MIRROR * QUARTER, MIRROR * QUARTER * HALF])  # fmt: skip
-
-
-def images(symmetry, between, rng, placements=6, pitches=(-0.2, 0.0, 0.2)):
-    """Rotations, placements and cameras of images, and the order that is true in each (by index)."""
-    out = []
-    for placement in range(placements):
-        board = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]) * Rotation.from_rotvec([*rng.uniform(-0.6, 0.6, 2), 0])
-        for camera, turn in between.items():
-            for pitch in pitches:
-                seen = turn * Rotation.from_rotvec([pitch, 0, 0]) * board
-                first = symmetry[rng.integers(len(symmetry) // 2)]  # the detector begins anywhere, and counts clockwise
-                orders = Rotation.concatenate([seen * first * s for s in symmetry])
-                true = np.argmin([(o * seen.inv()).magnitude() for o in orders])
-                out.append((orders, placement, camera, true))
-    return [list(column) for column in zip(*out, strict=True)]
-
-
-@pytest.mark.parametrize("symmetry", [RECTANGLE, SQUARE], ids=["rectangle", "square"])
-@pytest.mark.parametrize("turned", [[0, 0.05, 0], [0, 0, 3.0], [0.4, 0.9, 1.2]], ids=["beside", "overhead", "askew"])
-def test_orders_of_a_placement_belong_together_however_the_cameras_are_mounted(symmetry, turned):
-    rng = np.random.default_rng(4)
-    rotations, placements, cameras, true = images(
-        symmetry, {"left": Rotation.identity(), "right": Rotation.from_rotvec(turned)}, rng
-    )
-    first, partner = alike(rotations, placements, cameras)
-    assert [placements[i] for i in first] == placements
-    np.testing.assert_array_equal(partner[np.arange(len(true)), np.take(true, first)], true)
-
-
-def test_the_evidence_of_all_images_decides():
-    rng = np.random.default_rng(5)
-    rotations, placements, cameras, true = images(RECTANGLE, {"left": Rotation.identity()}, rng)
-    scores = rng.uniform(0, 1, (len(true), 4))  # no image tells on its own
-    scores[np.arange(len(true)), true] += 0.45
-    assert np.mean(np.argmax(scores, axis=1) == true) < 0.95
-    first, partner = alike(rotations, placements, cameras)
-    chosen = decide(np.take_along_axis(scores, partner, axis=1), first)
-    np.testing.assert_array_equal(partner[np.arange(len(true)), chosen], true)
-
-
 @pytest.fixture(scope="module")
 def centred(tmp_path_factory):
     return open_session(

@@ -8,9 +8,10 @@ from contextlib import suppress
 import cv2
 import numpy as np
 import pytest
+from shared import until
 
 from lrfcal_lib.drivers import video
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError
+from lrfcal_lib.drivers.port import LineLost, NoReply, PortError
 from lrfcal_lib.drivers.video import Camera, MjpegStream
 
 WAIT_S = 20.0  # guard against a hang on a busy machine
@@ -23,14 +24,6 @@ def numbered(number, size=(64, 48)):
 
 def number_of(frame):
     return round(float(frame.image.mean()) / 16) % 16
-
-
-def until(condition):
-    """Wait for a state, not for a time."""
-    end = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 class MjpegServer:
@@ -146,32 +139,8 @@ def test_stream_that_is_silent_for_too_long(server):
         assert camera.newest(timeout=WAIT_S).image.shape == (48, 64, 3) and len(server.requests) > 1
 
 
-@pytest.mark.parametrize("ends", [True, False], ids=["ended", "silent"])
-def test_a_stream_that_ended_or_fell_silent_is_at_its_end_however_often_it_is_asked(server, ends):
-    stream = MjpegStream(server.url, 0.3)
-    assert stream.grab()
-    until(lambda: server.links)
-    if ends:
-        server.links.pop().close()
-    assert not stream.grab() and not stream.grab()
-    stream.release()
-    server.last = b""
-    stream = MjpegStream(server.url, 0.3)  # whose first image never comes
-    assert stream.get(cv2.CAP_PROP_FRAME_WIDTH) == stream.get(cv2.CAP_PROP_FRAME_HEIGHT) == 0
-    stream.release()
-
-
-def test_closing_wakes_who_waits(camera):
-    threading.Timer(0.1, camera.close).start()
-    for after in (time.time() + 100, None):
-        with pytest.raises(DeviceError, match="left is closed"):
-            camera.newest(after=after, timeout=WAIT_S)
-    camera.close()
-
-
 def test_frames_that_piled_up_are_known(server):
     stream = MjpegStream(server.url.replace("//", "//user:pass%20word@"), 5)
-    assert stream.multipart and (stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FPS)) == (64, 0)
     assert stream.grab()  # the one that told the size
     until(lambda: server.links)
     for number in (1, 2, 3):
@@ -179,10 +148,8 @@ def test_frames_that_piled_up_are_known(server):
     for number in (1, 2, 3):
         assert stream.grab() and not stream.waited
         assert stream.retrieve()[1].mean() == pytest.approx(16 * number, abs=2)
-    for wait in (0.1, 0.5, 2.0):
-        threading.Timer(wait, server.show, (4,)).start()
-    while not stream.waited:
-        assert stream.grab()
+    threading.Timer(0.5, server.show, (4,)).start()
+    assert stream.grab() and stream.waited
     stream.release()
     assert "Authorization: Basic dXNlcjpwYXNzIHdvcmQ=" in server.requests[0]
 
@@ -195,42 +162,23 @@ def test_a_url_that_nobody_serves(server, host):
         Camera(url, name="left", silence_s=0.3)
 
 
-def test_size_and_exposure_that_a_stream_cannot_set(server, caplog):
-    with Camera(server.url, name="left", size=(640, 480), exposure=0.01) as camera:
-        camera.newest(timeout=WAIT_S)
-    assert [record.getMessage() for record in caplog.records] == [
-        "camera left: size is (64, 48), asked (640, 480)", "camera left: exposure cannot be set, asked 0.01",
-    ]  # fmt: skip
-
-
 # ---------------------------------------------------------------------------------------------------- recorded
 
 
-@pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*"])
-def test_images_in_the_order_of_their_names(tmp_path, pattern):
-    for number in (3, 1, 2):
-        cv2.imwrite(str(tmp_path / f"{number:04d}.png"), numbered(number))
+@pytest.mark.parametrize("pattern", ["", "*.png", "000[123].*", "video.avi"])
+def test_recorded_images_in_the_order_of_their_names(tmp_path, pattern):
+    writer = cv2.VideoWriter(str(tmp_path / "video.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    for number in (1, 2, 3):
+        cv2.imwrite(str(tmp_path / f"{4 - number:04d}.png"), numbered(4 - number))
+        writer.write(numbered(number))
+    writer.release()
     (tmp_path / "notes.txt").write_text("no image")
     with Camera(tmp_path / pattern if pattern else tmp_path, name="right") as camera:
         assert camera.size == (64, 48)
         frames = [camera.newest(after=time.time()) for _ in range(3)]
         assert [(number_of(frame), frame.index) for frame in frames] == [(1, 0), (2, 1), (3, 2)]
         assert frames[0].time_s <= frames[1].time_s <= frames[2].time_s and not camera.lost
-        with pytest.raises(LineLost, match="at the end of its 3 recorded images"):
-            camera.newest()
-        assert camera.lost
-
-
-def test_video_file(tmp_path):
-    path = tmp_path / "video.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
-    assert writer.isOpened()
-    for number in range(5):
-        writer.write(numbered(number))
-    writer.release()
-    with Camera(str(path), name="right", fps=25, size=(64, 48)) as camera:
-        assert [number_of(camera.newest()) for _ in range(5)] == list(range(5))
-        with pytest.raises(LineLost, match="at the end of its 5"):
+        with pytest.raises(LineLost, match="at the end of its 3 "):
             camera.newest()
 
 
@@ -290,13 +238,6 @@ def device(monkeypatch):
     return made
 
 
-def test_what_a_device_does_as_told(device):
-    with Camera(0, name="left", size=(320, 240), exposure=0.005, fps=15) as camera:
-        assert camera.size == (320, 240)
-        assert [device.last.got[key] for key in (cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_FPS)] == [50, 15]
-        assert camera.newest(timeout=WAIT_S).image.shape == (240, 320, 3)
-
-
 def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
     device.fixed = {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FRAME_WIDTH}
     with Camera("0", name="left", size=(1024, 480), exposure=0.005) as camera:
@@ -304,19 +245,6 @@ def test_device_without_exposure_control_and_with_its_own_size(device, caplog):
         camera.newest(timeout=WAIT_S)
     assert "exposure cannot be set, asked 0.005" in caplog.text
     assert "size is (640, 480), asked (1024, 480)" in caplog.text
-
-
-def test_device_lost_and_found(device):
-    with Camera(0, name="left", exposure=0.005) as camera:
-        camera.newest(timeout=WAIT_S)
-        device.ends = True
-        device.there = False
-        until(lambda: camera.lost)
-        with pytest.raises(LineLost, match="check the plug of /dev/video0"):
-            camera.newest(timeout=0.1)
-        device.ends, device.there = False, True
-        assert camera.newest(timeout=WAIT_S).index > 0
-        assert device.last.got[cv2.CAP_PROP_EXPOSURE] == 50
 
 
 @pytest.mark.parametrize(("source", "habit", "what"), [

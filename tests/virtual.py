@@ -9,7 +9,7 @@ import numpy as np
 from faults import FaultyHead, FaultyLms
 
 from lrfcal_lib.drivers.port import PortError
-from lrfcal_lib.session.lms2xx_codec import Configuration, split_stream
+from lrfcal_lib.session.lms2xx_codec import Configuration
 
 LEAST_S = 1e-9  # that a wait takes, so that rounding errors of what is left do not make it endless
 ROOM = 4095  # bytes that a port keeps until they are read
@@ -239,12 +239,6 @@ def head(host=None, **options):
     return FaultyHead(path="head", host=host or VirtualHost(), **options).start()
 
 
-def telegrams(data):
-    """The sound telegrams of a device in a row of bytes."""
-    found = split_stream(bytes(data))
-    return [bytes(data[o : o + n]) for o, n in zip(found.offset.tolist(), found.length.tolist(), strict=True)]
-
-
 class Bench:
     """A program at the other end of a device's line; its rate is the device's unless one is given."""
 
@@ -278,22 +272,3 @@ class Bench:
         self.machine.sleep(wait)
         self.port.reset_input_buffer()
         return self.heard
-
-    def reply(self, raw, code, wait=1.0, tries=3):
-        """Ask until a reply of that code comes, within a time each; one byte is read at a time."""
-        for _ in range(tries):
-            self.ask(raw)
-            end = self.now + wait
-            while self.now < end:
-                found = self.read(end - self.now)
-                if found is not None and found[4] == code:
-                    return found
-        raise AssertionError(f"no reply {code:02X} in {tries} tries of {wait} s")
-
-    def read(self, wait):
-        """The next sound telegram within a time; None without."""
-        end, data = self.now + wait, b""
-        while self.now < end and not telegrams(data):
-            self.machine.wait(lambda: self.port.in_waiting, end - self.now)
-            data += self.port.read(1)
-        return next(iter(telegrams(data)), None)

@@ -132,7 +132,7 @@ class Terminal(threading.Thread):
 
     def __init__(self, device):
         super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
-        self._device, self._quit, self._master, self.open, self.wake = device, False, None, False, lambda: None
+        self._device, self._quit, self._master, self.open = device, False, None, False
 
     there = property(lambda self: self._master is not None)
     rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
