@@ -78,7 +78,7 @@ def parser():
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
     emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
     report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
-    report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the one at hand)")
+    report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the shipped one)")
     report.add_argument("--out", help="folder of the report (default reports/<session>)")
     report.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     return top

@@ -38,7 +38,7 @@ from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.lms2xx_codec import encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
-from lrfcal_lib.session.write import SessionRecorder, SessionWriter
+from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish
 
 SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
@@ -258,7 +258,7 @@ def use(rng, path):
     if (path / "rig.json").exists():
         return [_caught(_open_rig, path / "rig.json")]  # what it names belongs to who wrote it
     read = any_of(rng, validate, _survey if rng.random() < SURVEYED else read_all)
-    return [_caught(work, path) for work in (read, *[_go_on] * (rng.random() < 0.3))]
+    return [_caught(work, path) for work in (read, *[any_of(rng, _go_on, finish)] * (rng.random() < 0.3))]
 
 
 def _open_rig(file):
@@ -298,7 +298,7 @@ def _caught(work, *arguments):
         error, trace, last = raised, traceback.format_exc(), traceback.extract_tb(raised.__traceback__)[-1]
     if "MemoryError" in trace or "nsufficient memory" in trace:
         return "memory", repr(error)[:200], trace
-    ours = [SessionError, RigFileError] + [OSError] * (work is _go_on)
+    ours = [SessionError, RigFileError] + [OSError] * (work in (_go_on, finish))
     if work in (read_all, _survey) and last.filename.startswith(LIBRARY):
         ours.append(ValueError)  # what the preprocessing raises itself is documented as ValueError
     return None if isinstance(error, tuple(ours)) else ("foreign", repr(error)[:200], trace)

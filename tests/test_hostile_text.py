@@ -122,9 +122,9 @@ def test_nothing_runs_in_the_panel(page):
     light, task = Light(HOSTILE, "warn", HOSTILE), SimpleNamespace(title=HOSTILE, guidance=HOSTILE)
     vector = ((0.0,) * 3,) * 4
     result = SimpleNamespace(answer="no", sentences=(f"a: {HOSTILE}", HOSTILE), file=HOSTILE, poses={HOSTILE: vector})
-    said = [panel.title_html(HOSTILE), panel.soft_html(HOSTILE), panel.state_html("busy", HOSTILE)]
-    said += [panel.error_html(HOSTILE, HOSTILE), panel.notes([HOSTILE]), panel.lights_html(HOSTILE, [light])]
-    said += [panel.task(task, True, (1,)), panel.result_html(result)]
+    said = [panel.HTML.title(HOSTILE), panel.HTML.soft(HOSTILE), panel.HTML.state("busy", HOSTILE)]
+    said += [panel.HTML.error(HOSTILE, HOSTILE), panel.HTML.notes([HOSTILE]), panel.HTML.lights(HOSTILE, [light])]
+    said += [panel.HTML.task(task, True, (1,)), panel.HTML.result(result)]
     page.goto("about:blank")
     page.set_content("".join(f"<div>{part}</div>" for part in said))
     assert seen(page).count(HOSTILE) == 15

@@ -24,7 +24,7 @@ FRAMES = {
     "FF 0A 88 90 20 00 42": Frame(10, 0x88, 0x90, 0x20),
     "FF 01 00 03 00 01 05": Frame(1, 0, 0x03, 0, 1),
     "FF 01 00 07 00 22 2A": Frame(1, 0, 0x07, 0, 0x22),
-    "FF 01 00 51 00 00 52": Frame(1, 0, pelco_d.QUERY_PAN),
+    "FF 01 00 51 00 00 52": Frame(1, 0, 0x51),
     "FF 01 00 53 00 00 54": Frame(1, 0, pelco_d.QUERY_TILT),
 }
 # degrees up, and the frames' last three bytes for set pan, set tilt, pan reply, tilt reply
@@ -57,9 +57,8 @@ def test_angles(degrees, set_pan, set_tilt, pan, tilt):
     for opcode, end in ((0x4B, set_pan), (0x4D, set_tilt), (0x59, pan), (0x5B, tilt)):
         raw = encode_extended(1, opcode, value)
         assert raw == bytes.fromhex(f"FF 01 00 {opcode:02X} {end}")
-    reply = split_replies(raw).replies[0]
-    assert (reply.opcode, reply.address) == (pelco_d.TILT, 1)
-    assert math.degrees(pelco_d.decode_tilt(reply.value)) == pytest.approx(degrees)
+    (told,) = split_replies(raw, QUERY).tilts
+    assert math.degrees(pelco_d.decode_tilt(told)) == pytest.approx(degrees)
 
 
 def test_every_tilt_survives():
@@ -81,29 +80,41 @@ def test_commands_between_garbage():
     assert split_frames(b"\x01\x02") == ((), 2)
 
 
-@pytest.mark.parametrize(("data", "sent", "numbers"), [
-    (LEVEL, QUERY, (1, pelco_d.TILT, 0)),
-    (PAN_45, QUERY, (1, pelco_d.PAN, 4500)),
-    (bytes.fromhex("00 59 00 64 BD"), QUERY, (None, pelco_d.PAN, 100)),
-    (bytes.fromhex("FF 01 00 01"), STOP, (1, None, 0)),
-    (bytes.fromhex("FF 01 05 06"), STOP, (1, None, 5)),
-    (b"\x01", QUERY, (None, None, None)),
-])  # fmt: skip
-def test_kinds_of_reply(data, sent, numbers):
-    received = split_replies(data, sent, complete=True)
-    assert received == pelco_d.Received((pelco_d.Reply(data, *numbers),), 0, 0)
-
-
 ACKNOWLEDGED = bytes.fromhex("FF 01 00 29")  # of the motion
+FAR = encode_extended(1, pelco_d.TILT, 36000)  # no such angle
 
 
-@pytest.mark.parametrize(("data", "sent", "complete", "found"), [
-    (ACKNOWLEDGED, MOTION, False, 1), (ACKNOWLEDGED, STOP, False, 0), (ACKNOWLEDGED, b"", True, 0),
-    (encode_extended(1, pelco_d.ZOOM, 36000), QUERY, False, 1),
-    (encode_extended(1, pelco_d.TILT, 36000), QUERY, False, 0),  # no such angle
+@pytest.mark.parametrize(("data", "sent", "found"), [
+    (LEVEL, QUERY, ((0,), False)), (FAR, QUERY, ((), False)), (PAN_45, QUERY, ((), False)),
+    (encode_extended(2, pelco_d.TILT), QUERY, ((), False)), (b"\x01", STOP, ((), False)),
+    (bytes.fromhex("00 5B 00 64 BF"), QUERY, ((100,), False)),  # without sync and address
+    (ACKNOWLEDGED, MOTION, ((), True)), (ACKNOWLEDGED, STOP, ((), False)), (ACKNOWLEDGED, QUERY, ((), False)),
+    (bytes.fromhex("FF 01 05 06"), STOP, ((), True)),  # with alarms
 ])  # fmt: skip
-def test_what_is_a_reply_to_what_was_sent(data, sent, complete, found):
-    assert len(split_replies(data, sent, complete=complete).replies) == found
+def test_what_is_a_reply_to_what_was_sent(data, sent, found):
+    received = split_replies(data, sent)
+    assert (received.tilts, received.acknowledged) == found
+    for echo in (sent, sent[3:]):
+        again = split_replies(echo + data, sent)
+        assert ((again.tilts, again.acknowledged), again.echoed) == (found, len(echo))
+
+
+@pytest.mark.parametrize("command", [STOP, MOTION, encode_extended(1, pelco_d.SET_TILT, 0x11EE)])
+def test_a_piece_of_the_own_frame_is_no_reply(command):
+    """The last one ends in its opcode, so that its beginning looks like a confirmation."""
+    for count in range(1, 8):
+        for piece in (command[:count], command[-count:]):
+            received = split_replies(piece, command)
+            assert received.echoed + received.skipped == count and not (received.tilts or received.acknowledged)
+
+
+def test_bytes_that_come_one_by_one_give_no_premature_reply():
+    for address in (1, 8, 255):
+        sent = encode_extended(address, pelco_d.QUERY_TILT)
+        data = sent + b"\xff" + encode_extended(address, pelco_d.TILT, 4500)
+        for count in range(len(data)):
+            assert not split_replies(data[:count], sent).tilts
+        assert split_replies(data, sent).tilts == (4500,)
 
 
 def test_reply_after_every_kind_of_noise():
@@ -111,9 +122,9 @@ def test_reply_after_every_kind_of_noise():
     lost = 0
     for _ in range(2000):
         noise = rng.choice([0xFF, 0x00, 0x01, 0x59, 0x5B, *range(256)], rng.integers(0, 12)).astype(np.uint8).tobytes()
-        received = split_replies(noise + LEVEL + noise, QUERY, complete=True)
-        lost += LEVEL not in [one.raw for one in received.replies]
-        assert received.echoed + received.skipped + sum(len(one.raw) for one in received.replies) == 7 + 2 * len(noise)
+        received = split_replies(noise + LEVEL + noise, QUERY)
+        lost += 0 not in received.tilts
+        assert received.echoed + received.skipped + 7 * len(received.tilts) == 7 + 2 * len(noise)
     assert lost < 20  # one in 256 of the places where noise and reply look like another reply
 
 
@@ -122,15 +133,15 @@ def test_fuzz():
     rng, found = np.random.default_rng(0), 0
     seeds = [STOP, QUERY, LEVEL, PAN_45, QUERY + LEVEL, bytes.fromhex("00 59 00 64 BD"), STOP[:4], b"\xff" * 9]
     for row in range(STRINGS):
-        data, sent = rng.bytes(int(rng.integers(25))), (STOP, QUERY, b"")[row % 3]
+        data, sent = rng.bytes(int(rng.integers(25))), (STOP, QUERY, MOTION)[row % 3]
         if row % 2:
             seed = seeds[row // 2 % len(seeds)]
             at = int(rng.integers(2 * len(seed)))
             data = data[:4] + seed[:at] + data[5:6] * (at < len(seed)) + seed[at + 1 :]
-        received = split_replies(data, sent, complete=row % 5 > 0)
-        used = received.echoed + received.skipped + sum(len(one.raw) for one in received.replies)
-        assert used == len(data) or used < len(data) and row % 5 == 0
+        received = split_replies(data, sent)
+        used = received.echoed + received.skipped + 5 * len(received.tilts)
+        assert used == len(data) or used < len(data) and (received.tilts or received.acknowledged)
         frames, pending = split_frames(data)
         assert 7 * len(frames) <= pending <= len(data)
-        found += len(frames) + len(received.replies)
+        found += len(frames) + len(received.tilts) + received.acknowledged
     assert found > STRINGS / 10

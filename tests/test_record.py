@@ -94,7 +94,7 @@ def test_a_session_holds_what_the_devices_gave(path, cameras):
     complete(make_rig(listed(-4, 0, 4, cameras=cameras)), path)
     session = open_session(path)
     assert session.placements == (1, 2, 3) and "stop-and-go" in session.reference["recording"]
-    assert session.telegram_report()["outcomes"] == {"scan": 9, "other": 1, "wrong CRC": 0, "truncated": 0}
+    assert session.telegrams.report()["outcomes"] == {"scan": 9, "other": 1, "wrong CRC": 0, "truncated": 0}
 
 
 @pytest.mark.parametrize("feedback", [True, False])

@@ -19,7 +19,6 @@ from shared import ROOT
 from test_session import wall, write
 
 from lrfcal_lib.report import notebook, report
-from lrfcal_lib.session.stated import SessionError
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 GOOD = """
@@ -241,22 +240,13 @@ def test_make_takes_a_session_with_a_space():
 def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "NOTEBOOKS", tmp_path)
     write_notebook(tmp_path / "00_good.ipynb", GOOD)
-    assert report.main([session], tmp_path / "a", 1) == 0
+    assert report.main([session], tmp_path / "a") == 0
     assert "1 of 1 notebooks" in capsys.readouterr().out
     write_notebook(tmp_path / "00_good.ipynb", "1 / 0")
     assert report.main([session], tmp_path / "b") == 1
     assert "00_good failed: ZeroDivisionError" in capsys.readouterr().err
     assert report.main([tmp_path / "nowhere"]) == 2
     assert "nowhere" in capsys.readouterr().err
-
-
-def test_the_shipped_session_comes_first_and_without_any_it_says_how_to_get_one(session, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "SHIPPED", session)
-    assert report.default_session() == session
-    monkeypatch.setenv("LRFCAL_REAL_DATA", str(tmp_path))
-    monkeypatch.setattr(report, "SHIPPED", tmp_path / "none")
-    with pytest.raises(SessionError, match="suijingfeng/LaserSeteroCalibration @ f9a70a9.*ZED_STEREO_LASER_SWEEP"):
-        report.default_session()
 
 
 def test_storing_keeps_outputs_of_simulations_only_and_nothing_of_what_fails(session, tmp_path):
@@ -287,13 +277,3 @@ def test_outside_a_report_run_nothing_is_written(monkeypatch, tmp_path):
 def test_names_become_file_names(name):
     with pytest.raises(ValueError, match="must consist of lower-case letters"):
         notebook.finding(name, 1, "text")
-
-
-def test_session_path_falls_back_and_explains(monkeypatch, tmp_path):
-    monkeypatch.setenv("LRFCAL_SESSION", "somewhere")
-    assert str(notebook.session_path()) == "somewhere"
-    monkeypatch.delenv("LRFCAL_SESSION")
-    monkeypatch.setattr(notebook, "SHIPPED", tmp_path / "none")
-    monkeypatch.setattr(notebook, "SCRATCH", tmp_path / "none")
-    with pytest.raises(FileNotFoundError, match="make report"):
-        notebook.session_path()

@@ -15,7 +15,7 @@ from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import image_size, open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError
-from lrfcal_lib.session.write import SessionWriter
+from lrfcal_lib.session.write import SessionWriter, finish
 
 BEARINGS = np.radians(np.arange(60.0, 121.0))
 LRF = LrfInfo("made up", (BEARINGS[0], BEARINGS[-1]), np.radians(1.0), 0.005, np.radians(0.01), 0.001, 8.0)
@@ -99,6 +99,33 @@ def test_picks_override_by_camera_file_and_edge(path):
     (found,) = session.picks
     assert found.edge == "ab" and found.file == session.images("left", 1)[0].file
     assert found.ends.tolist() == [[1, 2], [20, 3.5]]
+
+
+# ---------------------------------------------------------------------------------------------- crashes
+
+
+def test_an_interrupted_recording_is_said_and_can_be_finished(tmp_path):
+    path = tmp_path / "s"
+    with pytest.raises(RuntimeError, match="power"), SessionWriter(path, triangle_board(), LRF, CAMERAS) as writer:
+        writer.add_sweep(4, *wall())
+        writer.add_image("left", pixels(), 4)
+        raise RuntimeError("power cut")
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images/left/00")
+    with pytest.raises(SessionError, match=r"interrupted; lrfcal_lib\.session\.write\.finish"):
+        open_session(path)
+    finish(path)
+    session = open_session(path)
+    assert session.placements == (4,) and len(session.images("left", 4)) == 1
+    assert sorted(p.name for p in (path / "lrf").iterdir()) == ["scans.npz"]
+
+
+def test_finish_needs_sweeps(path):
+    with pytest.raises(SessionError, match="no sweep to finish"):
+        finish(path)
+    (path / "images").mkdir(exist_ok=True)
+    with pytest.raises(SessionError, match="lrf is missing; is this the folder of a session"):
+        finish(path / "images")
 
 
 def test_an_existing_target_is_refused(path):

@@ -13,6 +13,8 @@ from pathlib import Path
 import cv2
 import ipywidgets as w
 import numpy as np
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup
 
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
@@ -21,80 +23,13 @@ from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.recording import COLORS
 from lrfcal_lib.session.stated import escape
 
-GOOD, WARN, BAD, IDLE = "#1a7f37", "#9a6700", "#cf222e", "#57606a"
-LIGHTS = {"ok": (GOOD, "✓", "good"), "warn": (WARN, "!", "check"), "bad": (BAD, "✕", "bad")}
-ANSWERS = {"yes": (GOOD, "✓", "can be trusted"), "with care": (WARN, "!", "use with care"),
-           "no": (BAD, "✕", "cannot be trusted")}  # fmt: skip
-STATES = {"off": (IDLE, "○", "not connected"), "ready": (GOOD, "●", "ready"), "busy": (WARN, "◐", "busy")}
-STYLE = f"<style>\n{Path(__file__).with_name('panel.css').read_text()}</style>"
-
-
-def mark_html(colour, sign, word):
-    """A coloured label with a sign and a word."""
-    return f'<span class="mark" style="background:{colour}">{sign} {escape(word)}</span>'
-
-
-def title_html(text):
-    """A heading of a part of the panel."""
-    return f"<h4>{escape(text)}</h4>"
-
-
-def soft_html(text):
-    """A remark."""
-    return f'<span class="soft">{escape(text)}</span>'
-
-
-def state_html(name, text=""):
-    """State of the panel: 'off', 'ready' or 'busy', and what it is busy with."""
-    return mark_html(*STATES[name]) + soft_html(text)
-
-
-def error_html(heading, text):
-    """Something went wrong, and what to do; '' for no text."""
-    if not text:
-        return ""
-    return (f'<div class="lrfcal-error" style="border-left:4px solid {BAD};padding:6px 10px;margin:6px 0">'
-            f"{mark_html(BAD, '✕', heading)}{escape(text)}</div>")  # fmt: skip
-
-
-def notes(lines):
-    """What the drivers reported."""
-    return "".join(f"<p>{soft_html(line)}</p>" for line in lines)
-
-
-def lights_html(heading, found):
-    """Lights of a placement, or a remark where there are none yet."""
-    rows = ""
-    for one in found:  # what should be added next is no fault of what was recorded
-        to_come = (one.name, one.state) == ("information", "warn")
-        mark = mark_html(*((IDLE, "→", "next") if to_come else LIGHTS[one.state]))
-        rows += f'<div class="light">{mark}<span><b>{escape(one.name)}</b> {escape(one.text)}</span></div>'
-    return title_html(heading) + (rows or soft_html("they are checked as soon as a placement is recorded"))
-
-
-def task(found, emulated, finished):
-    """What to record next."""
-    done = soft_html(f"recorded: {', '.join(map(str, finished))}" if finished else "nothing is recorded yet")
-    if found is None:
-        return f"{title_html('The plan is done')}<p>Calibrate, or close.</p>{done}"
-    what = escape(found.guidance[:1].upper() + found.guidance[1:])
-    if emulated:
-        what = f"The emulated board moves by itself. {soft_html('A real one:')} {what}"
-    return f"{title_html(found.title)}<p>{what}.</p>{done}"
-
-
-def result_html(found):
-    """A calibration: may it be trusted, what is expected, the poses."""
-    first = found.sentences[0].partition(": ")[2] or "Every check passed."
-    text = "".join(f"<p>{escape(sentence)}</p>" for sentence in found.sentences[1:])
-    where = f"<p>{soft_html(f'written: {found.file}')}</p>" if found.file else ""
-    rows = [("camera", "rotation vector [deg]", "translation [mm]")] if found.poses else []
-    for camera, (turn, shift, turn_sigma, shift_sigma) in found.poses.items():
-        cells = (zip(turn, turn_sigma, (2,) * 3, strict=True), zip(shift, shift_sigma, (1,) * 3, strict=True))
-        rows.append((escape(camera), *(", ".join(f"{v:.{n}f} ± {s:.{n}f}" for v, s, n in cell) for cell in cells)))
-    table = "".join(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>" for cells in rows)
-    return (f'<div class="lrfcal-result"><p>{mark_html(*ANSWERS[found.answer])}{escape(first[:1].upper() + first[1:])}'
-            f"</p>{table and f'<table>{table}</table>'}{text}{where}</div>")  # fmt: skip
+HERE = Path(__file__).parent
+STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
+# macros that make parts of the panel; all that is put into them is text
+HTML = Environment(
+    loader=FileSystemLoader(HERE), autoescape=True, trim_blocks=True, lstrip_blocks=True,
+    finalize=lambda value: value if hasattr(value, "__html__") else Markup(escape(value)),
+).get_template("panel.html.jinja").module  # fmt: skip
 
 
 PICTURE = (400, 300)  # pixels
@@ -202,9 +137,9 @@ FIELDS = {  # kind, options, layout
                                "description": "target"}, WIDE),
     "progress": (w.FloatProgress, {"min": 0, "max": 1, "description": ""}, WIDE),
 }  # fmt: skip
-TEXTS = {"state": state_html("off"), "error": "", "notes": "", "pitch": "", "task": "", "doing": "",
-         "lights": lights_html("Quality", ()),
-         "result": soft_html("three placements and more; the recording can go on afterwards")}  # fmt: skip
+TEXTS = {"state": HTML.state("off"), "error": "", "notes": "", "pitch": "", "task": "", "doing": "",
+         "lights": HTML.lights("Quality", ()),
+         "result": HTML.soft("three placements and more; the recording can go on afterwards")}  # fmt: skip
 
 
 def card(*children, grow=1, basis="300px"):
@@ -226,11 +161,11 @@ class Picture:
         self.image = w.Image(format=kind, layout=w.Layout(width="100%", max_width=f"{PICTURE[0]}px"))
         self.image.add_class(f"lrfcal-picture-{name}")
         self.remark = w.HTML()
-        self.box = card(w.HTML(title_html(heading)), self.image, self.remark, basis="270px")
+        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark, basis="270px")
 
     def show(self, data, remark):
         """Show the bytes of an image; what did not change is not sent again."""
-        self.image.value, self.remark.value = data, soft_html(remark)
+        self.image.value, self.remark.value = data, HTML.soft(remark)
 
 
 class Parts:
@@ -250,12 +185,12 @@ class Parts:
         self.pictures, self.views = {}, row()
         head = row(w.HTML("<b style='font-size:16px'>Data collection</b>"), self.state, self.stop,
                    justify_content="space-between", align_items="center")  # fmt: skip
-        head_card = card(w.HTML(title_html("Head")), self.pitch, self.slider, row(self.go))
+        head_card = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
         next_card = card(self.task, row(self.capture, self.again), self.progress, self.doing)
         self.root = w.VBox(
             [w.HTML(STYLE), head, row(self.rig, self.session, self.connect, self.close), self.error, self.views,
              row(head_card, next_card, card(self.lights, grow=2, basis="420px")),
-             card(w.HTML(title_html("Result")), row(self.calibrate), self.result, basis="auto"), self.notes],
+             card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto"), self.notes],
             layout=w.Layout(grid_gap="10px"),
         )  # fmt: skip
         self.root.add_class("lrfcal-panel")
@@ -293,7 +228,7 @@ class Notes(logging.Handler):
     def emit(self, record):
         """Show the newest lines."""
         self.lines = [*self.lines, f"{time.strftime('%H:%M:%S')} {record.getMessage()}"][-NOTES:]
-        self.part.value = notes(self.lines)
+        self.part.value = HTML.notes(self.lines)
 
 
 class Panel(Closed):
@@ -370,21 +305,21 @@ class Panel(Closed):
         with self._doing("recording"):
             self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
-            self.parts.lights.value = lights_html(f"Quality of {task.title.lower()}", lights)
+            self.parts.lights.value = HTML.lights(f"Quality of {task.title.lower()}", lights)
         return lights
 
     def again(self):
         """Take the placement recorded last back; returns its number."""
         with self._doing("taking it back"):
             number = self.collector.again()
-            self.parts.lights.value = lights_html("Quality", ())
+            self.parts.lights.value = HTML.lights("Quality", ())
         return number
 
     def calibrate(self):
         """Calibrate what was recorded so far; returns the Result."""
         with self._doing("calibrating"):
             result = self.collector.calibrate()
-            self.parts.result.value = result_html(result)
+            self.parts.result.value = HTML.result(result)
         return result
 
     def stop(self):
@@ -408,7 +343,7 @@ class Panel(Closed):
     def _doing(self, text):
         """Something is under way: nothing else can be pressed, and what goes wrong is said."""
         parts, heading = self.parts, ""
-        parts.error.value, parts.state.value = "", state_html("busy", text)
+        parts.error.value, parts.state.value = "", HTML.state("busy", text)
         self._show_progress(0.0, text)
         parts.enable(self.collector.connected, True, False)
         try:
@@ -418,7 +353,7 @@ class Panel(Closed):
             if not isinstance(error, EXPECTED):
                 said = f"{type(error).__name__}: {error}"
                 LOG.exception("the panel failed while %s", text)
-            parts.error.value = error_html(heading, said)
+            parts.error.value = HTML.error(heading, said)
             raise
         finally:
             self._show_progress(0.0, heading)
@@ -429,14 +364,14 @@ class Panel(Closed):
     def _refresh(self):
         """Show what can be done now."""
         collector, parts = self.collector, self.parts
-        parts.state.value = state_html("ready" if collector.connected else "off")
-        parts.task.value = title_html("Next placement") + soft_html("connect a rig first")
+        parts.state.value = HTML.state("ready" if collector.connected else "off")
+        parts.task.value = HTML.title("Next placement") + HTML.soft("connect a rig first")
         if collector.connected:
-            parts.task.value = task(collector.task(), collector.emulated, collector.finished)
+            parts.task.value = HTML.task(collector.task(), collector.emulated, collector.finished)
         parts.enable(collector.connected, False, bool(collector.finished))
 
     def _show_progress(self, share, text):
-        self.parts.progress.value, self.parts.doing.value = share, soft_html(text)
+        self.parts.progress.value, self.parts.doing.value = share, HTML.soft(text)
 
     def _begin_sweep(self, task):
         """An empty picture of the sweep to come."""
@@ -458,7 +393,7 @@ class Panel(Closed):
     def _show_view(self, view, view_of):
         parts, pictures, sweep = self.parts, self.parts.pictures, self._sweep
         how = "told by the head" if view.measured else "dead reckoning: the head does not tell it"
-        parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {soft_html(how)}"
+        parts.pitch.value = f"<b>{np.degrees(view.pitch):+.2f}°</b> {HTML.soft(how)}"
         if view.ranges is not None:
             known = np.isfinite(view.ranges)
             nearest = f"nearest {np.min(view.ranges[known]):.2f} m" if known.any() else "no range at all"
@@ -472,4 +407,4 @@ class Panel(Closed):
             size = "{1} x {0} pixels".format(*frame.image.shape)
             pictures[name].show(jpeg(frame.image, PICTURE[0]), size)
         if view.trouble or "view" in parts.error.value.partition("</span>")[0]:  # it goes when it is over
-            parts.error.value = error_html("view", view.trouble)
+            parts.error.value = HTML.error("view", view.trouble)

@@ -9,13 +9,11 @@ from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
-FRAME, GENERAL, SHORT = 7, 4, 5  # bytes of a frame and of the kinds of reply
+FRAME, SHORT, GENERAL = 7, 5, 4  # bytes of a frame, of a short reply, of a confirmation
 UP, DOWN = 0x08, 0x10  # bits of command 2; without them, and those of the pan, it is a stop
 FASTEST = 0x3F  # speed byte; 0 is very slow, not stop
 SET_TILT = 0x4D
-QUERY_PAN, QUERY_TILT, QUERY_ZOOM, QUERY_MAGNIFICATION = 0x51, 0x53, 0x55, 0x61
-PAN, TILT, ZOOM, MAGNIFICATION = 0x59, 0x5B, 0x5D, 0x63  # replies
-ANSWER = {QUERY_PAN: PAN, QUERY_TILT: TILT, QUERY_ZOOM: ZOOM, QUERY_MAGNIFICATION: MAGNIFICATION}
+QUERY_TILT, TILT = 0x53, 0x5B  # and its reply
 TURN = 36000  # hundredths of a degree
 
 
@@ -33,26 +31,13 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Reply:
-    """One reply of a head, by the length of what was received.
-
-    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a command, their value is
-    a byte of alarm bits; some heads send the one byte 0x01.
-    """
-
-    raw: bytes
-    address: int | None = None
-    opcode: int | None = None
-    value: int | None = None
-
-
-@dataclass(frozen=True)
 class Received:
     """What came back after a frame was sent."""
 
-    replies: tuple
-    echoed: int  # bytes of the own frame that a two-wire adapter handed back
-    skipped: int  # bytes that belong to nothing
+    tilts: tuple = ()  # numbers of the replies that tell the tilt
+    acknowledged: bool = False
+    echoed: int = 0  # bytes of the own frame that a two-wire adapter handed back
+    skipped: int = 0  # bytes that belong to nothing
 
 
 def encode_frame(address, command1=0, command2=0, data1=0, data2=0):
@@ -96,62 +81,38 @@ def decode_tilt(value):
     return -math.radians((value if value <= TURN // 2 else value - TURN) / 100)
 
 
-def split_replies(data, sent=b"", *, complete=False):
+def tilt_in(raw, address):
+    """Number of the frame with which the head of an address tells its tilt, in a tuple; angles end at 359.99 deg."""
+    return tuple(
+        frame.value for frame in split_frames(raw)[0]
+        if (frame.address, frame.command1, frame.command2) == (address, 0, TILT) and frame.value < TURN
+    )  # fmt: skip
+
+
+def split_replies(data, sent):
     """What a head, and an adapter that echoes, sent back after one frame, as Received.
 
-    Every place is tried by length and checksum, the longer kinds first; a place that fits none is skipped. Frames of
-    other senders count as skipped. The checksum of 4-byte replies continues that of the frame `sent`, and its echo,
-    whole or one end of it, is told from replies by comparison with it. `complete`: nothing more will come, so that what
-    could still grow is decided now; otherwise it is left out.
+    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a command: a byte of alarm
+    bits, and a checksum that continues that of the command. Every place is tried, and one that fits nothing is skipped;
+    so are frames of other senders, and the single byte 01 of some heads. What looks like a confirmation may as well be
+    the beginning of an echo, and is none then; of echoes the beginning may be lost.
     """
-    data, sent = bytes(data), bytes(sent)
-    replies, echoed, skipped = [], 0, 0
-    while data and (complete or not _may_grow(data, sent)):
-        echo = _echo(data, sent, first=not replies and not echoed)
-        reply = None if echo else _reply(data, sent)
-        replies += [reply] if reply else []
-        echoed += echo
-        skipped += not echo and not reply
-        data = data[echo or (len(reply.raw) if reply else 1) :]
-    return Received(tuple(replies), echoed, skipped)
-
-
-def _may_grow(data, sent):
-    """Whether the last bytes are the beginning of something longer."""
-    if sent.startswith(data) and len(data) < len(sent):
-        return True
-    if data[0] == SYNC:
-        return len(data) < GENERAL or len(data) < FRAME and data[2] == 0 and data[3] in ANSWER.values()
-    return data == b"\x01"
-
-
-def _echo(data, sent, first):
-    """Number of bytes of the own frame here: all of it, or one end of it where only noise came before."""
-    if data.startswith(sent):
-        return len(sent)
-    if first and sent.startswith(data):
-        return len(data)
-    if not first or _reply(data, sent, alone=False):
-        return 0
-    return next((n for n in range(len(sent) - 1, 0, -1) if data.startswith(sent[-n:])), 0)
-
-
-def _reply(data, sent, alone=True):
-    """The reply that begins here, or None."""
-    if data[0] == SYNC and len(data) >= FRAME and (answer := _answer(data[1:FRAME])):
-        return Reply(data[:FRAME], data[1], *answer)
-    if data[0] == SYNC and len(data) >= GENERAL and len(sent) == FRAME and data[3] == (sent[6] + data[2]) & 0xFF:
-        return Reply(data[:GENERAL], data[1], value=data[2])
-    if len(data) >= SHORT and (answer := _answer(data[:SHORT])):
-        return Reply(data[:SHORT], None, *answer)
-    return Reply(data) if alone and data == b"\x01" else None
-
-
-def _answer(raw):
-    """Opcode and value of an answer that ends in 0, opcode, value, checksum, else None; angles end at 359.99 deg."""
-    opcode, value = raw[-4], int.from_bytes(raw[-3:-1], "big")
-    sensible = opcode in (ZOOM, MAGNIFICATION) or opcode in (PAN, TILT) and value < TURN
-    return (opcode, value) if sensible and raw[-5] == 0 and raw[-1] == sum(raw[:-1]) & 0xFF else None
+    tilts, acknowledged, echoed, skipped = [], False, 0, 0
+    while data:
+        short, size, fresh = data[:GENERAL], 1, not (tilts or acknowledged or echoed or skipped)
+        if data.startswith(sent):
+            echoed += (size := FRAME)
+        elif found := tilt_in(data[:FRAME], sent[1]) or tilt_in(bytes([SYNC, 0]) + data[:SHORT], 0):
+            tilts, size = [*tilts, *found], FRAME if data[0] else SHORT
+        elif (len(short) == GENERAL and sent[3] != QUERY_TILT and not sent.startswith(short)
+              and short[0] == SYNC and short[3] == (sent[6] + short[2]) & 0xFF):  # fmt: skip
+            acknowledged, size = True, GENERAL
+        elif fresh and (end := next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)):
+            echoed += (size := end)
+        else:
+            skipped += 1
+        data = data[size:]
+    return Received(tuple(tilts), acknowledged, echoed, skipped)
 
 
 READ_S = 0.02  # longest wait for single bytes, so that no read overshoots a deadline by more
@@ -186,16 +147,11 @@ class HeadLine:
         After a time-out the next reply may be the late one, so it is thrown away and the head asked again. The head
         looks at its encoder about half-way between the beginning of the query and the end of the reply.
         """
-        frame, mine = encode_extended(self.settings.address, QUERY_TILT), (None, self.settings.address)
-
-        def tilts(received):
-            """Numbers of the tilt replies among others; 5-byte replies carry no address."""
-            return [one.value for one in received.replies if one.opcode == TILT and one.address in mine]
-
+        frame = encode_extended(self.settings.address, QUERY_TILT)
         for _ in range(1 + retries + self._late):
             with self.lock:
                 suspect, begun = self._late, self.host.now()
-                told = tilts(self._exchange(frame, tilts, self.settings.reply_s, again=True))
+                told = self._exchange(frame, self.settings.reply_s, again=True).tilts
                 self._late = not told
             if told and not suspect:
                 return (begun + self.host.now()) / 2, self.settings.pitch(decode_tilt(told[-1]))
@@ -215,7 +171,7 @@ class HeadLine:
         instants = []
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
-                acknowledged = self._exchange(self._stop, again=True).replies
+                acknowledged = self._exchange(self._stop, again=True).acknowledged
                 instants.append(self._sent)
             if acknowledged:
                 self._acknowledges = True
@@ -236,15 +192,14 @@ class HeadLine:
             if held:
                 self.lock.release()
 
-    def _exchange(self, frame, found=lambda received: received.replies, wait_s=None, *, again=False):
-        """Send a frame, `again` where the port was lost and came back, and collect what is Received.
+    def _exchange(self, frame, wait_s=None, *, again=False):
+        """Send a frame, `again` where the port was lost and came back, and collect what is Received until a reply.
 
-        The wait (by default that of an acknowledgement) counts from the end of the transmission of the frame, and of
-        the reply; ``found(received)`` ends it.
+        The wait (by default that of an acknowledgement) counts from the end of the transmission of frame and reply.
         """
         with self.lock:
             self.host.sleep(max(0.0, self._free - self.host.now()))
-            data, over, received = b"", False, Received((), 0, 0)
+            data, received = b"", Received()
             try:
                 with line_lost(self.path):
                     port = self.opened()
@@ -252,17 +207,16 @@ class HeadLine:
                     port.write(frame)
                     self._sent = self.host.now()
                     end = self._sent + self.wire_s(len(frame) + FRAME) + (wait_s or self.settings.gap_s)
-                    while not over and not found(received):
+                    while not (received.tilts or received.acknowledged or self.host.now() >= end or len(data) >= MOST):
                         data += port.read(max(1, min(port.in_waiting, MOST)))
-                        over = self.host.now() >= end or len(data) >= MOST
-                        received = split_replies(data, frame[:FRAME], complete=over)
+                        received = split_replies(data, frame[:FRAME])
             except LineLost:
                 LOG.warning("the line %s to the head is lost", self.path)
                 there = self._port is not None  # else it did not come back
                 self.close()
                 if not (again and there):
                     raise
-                return self._exchange(frame, found, wait_s)
+                return self._exchange(frame, wait_s)
             self._free = max(self.host.now(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
             for name, count in (("frames", 1), ("echoed", received.echoed), ("skipped", received.skipped)):
                 self.counts[name] += count

@@ -214,7 +214,6 @@ class Rig(Closed):
             yield moved
             if pitch not in alone:
                 readings = self._scans(moved.time_s, interlaced)
-                _later(readings[0].time_s, moved, "scan")
                 yield Scanned(placement.number, tuple(readings), np.full(len(readings), moved.pitch))
             if any(abs(pitch - image) < SAME_STOP for image in images):
                 yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
@@ -249,7 +248,6 @@ class Rig(Closed):
     def _photograph(self, cameras, placement, moved, purpose):
         for name in cameras:
             frame = self.cameras[name].newest(after=moved.time_s, timeout=IMAGE_S)
-            _later(frame.time_s, moved, f"image of camera '{name}'")
             yield Photographed(placement, name, frame, moved.pitch, purpose)
 
     def _continuous(self, placement):
@@ -316,12 +314,6 @@ def unchanged(scans):
     steps, spread = (np.diff(ranges, axis=0) ** 2).sum(axis=0), ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
     ratio = np.divide(steps, spread, out=np.full(len(steps), 2.0), where=steps > 0)
     return ratio.size > 0 and bool(ratio.mean() > STILL)
-
-
-def _later(instant, moved, what):
-    """Refuse what was recorded while the head still moved, whatever a driver says."""
-    if instant <= moved.time_s:
-        raise DeviceError(f"the {what} is {moved.time_s - instant:.3f} s older than the stop it belongs to")
 
 
 def _camera(stated, name):

@@ -4,6 +4,7 @@ import contextlib
 import glob
 import logging
 import os
+import re
 import select
 import threading
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply
 
 LOG = logging.getLogger(__name__)
 BEGIN, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG file; inside of its image data they cannot occur
+LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
 CHUNK, LONGEST = 1 << 16, 1 << 26
 EXPOSURE_UNIT_S = 1e-4  # of V4L2
 MANUAL = 1  # exposure mode of V4L2
@@ -80,10 +82,14 @@ class MjpegStream(Images):
         return super().grab()
 
     def take(self):
-        """The next whole image."""
-        seen = 0
-        while (end := self._buffer.find(END, seen)) < 0:
-            seen = max(0, len(self._buffer) - 1)
+        """The next whole image: as long as is stated before it (it may hold another one), else up to its end."""
+        while True:
+            begin = self._buffer.find(BEGIN)
+            stated = LENGTH.findall(self._buffer[: max(begin, 0)])
+            end = begin + int(stated[-1]) if stated else self._buffer.find(END, begin) + len(END)
+            if begin >= 0 and len(END) <= end <= len(self._buffer):
+                image, self._buffer = self._buffer[begin:end], self._buffer[end:]
+                return image
             if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
                 return None
             try:
@@ -94,8 +100,6 @@ class MjpegStream(Images):
             if not some:
                 return None
             self._buffer += some
-        image, self._buffer = self._buffer[: end + len(END)], self._buffer[end + len(END) :]
-        return image[max(image.find(BEGIN), 0) :]
 
 
 class Files(Images):

@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import ANSWER, DOWN, FASTEST, SYNC, UP, encode_extended
+from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, SYNC, TILT, UP, encode_extended
 from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.simulate.rig import Platform
@@ -113,9 +113,8 @@ class EmulatedHead(SerialDevice):
     feedback : {'full', 'partial', 'none'}
         'full': tells its position except during an absolute move, and makes absolute moves. 'partial': tells its
         position at rest only, and ignores absolute moves. 'none': neither; nothing is ever answered.
-    reply : {'extended', 'general', 'five', 'single', 'none'}
-        Form of the answers. 'extended': 7 bytes to queries, none to commands. 'general': besides, 4 bytes to commands.
-        'single': besides, one byte 0x01 to commands. 'five': 5 bytes without sync and address to queries.
+    confirms : bool
+        Answers commands by 4 bytes.
     echo : bool
         The two-wire line hands back what the host sends.
     speeds, go_speed : tuple of float, float
@@ -128,11 +127,11 @@ class EmulatedHead(SerialDevice):
         As for :class:`EmulatedLms`. `frames` holds host time and sound frames to this address.
     """
 
-    def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", reply="extended", echo=False,
+    def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", confirms=False, echo=False,
                  speeds=(0.5, 12.0), go_speed=8.0, watchdog_s=None, invert=False, seed=0, host=REAL):  # fmt: skip
         super().__init__(path, host, seed)
         self.head, self.baudrate, self.address = head or Head(seed=seed), baudrate, address
-        self.feedback, self.reply_kind, self.echo = feedback, "none" if feedback == "none" else reply, echo
+        self.feedback, self.confirms, self.echo = feedback, confirms and feedback != "none", echo
         self.speeds, self.go_speed = np.radians(speeds), math.radians(go_speed)
         self.watchdog_s, self.sign, self.frames = watchdog_s, -1 if invert else 1, deque(maxlen=10 * KEPT)
         self._buffer, self.absolute_until = b"", -math.inf
@@ -161,8 +160,8 @@ class EmulatedHead(SerialDevice):
         self.cancel("watchdog")
         if self.watchdog_s:
             self.at(at + self.watchdog_s, self.stop, "watchdog")
-        if frame.command2 in ANSWER:
-            return self.tell(frame.command2, at)
+        if frame.command2 == QUERY_TILT:
+            return self.tell(at)
         head, way = self.head, {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
         if not frame.command2 & 1:
             if way is None:  # without a direction it is a stop whatever the speeds say
@@ -176,22 +175,17 @@ class EmulatedHead(SerialDevice):
                 goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.limits))
                 self.absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
                 head.go(at, goal, self.go_speed)
-        answers = {"general": bytes([SYNC, self.address, 0, sum(vars(frame).values()) % 256]), "single": b"\x01"}
-        if self.reply_kind in answers:
-            self.reply(answers[self.reply_kind], at + TURN_AROUND_S)
+        if self.confirms:
+            self.reply(bytes([SYNC, self.address, 0, sum(vars(frame).values()) % 256]), at + TURN_AROUND_S)
 
     def stop(self, at):
         """Stop the motor."""
         self.absolute_until = -math.inf
         self.head.stop(at)
 
-    def tell(self, opcode, at):
+    def tell(self, at):
         """Answer a query, unless the head is too busy or does not know how."""
         busy = at < self.absolute_until or (self.feedback == "partial" and self.head.moving(at))
-        if self.reply_kind == "none" or busy:
-            return
-        tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at)) if opcode == pelco_d.QUERY_TILT else 0
-        raw = encode_extended(self.address, ANSWER[opcode], tilt)
-        if self.reply_kind == "five":
-            raw = bytes([0, *raw[3:6], sum(raw[3:6]) % 256])
-        self.reply(raw, at + TURN_AROUND_S)
+        if self.feedback != "none" and not busy:
+            tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at))
+            self.reply(encode_extended(self.address, TILT, tilt), at + TURN_AROUND_S)

@@ -81,23 +81,14 @@ class EmulatedRig:
         return self.lrf.error or self.pan_tilt.error
 
     def plan(self):
-        """What a recording of this rig can do: the sweep that holds all placements, and each of them."""
+        """What a recording of this rig can do: each of its placements."""
         setup, each = self.setup, []
         for p in self.world.placements.values():
             board = p.T_platform_board is not None
             step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
             sweep, images = (np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch))
             each.append({"number": p.number, "board": board, "pitch_deg": [*sweep, step], "image_pitch_deg": images})
-        boards = [p for p in each if p["board"]] or each
-        ends = np.array([p["pitch_deg"][:2] for p in boards])
-        return {
-            "mode": "stop-and-go",
-            "scans_per_stop": 1,
-            "intrinsics_images": setup.intrinsics_views,
-            "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), math.degrees(setup.step)],
-            "image_pitch_deg": np.unique(np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))).tolist(),
-            "placements": each,
-        }
+        return {"mode": "stop-and-go", "intrinsics_images": setup.intrinsics_views, "placements": each}
 
     def rig_file(self):
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
@@ -114,7 +105,7 @@ class EmulatedRig:
                 "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False, "unit": rig.beam.unit_name,
                         "variant": [rig.beam.field_of_view, rig.beam.resolution / 100]},
                 "head": {"port": head.path, "address": head.address, "baudrate": head.baudrate,
-                         "feedback": head.reply_kind != "none",
+                         "feedback": head.feedback != "none",
                          "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist()},
                 "cameras": {name: {"source": self.camera_urls[name], "silence_s": SILENCE_S,
                                    "size": [c.width, c.height]} for name, c in cameras.items()},

@@ -87,14 +87,11 @@ class EmulatedWorld:
 
 
 def scaled(rig, width):
-    """The rig with images of another width, the same field of view; ValueError for an odd number of pixels."""
+    """The rig with images of another width, the same field of view."""
     cameras = []
     for camera in rig.cameras:
         m, scale = camera.model, width / camera.model.width
-        height = m.height * scale
-        if width % 2 or abs(height - 2 * round(height / 2)) > 1e-6:
-            raise ValueError(f"an image width of {width} makes {height:g} lines: both must be even whole numbers")
-        changed = {"width": width, "height": round(height), "fx": m.fx * scale, "fy": m.fy * scale}
+        changed = {"width": width, "height": round(m.height * scale), "fx": m.fx * scale, "fy": m.fy * scale}
         changed |= {"cx": (m.cx + 0.5) * scale - 0.5, "cy": (m.cy + 0.5) * scale - 0.5}
         cameras.append(replace(camera, model=replace(m, **changed)))
     return replace(rig, cameras=tuple(cameras))

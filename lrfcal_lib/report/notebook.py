@@ -24,7 +24,6 @@ from lrfcal_lib.solvers import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
-SCRATCH = ROOT / "reports" / ".sessions" / "lms400_zed"
 STYLE = Path(__file__).with_name("figures.mplstyle")
 UNITS = {"deg": "deg", "mm": "mm", "px": "px", "m": "m", "m3": "m³", "percent": "%", "radii": "spot radii"}
 WORDS = {name: method.label for name, method in METHODS.items()} | {
@@ -50,19 +49,9 @@ def set_up():
 
 
 def start():
-    """First cell of a notebook: :func:`set_up`, then the Session of :func:`session_path`."""
+    """First cell of a notebook: :func:`set_up`, then the Session ``LRFCAL_SESSION``, else the shipped one."""
     set_up()
-    return open_session(session_path())
-
-
-def session_path():
-    """Folder to work on: ``LRFCAL_SESSION``, else the shipped session, else the one that ``make report`` imported."""
-    if stated := os.environ.get("LRFCAL_SESSION"):
-        return Path(stated)
-    for path in (SHIPPED, SCRATCH):
-        if (path / "session.json").is_file():
-            return path
-    raise FileNotFoundError("no session: run `make report` once, or name a session's folder with LRFCAL_SESSION=path")
+    return open_session(os.environ.get("LRFCAL_SESSION") or SHIPPED)
 
 
 def report_file(name):

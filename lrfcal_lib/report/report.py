@@ -28,9 +28,8 @@ from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernel
 from tqdm import tqdm
 
 from lrfcal_lib.report import page
-from lrfcal_lib.report.notebook import ROOT, SCRATCH, SHIPPED, WORDS
+from lrfcal_lib.report.notebook import ROOT, SHIPPED, WORDS
 from lrfcal_lib.session.cache import VARIABLE as CACHE
-from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 
@@ -46,11 +45,6 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
 _CLIENTS = set()  # of the notebooks that are being executed
 MEASURED = ("combined", "fused", "likelihood", "half_step", "last_beam")  # edge lengths, the best way first
-SOURCE_OF_SESSIONS = (
-    "there is no session to report on. Either name one, `make report SESSION=path`, or get the public recording that "
-    "the README describes: GitHub repository suijingfeng/LaserSeteroCalibration @ f9a70a9, folder "
-    "ZED_STEREO_LASER_SWEEP, put its files in FOLDER/lms400_zed and run `LRFCAL_REAL_DATA=FOLDER make report`"
-)
 
 
 @dataclass(frozen=True)
@@ -146,28 +140,15 @@ def store(path, session_path, cache=""):
     return ""
 
 
-def default_session():
-    """The shipped session, else the public recording where a copy is at hand, freshly imported, else a SessionError."""
-    if (SHIPPED / "session.json").is_file():
-        return SHIPPED
-    recordings = Path(os.environ.get("LRFCAL_REAL_DATA") or ROOT.parent / "shared" / "real") / "lms400_zed"
-    if not recordings.is_dir():
-        raise SessionError(SOURCE_OF_SESSIONS)
-    shutil.rmtree(SCRATCH, ignore_errors=True)
-    SCRATCH.parent.mkdir(parents=True, exist_ok=True)
-    import_lasersetero(recordings, SCRATCH)
-    return SCRATCH
-
-
 def main(sessions=(), out=None, stored=False):
-    """Report on sessions, or store the notebooks as run on them; the one at hand where none is named.
+    """Report on sessions, or store the notebooks as run on them; the shipped one where none is named.
 
     0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it.
     """
     # nohup ignores SIGHUP
     before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
-        sessions = [Path(path) for path in sessions] or [default_session()]
+        sessions = [Path(path) for path in sessions] or [SHIPPED]
         return max(_store_all(session) if stored else _report(session, out) for session in sessions)
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)

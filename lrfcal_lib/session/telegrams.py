@@ -42,7 +42,14 @@ class TelegramLog:
     problems: tuple[str, ...]
 
     def report(self, placement=None):
-        """Counts of telegrams and of their values, see :meth:`lrfcal_lib.session.read.Session.telegram_report`."""
+        """What became of the recorded telegrams, of a placement or (by default) of all.
+
+        Returns
+        -------
+        dict
+            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
+            'wrong_crc_offsets' : tuple of int.
+        """
         rows = np.ones(len(self.offset), bool) if placement is None else self.placement == placement
         outcomes = np.bincount(self.outcome[rows], minlength=len(OUTCOMES)).tolist()
         return {

@@ -19,7 +19,8 @@ from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 
-    Telegrams and images are on the disk (fsync) before the table that names them is; scan lines are written at the end.
+    Every sweep and every image is on the disk (fsync) before the table that names it is; at the end, or by
+    ``finish(path)`` after an interruption, sweeps become the one scans.npz.
     A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
 
     Parameters
@@ -45,7 +46,7 @@ class SessionWriter:
     ):  # fmt: skip
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
-        self.sweeps, self.shots = [], dict.fromkeys(self.cameras, 0)
+        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
         self.telegrams = self.path / "lrf" / "telegrams.bin"
         platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
         if platform_sigma is not None:
@@ -85,19 +86,12 @@ class SessionWriter:
 
     def __exit__(self, kind, error, trace):
         with contextlib.closing(self):
-            if kind is None and not self.telegrams.exists():
-                self._write_scans()
+            if kind is None:
+                complete(self.path)
 
     def close(self):
         """Write nothing any more: others may."""
         self._held.close()
-
-    def _write_scans(self):
-        if not self.sweeps:
-            raise SessionError(f"{self.path}: no sweep to write to lrf/; nothing was recorded")
-        shared = [key for key in self.sweeps[0] if key != "bearings" and all(key in scans for scans in self.sweeps)]
-        scans = {key: np.concatenate([scans[key] for scans in self.sweeps]) for key in shared}
-        self._write("lrf/scans.npz", {**scans, "bearings": self.sweeps[0]["bearings"]})
 
     def _write(self, name, content):
         write_file(self.path / name, content, self.path)
@@ -140,9 +134,10 @@ class SessionWriter:
         scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
         with naming(f"{self.path}: placement {placement}"):
             scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
-            if self.sweeps and not np.array_equal(self.sweeps[0]["bearings"], bearings):
+            if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
-        self.sweeps.append(scans)
+        self.bearings, self.parts = bearings, self.parts + 1
+        self._write(f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
     def add_telegrams(self, placement, telegrams, pitch=math.nan, time_s=math.nan):
@@ -164,17 +159,11 @@ class SessionWriter:
             that has scan lines already.
         """
         with naming(f"{self.path}: placement {placement}"):
-            if isinstance(telegrams, bytes | bytearray):
-                raise ValueError("telegrams come as a sequence, one bytes each: put a single one into a list")
-            telegrams = [bytes(raw) for raw in telegrams]
             lengths = [len(raw) for raw in telegrams]
-            if min(lengths, default=0) < 7:
-                got = short(sorted(set(lengths)))
-                raise ValueError(f"one or more telegrams of 7 or more bytes are needed, got lengths {got}")
             pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
-            if self.sweeps:
+            if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
@@ -205,6 +194,40 @@ class SessionWriter:
         self._note_placement(placement)
         where = name, "" if placement < 0 else placement, cell(math.degrees(pitch))
         self._append_rows("images.csv", [[cell(time_s), camera, *where, purpose]])
+
+
+def finish(path):
+    """Complete a session whose recording was interrupted: one scans.npz out of its sweeps, whole rows in its tables.
+
+    SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
+    """
+    try:
+        with stated.alone(path):
+            complete(Path(path))
+    except FileNotFoundError as error:
+        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
+
+
+def complete(path):
+    """As :func:`finish`, for who writes the session already; telegrams are complete as they are."""
+    mend_tables(path)
+    if os.path.lexists(path / "lrf" / "telegrams.bin"):
+        return
+    if not (parts := read.parts_of(path)):
+        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
+    sweeps = [read.read_npz(part, path) for part in parts]
+    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
+    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
+    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path)
+    for part in parts:
+        part.unlink()
+
+
+def mend_tables(path):
+    """Remove rows that a crash cut off at the end of a session's tables."""
+    for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
+        if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
+            write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
 
 
 def as_lines(rows):
@@ -289,9 +312,7 @@ class SessionRecorder(SessionWriter):
                 raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
         self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
         self._make_folders()
-        for table in ("images.csv", "lrf/index.csv", "platform.csv"):  # a crash may have cut off the last row
-            if os.path.lexists(file := self.path / table):
-                self._write(table, stated.read_bytes(file, self.path).rpartition(b"\n")[0] + b"\n")
+        mend_tables(self.path)
         for placement in self.data["unfinished"]:
             self._mark_dropped(placement)
         self._state(unfinished=[])
