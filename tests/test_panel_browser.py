@@ -8,16 +8,17 @@ import subprocess
 import sys
 import time
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import nbformat
 import pytest
-from shared import campaign
+from shared import campaign, until
 
 NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
 # dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
 QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
-START_S, ACTION_S = 90, 120  # guards against hanging
+START_S, ACTION_S = 180, 240  # guards against hanging
 
 
 def panel_only(folder):
@@ -50,18 +51,15 @@ def lab(tmp_path):
         request = urllib.request.Request(address + path, headers={"Authorization": f"token {token}"}, **options)
         return urllib.request.urlopen(request, timeout=20).read()
 
+    def responds():
+        with suppress(OSError):
+            return call("/api")
+
     with log.open("w") as stream:
         server = subprocess.Popen(command, env=environment, stdout=stream, stderr=stream)
-        end = time.monotonic() + START_S
         try:
-            while True:
-                try:
-                    call("/api")
-                    break
-                except OSError:
-                    if server.poll() is not None or time.monotonic() > end:
-                        pytest.fail(f"JupyterLab does not start:\n{log.read_text()[-3000:]}")
-                    time.sleep(0.2)
+            until(lambda: server.poll() is not None or responds(), START_S)
+            assert server.poll() is None, f"JupyterLab does not start:\n{log.read_text()[-3000:]}"
             yield f"{address}/doc/tree/panel.ipynb?token={token}"
             for kernel in json.loads(call("/api/kernels")):  # by itself: the panel's rig is closed, its head stopped
                 call(f"/api/kernels/{kernel['id']}", method="DELETE")
