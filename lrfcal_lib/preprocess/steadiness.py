@@ -66,8 +66,6 @@ class Steadiness:
     camera : str
     placements : ndarray of int, shape (n,)
         In the order of the session; those whose background could not be followed are in `problems`.
-    reference : int
-        Placement that all motion is relative to; -1 where the question does not arise.
     rotvec : ndarray, shape (n, 3)
         Turn of the camera since the reference, rotation vector in its own frame, radians.
     scale : ndarray, shape (n,)
@@ -86,7 +84,6 @@ class Steadiness:
 
     camera: str
     placements: np.ndarray
-    reference: int = -1
     rotvec: np.ndarray = ()
     scale: np.ndarray = ()
     covariance: np.ndarray = ()
@@ -151,7 +148,7 @@ def camera_steadiness(prepared, camera):
     size, corner = np.linalg.norm(turn @ root.T, axis=1), np.hypot(model.width, model.height) / 2 * (scale - 1)
     steps = find_steps(order, turn, covariance[:, :3, :3], root)
     motion = turn, scale, covariance, size, corner, steps
-    return Steadiness(camera, np.array(order, int), reference, *motion, problems=problems)
+    return Steadiness(camera, np.array(order, int), *motion, problems=problems)
 
 
 def board_hull(view, model):
