@@ -19,7 +19,7 @@ from lrfcal_lib.fit.residuals import move_head, move_state, prior_terms
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
-from lrfcal_lib.preprocess import intrinsics, steadiness
+from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.solvers import lines, pitch, planes, platform
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -167,12 +167,6 @@ def images():
     count = jacobian[0].size // pixels[0].size
     jacobian = jacobian.reshape(*pixels.shape, count)
     yield jacobian, lambda s: intrinsics.predict(intrinsics.moved(state, s), points, basis)[0], count
-    first, turn = rng(0).uniform(-0.6, 0.6, (30, 2)), Rotation.from_rotvec([0.02, -0.03, 0.01])
-
-    def misses(s):
-        return steadiness.motion_misses(first, 0 * first, Rotation.from_rotvec(s[:3]) * turn, 1.01 + s[3])
-
-    yield -misses(np.zeros(4))[1], lambda s: misses(s)[0], 4
 
 
 @pytest.mark.parametrize("cases", [projection, camera_methods, intervals, board_planes, tilt_axis, recorded_pitch,

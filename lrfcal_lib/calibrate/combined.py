@@ -38,11 +38,6 @@ class Case:
     middle: np.ndarray
     start: tuple
 
-    @property
-    def width(self):
-        """Number of unknowns: of the joint estimate, and a shift and a turn of each side."""
-        return self.unknowns.shared + self.unknowns.own + 2 * len(self.middle)
-
 
 def combined_outlines(joint):
     """Measure the boards of all placements by face, beams about the edges and image edges, none knowing their size.
@@ -143,8 +138,8 @@ def fitted(case, start, scale):
 
 def blocks_of(state, case, scale):
     """All that is known of a placement, a list of Block (1, n, width)."""
-    (found, lines, change), unknowns, width = state, case.unknowns, case.width
-    data, count = replace(case.data, lines=lines), len(lines)
+    (found, lines, change), unknowns, count = state, case.unknowns, len(case.middle)
+    data, width = replace(case.data, lines=lines), unknowns.shared + unknowns.own + 2 * count
     blocks = [residuals.face_block(found, data, unknowns)]
     if data.beam["used"].any():
         beams = residuals.beam_block(found, data, unknowns)

@@ -135,6 +135,11 @@ class Calibration:
     problems: dict
     joint: JointCalibration | None = None
 
+    def frame(self, method):
+        """``T_head_lrf`` that goes with a method's camera poses, and what takes known errors out of recorded points."""
+        axis = self.platform.axis_with(method)
+        return self.platform.transform(axis), self.joint.solution.correct if axis == "joint" else as_recorded
+
 
 @cached
 def calibrate(session, methods=tuple(METHODS)):
@@ -425,12 +430,7 @@ def cloud_blocks(calibration, method="line", scene=False):
         masks = dict.fromkeys(session.scene_placements)
     if not masks:
         raise ValueError(f"{session.name}: no sweep of {'a scene' if scene else 'the board'} to colour")
-    axis = calibration.platform.axis_with(method)
-    settings = {
-        "T_head_lrf": calibration.platform.transform(axis), "lrf": session.lrf,
-        "correct": calibration.joint.solution.correct if axis == "joint" else as_recorded,
-        "continuous": str(session.reference.get("recording", "")).startswith("continuous"),
-    }  # fmt: skip
+    frame, continuous = calibration.frame(method), str(session.reference.get("recording", "")).startswith("continuous")
     for placement, mask in masks.items():
         sweep, views = session.sweep(placement), views_of(calibration, method, placement)
         if mask is not None:  # the board and what is around it
@@ -439,7 +439,7 @@ def cloud_blocks(calibration, method="line", scene=False):
             echoes = None if sweep.intensities is None else sweep.intensities[lines, beams]
             sweep = replace(sweep, ranges=sweep.ranges[lines, beams], intensities=echoes, **part)
             mask = mask[lines, beams]
-        yield from reconstruct.reconstruct(sweep, views, **settings, mask=mask)
+        yield from reconstruct.reconstruct(sweep, views, *frame, lrf=session.lrf, continuous=continuous, mask=mask)
 
 
 def views_of(calibration, method, placement):
@@ -447,9 +447,7 @@ def views_of(calibration, method, placement):
 
     ValueError where there are images and none of them can be posed.
     """
-    session, axis, views = calibration.prepared.session, calibration.platform.axis_with(method), []
-    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
-    back = calibration.platform.transform(axis).inv()
+    session, views, (T_head_lrf, correct) = calibration.prepared.session, [], calibration.frame(method)
     records, posed = session.images(placement=placement), [name for name, own in calibration.solutions if own == method]
     for record in records:
         name, mount = record.camera, session.cameras[record.camera].mount
@@ -457,7 +455,7 @@ def views_of(calibration, method, placement):
             pose = calibration.solutions[name, method].transform
             if mount == "head":  # while the head stood at this pitch
                 at = float(correct(placement, np.zeros(3), record.pitch)[1])
-                pose = pose * back * RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0.0, 0.0]))
+                pose = pose * T_head_lrf.inv() * RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0.0, 0.0]))
             number, model = session.image_records.index(record), calibration.prepared.models[name]
             views.append(reconstruct.View(number, name, pose, model, session.read_image(record)))
     if records and not views:

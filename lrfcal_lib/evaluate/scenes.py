@@ -159,12 +159,11 @@ def scene_errors(cloud, calibration, method):
     from lrfcal_lib.simulate.rig import load_setup
 
     world = world_of(load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None)
-    T_head_lrf = calibration.platform.transform(calibration.platform.axis_with(method))
+    T_head_lrf, correct = calibration.frame(method)
     gauge = truth.T_head_lrf * T_head_lrf.inv()
     turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
-    sweep, axis = session.sweep(placement), calibration.platform.axis_with(method)
-    correct = calibration.joint.solution.correct if axis == "joint" else as_recorded
+    sweep = session.sweep(placement)
     turn += np.mean(truth.pitch[placement] - correct(placement, np.zeros(3), sweep.pitch)[1])
     order = np.argsort(sweep.pitch)
     pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])

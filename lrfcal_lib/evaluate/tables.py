@@ -33,6 +33,7 @@ from lrfcal_lib.solvers.joint_noise import on_board
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 ALL = 10**9  # crossings
+ENDS = {"fused": ("image", ""), "combined": ("image", "scan")}  # what decides ends of edges: images, beams, the pitch
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
     r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
@@ -464,21 +465,15 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         lengths, sigma = ({}, {}) if measured is None else (measured.lengths, measured.sigma)
         views = [views[placement] for views in prepared.views.values() if placement in views]
         for name in (name for name in known if any(view.edge(name) is not None for view in views)):
-            length = lengths.get(name, np.nan)
-            ends = ends_of(edges, name, weak or (), variant) if np.isfinite(length) else "not measured"
+            length, i = lengths.get(name, np.nan), edges.index(name)
+            worse = bool({edges[i - 1], edges[(i + 1) % len(edges)]} & set(weak or ()))
+            ends = ENDS.get(variant, ("scan", "pitch"))[worse] if np.isfinite(length) else "not measured"
             row = prepared.session.name, placement, name, ends, variant
             rows.append((*row, 1000 * known[name], 1000 * length, 1000 * sigma.get(name, np.nan)))
     rows += [("paper", np.nan, name, "scan", "last_beam", *lengths, np.nan) for name, lengths in PAPER_EDGES_MM.items()]
     columns = ["source", "placement", "edge", "ends", "variant", "true_mm", "measured_mm", "sigma_mm"]
     table = pd.DataFrame(rows, columns=columns).astype({"placement": "Int64"})
     return table.assign(error_mm=table.measured_mm - table.true_mm)
-
-
-def ends_of(edges, name, weak, variant):
-    """What decides the ends of an edge: its neighbours in images, beams, or the recorded pitch (the worse)."""
-    usual, worse = {"fused": ("image", ""), "combined": ("image", "scan")}.get(variant, ("scan", "pitch"))
-    i = edges.index(name)
-    return worse if {edges[i - 1], edges[(i + 1) % len(edges)]} & set(weak) else usual
 
 
 def edge_summary(table):

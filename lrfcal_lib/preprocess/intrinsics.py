@@ -84,7 +84,10 @@ def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, bas
     error = block.residuals @ block.residuals
     sigma2 = max(error / max(count - free.sum(), 1), 1e-18)
     covariance = np.zeros((len(free),) * 2)
-    covariance[np.ix_(free, free)] = sigma2 * _inverse_normal(block.jacobian[seen.ravel()])
+    normal = block.jacobian[seen.ravel()].T @ block.jacobian[seen.ravel()]
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # pixels, radians and metres mix safely
+    scale = np.outer(scale, scale)
+    covariance[np.ix_(free, free)] = sigma2 * np.linalg.pinv(normal * scale, hermitian=True) * scale
     own = [np.arange(a, b).reshape(-1, size) for a, b, size in zip(cuts, cuts[1:], (9, 6, 6), strict=False)]
     lens, mount, view = (covariance[rows[:, :, None], rows[:, None]] for rows in own)
     residuals = np.where(seen, -block.residuals.reshape(seen.shape), np.nan)
@@ -95,13 +98,6 @@ def adjust(pixels, points, models, poses, mounting=None, *, intrinsics=True, bas
     mounts, boards = (pose_transform(state[1]), mount), (pose_transform(state[2]), view)
     sheet = basis @ state[3], state[3], covariance[cuts[3] :, cuts[3] :]
     return Adjustment(tuple(models), *mounts, *boards, *sheet, residuals, float(np.sqrt(sigma2)), rms, bic)
-
-
-def _inverse_normal(jacobian):
-    """Pseudo-inverse of the normal equations; unit diagonal, so that pixels, radians and metres mix safely."""
-    normal = jacobian.T @ jacobian
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
 
 
 def predict(state, points, basis):

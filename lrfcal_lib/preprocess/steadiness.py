@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
@@ -18,8 +19,7 @@ TRACKING = {"winSize": (21, 21), "maxLevel": 3, "criteria": (3, 40, 0.003)}  # t
 THERE_AND_BACK = 0.1  # pixels; a feature that does not come back is hidden in the other image
 FEWEST_FEATURES, FEWEST_CELLS = 40, 10  # for four unknowns with a covariance from the scatter over cells
 CELLS = np.array([8, 5])  # of the image; neighbouring features share their errors (parallax, a box that was pushed)
-PLAIN_ROUNDS, TUKEY_ROUNDS = 10, 20  # of least absolute residuals, then of Tukey's biweight
-TUKEY = 3.0  # of the median residual of the features, whose lengths are Rayleigh: 3 medians are 3.5 sigma
+ROUNDS, FARTHEST = 4, 3.0  # of least squares; of the median miss of the features, whose lengths are Rayleigh: 3.5 sigma
 GROWTH = 1.3  # of the board's hull in an image: its rim, stand, shadow and whoever holds it move along
 LEAST_STEP = 0.2  # pixels: less than edges and corners of a board are off at one placement
 LEAST_SCALE = 0.5  # pixels at the image's corner: more than that is seen in the residuals of a pattern
@@ -203,53 +203,42 @@ def fit_motion(start, end, model):
     scale, and their covariance (4, 4) from the scatter over cells of the image, whose features share their errors.
     BackgroundLost with fewer than 40 features or 10 cells of the image (8 by 5) that agree.
     """
+    focal, centre = np.array([model.fx, model.fy]), np.array([model.cx, model.cy])
     column, row = np.clip((start * CELLS / [model.width, model.height]).astype(int), 0, CELLS - 1).T
-    cell, focal, centre = row * CELLS[0] + column, np.array([model.fx, model.fy]), np.array([model.cx, model.cy])
-    first, second = ((undistort(p, model) - centre) / focal for p in (start, end))
-    turn, scale, weight = Rotation.identity(), 1.0, np.ones(len(start))
-    for number in range(PLAIN_ROUNDS + TUKEY_ROUNDS + 1):
-        count, cells = (weight > 0).sum(), len(np.unique(cell[weight > 0]))
-        if count < FEWEST_FEATURES or cells < FEWEST_CELLS:
+    cell, (first, second) = row * CELLS[0] + column, (undistort(p, model) for p in (start, end))
+    rays, motion = np.column_stack([(first - centre) / focal, np.ones(len(first))]), np.array([0.0, 0.0, 0.0, 1.0])
+    good = cv2.findHomography(first, second, cv2.LMEDS)[1] if len(start) > FEWEST_FEATURES else None
+    good = np.ones(len(start), bool) if good is None else good.ravel() > 0
+
+    def misses(motion, some):
+        """Undistorted pixels, of a rotation vector and a scale."""
+        x, y, z = Rotation.from_rotvec(motion[:3]).apply(rays[some]).T
+        return (focal * motion[3] * np.stack([x / z, y / z], axis=1) + centre - second[some]).ravel()
+
+    for _ in range(ROUNDS):
+        (cells, which), count = np.unique(cell[good], return_inverse=True), good.sum()
+        if count < FEWEST_FEATURES or len(cells) < FEWEST_CELLS:
             raise BackgroundLost(
-                f"{count} features of the background in {cells} parts of the image can be followed, {FEWEST_FEATURES} "
-                f"in {FEWEST_CELLS} are needed: was the camera mounted anew, or is the scene too plain?"
+                f"{count} features of the background in {len(cells)} parts of the image can be followed, "
+                f"{FEWEST_FEATURES} in {FEWEST_CELLS} are needed: was the camera mounted anew, or is the scene too "
+                "plain?"
             )
-        if number == PLAIN_ROUNDS + TUKEY_ROUNDS:
-            break
-        miss, by_state = motion_misses(first, second, turn, scale)
-        length = np.maximum(np.linalg.norm(miss * focal, axis=1), 1e-4)
-        tukey = np.clip(1 - (length / (TUKEY * np.median(length[weight > 0]))) ** 2, 0, None) ** 2
-        weight = 1 / np.maximum(length, 0.01) if number < PLAIN_ROUNDS else tukey
-        weighted = by_state * weight[:, None, None]
-        bread, score = np.einsum("nij,nik->jk", weighted, by_state), np.einsum("nij,ni->nj", weighted, miss)
-        step = np.linalg.solve(bread, score.sum(axis=0))
-        turn, scale = Rotation.from_rotvec(step[:3]) * turn, scale + step[3]
+        found = least_squares(misses, motion, x_scale=1e-3, args=(good,))
+        motion, length = found.x, np.linalg.norm(misses(found.x, slice(None)).reshape(-1, 2), axis=1)
+        good = length < FARTHEST * np.median(length[good])
     # sandwich covariance with cells of the image as its independent parts
-    filling = np.zeros((cell.max() + 1, 4))
-    np.add.at(filling, cell, score)
-    bread = np.linalg.inv(bread)
-    return turn.as_rotvec(), float(scale), bread @ (filling.T @ filling) @ bread * cells / (cells - 4)
-
-
-def motion_misses(first, second, turn, scale):
-    """Observed minus predicted normalised coordinates (n, 2), and the derivative of the prediction (n, 2, 4).
-
-    By a small turn of the background from the left, camera frame, and by the scale; without lens distortion.
-    """
-    rays = turn.apply(np.column_stack([first, np.ones(len(first))]))
-    x, y = (rays[:, :2] / rays[:, 2:]).T
-    by_turn = [np.stack([-x * y, 1 + x * x, -y, x], axis=1), np.stack([-(1 + y * y), x * y, x, y], axis=1)]
-    by_state = np.stack(by_turn, axis=1)
-    by_state[:, :, :3] *= scale
-    return second - scale * np.stack([x, y], axis=1), by_state
+    filling, bread = np.zeros((len(cells), 4)), np.linalg.inv(found.jac.T @ found.jac)
+    np.add.at(filling, np.repeat(which, 2), found.jac * found.fun[:, None])
+    covariance = bread @ (filling.T @ filling) @ bread * len(cells) / (len(cells) - 4)
+    return motion[:3], float(motion[3]), covariance
 
 
 def pixel_root(model):
     """Matrix (3, 3) that makes of a turn a vector as long as the rms motion of undistorted pixels over the image."""
     u, v = np.meshgrid(np.linspace(0, model.width - 1, 17), np.linspace(0, model.height - 1, 11))
-    bare = np.column_stack([(u.ravel() - model.cx) / model.fx, (v.ravel() - model.cy) / model.fy])
-    by_turn = motion_misses(bare, bare, Rotation.identity(), 1.0)[1][:, :, :3] * np.array([[model.fx], [model.fy]])
-    return np.linalg.cholesky(np.einsum("nij,nik->jk", by_turn, by_turn) / len(bare)).T
+    x, y = (u.ravel() - model.cx) / model.fx, (v.ravel() - model.cy) / model.fy
+    by_turn = np.array([[-x * y, 1 + x * x, -y], [-(1 + y * y), x * y, x]]) * [[[model.fx]], [[model.fy]]]
+    return np.linalg.cholesky(np.einsum("ijn,ikn->jk", by_turn, by_turn) / len(x)).T
 
 
 def find_steps(placements, rotvec, covariance, root):

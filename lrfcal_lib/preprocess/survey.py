@@ -213,12 +213,9 @@ def _choices(records, camera, one_per_placement):
 
 def _first(group, begin):
     """The first image of a list that shows the board, as (record, view); the first one if none does."""
-    tried = []
-    for record in group:
-        tried.append((record, begin(record)))
-        if not tried[-1][1].reason:
-            return tried[-1]
-    return tried[0]
+    tried = ((record, begin(record)) for record in group)
+    first = next(tried)
+    return next((pair for pair in tried if not pair[1].reason), first) if first[1].reason else first
 
 
 def _for_intrinsics(images, camera):
