@@ -254,14 +254,13 @@ def find_steps(placements, rotvec, covariance, root):
     own = np.einsum("ij,njk,ik->ni", root, covariance, root)
     sigma = np.maximum(1.4826 * np.median(np.abs(np.diff(moved, axis=0))) / np.sqrt(2), np.sqrt(np.median(own)))
     sigma = max(float(sigma), 1e-6)
-    cuts, todo, steps = [0, n], [(0, n)], []
-    while todo:
-        low, high = todo.pop()
+
+    def splits(low, high):
+        """Where a part of the recording falls in pieces."""
         k, p_value = _best_split(moved[low:high], sigma, n)
-        if p_value < LEVEL:
-            cuts.append(low + k)
-            todo += [(low, low + k), (low + k, high)]
-    cuts.sort()
+        return [*splits(low, low + k), low + k, *splits(low + k, high)] if p_value < LEVEL else []
+
+    cuts, steps = [0, *splits(0, n), n], []
     for before, k, after in zip(cuts, cuts[1:], cuts[2:], strict=False):
         turn = np.median(rotvec[k:after], axis=0) - np.median(rotvec[before:k], axis=0)
         spread = sigma * np.sqrt(MEDIAN_VARIANCE * (1 / (k - before) + 1 / (after - k)))
