@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
@@ -110,15 +109,17 @@ def test_the_board_is_moved_by_who_records(world):
 
 
 def test_an_image_begun_before_a_move_is_not_sent(small):
-    """The drawing process is replaced by one that ends when it is told."""
-    server, asked = CameraServer(small), []
-    server._pool.submit = lambda *_: asked.append(Future()) or asked[-1]
-    until(lambda: server.image("left", timeout=0.05) == (None, None) and asked)
-    small.head.go(small.host.now(), 0.05, 2.0)
-    asked[0].set_result(b"old")
-    until(lambda: server.image("left", timeout=0.05) == (None, None) and len(asked) > 1)
-    asked[-1].set_result(b"new")
-    assert server.image("left", timeout=DEADLINE)[1] == b"new"
+    server, drawn = CameraServer(small), []
+
+    def draw(name, place, pitch, seed):
+        drawn.append(pitch)
+        if len(drawn) == 1:
+            small.head.go(small.host.now(), 0.05, 2.0)
+        return b"%d" % len(drawn)
+
+    server._draw = draw
+    key, data = server.image("left", timeout=DEADLINE)
+    assert data == b"2" and key[2] == drawn[1] != drawn[0]
     server.close()
 
 

@@ -9,7 +9,6 @@ import select
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -137,58 +136,49 @@ def _opened(message, *arguments):
     return capture
 
 
-def _open_device(source):
-    if not os.path.exists(source.path):
+def _open_device(path):
+    if not os.path.exists(path):
         there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
-        raise PortError(f"there is no camera {source.path}: check its plug; present are {there}")
-    if not os.access(source.path, os.R_OK | os.W_OK):
-        raise PortError(f"no permission for {source.path}: run 'sudo usermod -aG video $USER', then log in again")
-    busy = f"{source.path} gives no video: close other programs that use it, or name another device"
-    return _opened(busy, source.path, cv2.CAP_V4L2)
+        raise PortError(f"there is no camera {path}: check its plug; present are {there}")
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise PortError(f"no permission for {path}: run 'sudo usermod -aG video $USER', then log in again")
+    busy = f"{path} gives no video: close other programs that use it, or name another device"
+    return _opened(busy, path, cv2.CAP_V4L2)
 
 
-def _open_stream(source):
+def _open_stream(path, silence_s):
     """MJPEG over HTTP with our own reader, anything else with FFmpeg."""
-    if source.path.startswith("http"):
+    if path.startswith("http"):
         with contextlib.suppress(OSError):
-            stream = MjpegStream(source.path, source.silence_s)
+            stream = MjpegStream(path, silence_s)
             if stream.multipart:
                 return stream
             stream.release()
-    wait = round(1000 * source.silence_s)
+    wait = round(1000 * silence_s)
     waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, wait, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait]
-    return _opened(f"{source.path} gives no video: {source.remedy}", source.path, cv2.CAP_FFMPEG, waits)
+    return _opened(f"{path} gives no video: {remedy_of(path)}", path, cv2.CAP_FFMPEG, waits)
 
 
-def _open_video(source):
-    if not os.path.exists(source.path):
-        raise PortError(f"there is no video {source.path}: name a file, a device, a folder of images or a URL")
-    return _opened(f"{source.path} is no video that OpenCV can read", source.path)
-
-
-class Source(NamedTuple):
-    """Where images come from: ``open(source)`` gives what reads like cv2.VideoCapture; live ones can be lost."""
-
-    path: str
-    open: object
-    live: bool = False
-    remedy: str = "look at its file"
-    silence_s: float = 0.0
-
-
-def find_source(source, silence_s):
-    """The Source that is meant by an int, str or Path, see :class:`Camera`."""
-    path = os.fspath(source) if not isinstance(source, int) else str(source)
-    path = f"/dev/video{path}" if path.isdigit() else path
+def remedy_of(path):
+    """What to do about a live source that is lost; '' for files, which cannot be lost."""
     if "://" in path:
-        remedy = f"open {path} in a browser, and check network and power of the camera"
-        return Source(path, _open_stream, True, remedy, silence_s)
+        return f"open {path} in a browser, and check network and power of the camera"
+    is_device = path.startswith("/dev/")
+    return f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows" if is_device else ""
+
+
+def open_source(path, silence_s):
+    """What a path names, see :class:`Camera`: it reads like cv2.VideoCapture."""
+    if "://" in path:
+        return _open_stream(path, silence_s)
     if path.startswith("/dev/"):
-        return Source(path, _open_device, True, f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows")
+        return _open_device(path)
     pattern = glob.has_magic(path) and not os.path.exists(path)
     if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
-        return Source(path, lambda source: Files(source.path))
-    return Source(path, _open_video)
+        return Files(path)
+    if not os.path.exists(path):
+        raise PortError(f"there is no video {path}: name a file, a device, a folder of images or a URL")
+    return _opened(f"{path} is no video that OpenCV can read", path)
 
 
 @dataclass(frozen=True)
@@ -236,12 +226,14 @@ class Camera(Closed):
     def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
         self._asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
         self.name, self.lost, self._told = name, False, set()
-        self._source = find_source(source, silence_s)
+        path = os.fspath(source) if not isinstance(source, int) else str(source)
+        self._path, self._silence_s = f"/dev/video{path}" if path.isdigit() else path, silence_s
+        self._remedy = remedy_of(self._path)
         self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
-        self._capture = self._source.open(self._source)
+        self._capture = open_source(self._path, self._silence_s)
         self._apply()
         self._thread = None
-        if self._source.live:
+        if self._remedy:
             self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
             self._thread.start()
 
@@ -281,8 +273,8 @@ class Camera(Closed):
             if there():
                 return self._frame
         if self.lost:
-            raise LineLost(f"camera {self.name} is lost: {self._source.remedy}")
-        raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._source.remedy}")
+            raise LineLost(f"camera {self.name} is lost: {self._remedy}")
+        raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}")
 
     def close(self):
         """Close the source; a second call does nothing."""
@@ -330,18 +322,18 @@ class Camera(Closed):
         """Forget the last frame, and look for the source."""
         with self._new:
             if not self.lost:
-                LOG.warning("camera %s is lost: %s", self.name, self._source.remedy)
+                LOG.warning("camera %s is lost: %s", self.name, self._remedy)
             self.lost, self._frame = True, None
         self._release()
         if not self._quit.wait(AGAIN_S):
             with contextlib.suppress(PortError):
-                self._capture = self._source.open(self._source)
+                self._capture = open_source(self._path, self._silence_s)
                 self._apply()
 
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
         self._before, capture, asked, ticks = REAL.time(), self._capture, self._asked, 0
-        if self._source.open is _open_device:
+        if self._path.startswith("/dev/"):
             exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
             wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
                       FPS: asked["fps"], cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,

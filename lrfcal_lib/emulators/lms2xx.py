@@ -30,9 +30,6 @@ BAUD_WORD = {9600: 0x8067, 19200: 0x8033, 38400: 0x8019, 500000: 0x8001}
 BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
 INSTALLATION, DIAGNOSIS, STREAM, REQUEST, INTERLACED = 0x00, 0x10, 0x24, 0x25, 0x2A  # operating modes
 DONE, WRONG, FAULT = b"\0", b"\1", b"\2"  # results of command 0x20
-# offsets within the status reply, its code being 0, of words in a row: pollution, reference values, ...
-_WORDS = {19: (95, 97, 96, 94, 96, 95, 97, 95, 90, 91, 90, 92, *(100,) * 8, *(95,) * 4), 67: (148,), 71: (17,),
-          75: (18, 16), 81: (17, 71, 120, 33, 140, 60, *(921,) * 4), 103: (20, 20)}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -77,14 +74,13 @@ class Memory:
         return True
 
     def status_data(self):
-        """Data of the status reply 0xB1."""
+        """Data of the status reply 0xB1; offsets count from its code. What no driver reads is 0."""
         c, data = self.configuration, bytearray(153)
-        words = {**_WORDS, 107: self.variant, 112: (c.block[11],), 116: (BAUD_WORD[self.baudrate],)}
-        parts = {at: np.array(row, "<u2").tobytes() for at, row in words.items()}
-        parts |= {1: self.model[14:21].encode(), 10: f"{self.serial:8.8}".encode(), 124: b"V02.02 "}
-        single = {8: self.mode, 102: c.measuring_mode, 111: c.block[10], 118: c.block[9], 120: self.address, 121: 1,
-                  122: UNITS.index(c.unit), 123: 1}  # fmt: skip
-        for at, part in {**parts, **{at: bytes([value]) for at, value in single.items()}}.items():
+        parts = {1: self.model[14:21].encode(), 8: bytes([self.mode]), 10: f"{self.serial:8.8}".encode(),
+                 102: bytes([c.measuring_mode]), 107: np.array(self.variant, "<u2").tobytes(),
+                 116: BAUD_WORD[self.baudrate].to_bytes(2, "little"), 120: bytes([self.address, 1]),
+                 122: bytes([UNITS.index(c.unit), 1])}  # fmt: skip
+        for at, part in parts.items():
             data[at : at + len(part)] = part
         return bytes(data[1:])
 

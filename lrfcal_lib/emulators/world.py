@@ -7,7 +7,6 @@ import contextlib
 import itertools
 import threading
 import time
-from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -117,57 +116,41 @@ class CameraServer:
         self._imager = lru_cache(lambda name: Imager(self.cameras[name].model, self.cameras[name].exposure))
         self._scene = lru_cache(2)(lambda place: world_of(world.setup, place.T_platform_board, stand=place.stand))
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
-        self._pool = ThreadPoolExecutor(1, "drawing")
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"server_of": self}))
         self.url = f"http://127.0.0.1:{self._server.server_port}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self.start = self._thread.start
 
     def close(self):
-        """End the server, started or not, and the drawing."""
-        with self._lock:
-            self.quit.set()
+        """End the server, started or not, and wait for the end of a drawing."""
+        self.quit.set()
         if self._thread.is_alive():
             self._server.shutdown()
         self._server.server_close()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            self._images.clear()
 
     def image(self, name, timeout=1.0):
         """What a camera's image shows (a key), and the image of the rig as it stands now, a JPEG file.
 
-        (None, None) where the head does not rest or the image is not drawn within the timeout, seconds.
+        (None, None) where the head does not rest within the timeout, seconds, long enough to draw it.
         """
         end = time.monotonic() + timeout
         while not self.quit.is_set() and time.monotonic() < end:
-            key = self._key(name)
-            if key is None:
-                self.quit.wait(LOOK_S)
-                continue
-            with contextlib.suppress(TimeoutError, CancelledError):
-                data = self._drawn(key).result(LOOK_S)
-                if self._key(name) == key:
-                    return key, data
+            with self._lock:
+                key = self._key(name)
+                if key is not None and self._images.get(name, (None,))[0] != key:
+                    self._images[name] = key, self._draw(*key, [self.seed, next(self._count)])
+                if key is not None and self._key(name) == key:
+                    return self._images[name]
+            self.quit.wait(LOOK_S)
         return None, None
 
     def _key(self, name):
         """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
         head, now = self.world.head, self.world.host.now()
-        if not head.settled(now) or head.resting(now)[0] < self.rest_s + head.platform.settle:
-            return None
-        return name, self.world.place, round(float(head.pitch(now)), 7)
-
-    def _drawn(self, key):
-        """Future JPEG of a key; asked for where it is not there yet, and the camera's older one is forgotten."""
-        with self._lock:
-            before, image = self._images.get(key[0], (None, None))
-            if before != key:
-                if image is not None:
-                    image.cancel()
-                if self.quit.is_set():
-                    raise CancelledError
-                image = self._pool.submit(self._draw, *key, [self.seed, next(self._count)])
-                self._images[key[0]] = key, image
-        return image
+        rests = head.settled(now) and head.resting(now)[0] >= self.rest_s + head.platform.settle
+        return (name, self.world.place, round(float(head.pitch(now)), 7)) if rests and not self.quit.is_set() else None
 
     def _draw(self, name, place, pitch, seed):
         """JPEG of what a camera sees."""

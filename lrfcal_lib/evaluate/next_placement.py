@@ -165,7 +165,7 @@ def candidate_information(boards, pitches, solution, models, features=None):
     (_, distance, size), (pitch, away, seen) = (_as_seen(b, middle, solution.T_head_lrf) for b in (home.boards, boards))
     spot = spot_growth(solution)
     grown, off = np.polyval(spot, away) / np.polyval(spot, distance), np.sum((beam + [0, 0, 1.0]) * line, axis=-1)
-    most = np.sqrt(solution.data.face["used"].sum(axis=1).max() / max(THINNED * face.shape[1], 1))
+    most = np.sqrt(max(solution.data.face["used"].sum(axis=1).max(), 1) / max(THINNED * face.shape[1], 1))
     factors = {"radius": grown, "step": away / distance, "used": np.minimum(seen / size, most)}
     moved = beam + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
     groups = {name: _beams(getattr(data, name), p, boards, solution) for name, p in (("face", face), ("beam", moved))}

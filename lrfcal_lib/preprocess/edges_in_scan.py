@@ -143,7 +143,6 @@ class ScanEdges:
 
     Attributes
     ----------
-    placement : int
     variant : {'half_step', 'last_beam'}
     points : ndarray, shape (n, 3)
         LRF frame at the pitch of the point, metres; on the fitted scan line.
@@ -167,7 +166,6 @@ class ScanEdges:
         What the distance of the background adds to the log odds at which readings flip (:func:`background_odds`).
     """
 
-    placement: int
     variant: str
     points: np.ndarray
     covariance: np.ndarray
@@ -232,7 +230,7 @@ def crossings(scan, across=False, known=()):
         points, by_angle, range_sigma = _points_at(scan, line, beam, angle, shift, across)
         noise = points / np.linalg.norm(points, axis=1, keepdims=True) * np.hypot(range_sigma, warp_sigma)[:, None]
         noise, spacing = (np.einsum("ni,nj->nij", v, v) for v in (noise, by_angle * sigma[:, None]))
-        found[variant] = ScanEdges(scan.placement, variant, points, spacing + noise, there, *about, noise, odds)
+        found[variant] = ScanEdges(variant, points, spacing + noise, there, *about, noise, odds)
     return found, every
 
 

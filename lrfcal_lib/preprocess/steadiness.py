@@ -66,8 +66,6 @@ class Steadiness:
     camera : str
     placements : ndarray of int, shape (n,)
         In the order of the session; those whose background could not be followed are in `problems`.
-    reference : int
-        Placement that all motion is relative to; -1 where the question does not arise.
     rotvec : ndarray, shape (n, 3)
         Turn of the camera since the reference, rotation vector in its own frame, radians.
     scale : ndarray, shape (n,)
@@ -86,7 +84,6 @@ class Steadiness:
 
     camera: str
     placements: np.ndarray
-    reference: int = -1
     rotvec: np.ndarray = ()
     scale: np.ndarray = ()
     covariance: np.ndarray = ()
@@ -151,7 +148,7 @@ def camera_steadiness(prepared, camera):
     size, corner = np.linalg.norm(turn @ root.T, axis=1), np.hypot(model.width, model.height) / 2 * (scale - 1)
     steps = find_steps(order, turn, covariance[:, :3, :3], root)
     motion = turn, scale, covariance, size, corner, steps
-    return Steadiness(camera, np.array(order, int), reference, *motion, problems=problems)
+    return Steadiness(camera, np.array(order, int), *motion, problems=problems)
 
 
 def board_hull(view, model):
@@ -257,14 +254,13 @@ def find_steps(placements, rotvec, covariance, root):
     own = np.einsum("ij,njk,ik->ni", root, covariance, root)
     sigma = np.maximum(1.4826 * np.median(np.abs(np.diff(moved, axis=0))) / np.sqrt(2), np.sqrt(np.median(own)))
     sigma = max(float(sigma), 1e-6)
-    cuts, todo, steps = [0, n], [(0, n)], []
-    while todo:
-        low, high = todo.pop()
+
+    def splits(low, high):
+        """Where a part of the recording falls in pieces."""
         k, p_value = _best_split(moved[low:high], sigma, n)
-        if p_value < LEVEL:
-            cuts.append(low + k)
-            todo += [(low, low + k), (low + k, high)]
-    cuts.sort()
+        return [*splits(low, low + k), low + k, *splits(low + k, high)] if p_value < LEVEL else []
+
+    cuts, steps = [0, *splits(0, n), n], []
     for before, k, after in zip(cuts, cuts[1:], cuts[2:], strict=False):
         turn = np.median(rotvec[k:after], axis=0) - np.median(rotvec[before:k], axis=0)
         spread = sigma * np.sqrt(MEDIAN_VARIANCE * (1 / (k - before) + 1 / (after - k)))
