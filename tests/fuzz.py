@@ -191,11 +191,9 @@ def arrays(rng, file):
     if how == 0:
         shape = any_of(rng, "(100000, 100000)", "(-1, 61)", "()", "(6,)", "(2**40,)", "(6, 61", "(6, 61, 1)")
         kind = any_of(rng, "<f8", "<f4", "|O", "<U9", "|b1", "<c16", "|V1000000", "<i8", "<M8[s]", ">f8", "x", "|S0")
-        header = any_of(rng, *[header_of(shape, kind)] * 5, b"(" * 9000, b"{'descr':", b"\xff" * 50)
-        members[name] = array_of(header, any_of(rng, 1, 1, 2, 9)) + bytes(1000)
+        members[name] = array_of(header_of(shape, kind), any_of(rng, 1, 1, 2, 9)) + bytes(1000)
     elif how == 1:
-        value = any_of(rng, 0.0, np.nan, np.inf, -1.0, 1e300, 1e-300, 1000.0)
-        shape = any_of(rng, (6, 61), (0, 61), (6, 0), (6,), (61,), (1, 1), (3, 3000), ())
+        value, shape = any_of(rng, 0.0, np.nan, np.inf, -1.0, 1e300), any_of(rng, (6, 61), (0, 61), (61,), (3, 3000))
         np.save(stream := io.BytesIO(), np.full(shape, value, any_of(rng, float, np.float32, np.complex128, ">f8")))
         members[name] = stream.getvalue()
     elif how == 2:
@@ -219,9 +217,9 @@ def pixels(rng, file):
     data = cv2.imencode(any_of(rng, ".png", ".jpg"), np.zeros((120, 160, any_of(rng, 1, 3, 4)), np.uint8))[1].tobytes()
     if data[:4] == b"\x89PNG":
         data = pixels_of(data, size, (any_of(rng, 8, 16), any_of(rng, 0, 2, 3, 6), 0, 0, any_of(rng, 0, 1)))
-    elif (at := data.find(b"\xff\xc0")) > 0:
-        lie = any_of(rng, b"", b"", b"\xff", b"\xff\xd0", b"\x00")
-        data = data[:at] + lie + data[at : at + 5] + struct.pack(">HH", *size[::-1]) + data[at + 9 :]
+    else:
+        at = data.find(b"\xff\xc0") + 5
+        data = data[:at] + struct.pack(">HH", *size[::-1]) + data[at + 4 :]
     file.write_bytes(data)
     if rng.random() < 0.5:
         state_size(file, size)
@@ -401,14 +399,11 @@ def main():
     options = argparse.ArgumentParser(description=__doc__)
     for name, value in (("cases", 200_000), ("seed", SEED), ("workers", os.cpu_count()), ("case", None)):
         options.add_argument(f"--{name}", type=int, default=value)
-    options.add_argument("--out", default="reports/fuzz/findings.jsonl", help="file for the findings, one a line")
     asked = options.parse_args()
     found = run(range(asked.cases) if asked.case is None else [asked.case], asked.seed, asked.workers)
-    Path(asked.out).parent.mkdir(parents=True, exist_ok=True)
-    Path(asked.out).write_text("".join(json.dumps({"seed": asked.seed, "finding": f}) + "\n" for f in found))
     for number, kind, text, trace in found:
         print(f"{kind} {text}: --seed {asked.seed} --case {number}", trace * (asked.case is not None), sep="\n")
-    print(f"{asked.cases if asked.case is None else 1} cases, {len(found)} findings (in {asked.out})")
+    print(len(found), "findings")
     return bool(found)
 
 

@@ -1,15 +1,11 @@
 """Emulated devices in virtual time: byte-exact replies, times."""
 
-import os
 
 import numpy as np
 import pytest
-import serial
-from virtual import Bench, Source, VirtualHost, head, lms
+from virtual import Bench, Source, VirtualHost, lms
 
-from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.head import REACT_S, Head
-from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import VARIANTS
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
@@ -135,61 +131,7 @@ def test_a_stream_that_this_machine_is_too_slow_for_leaves_scans_out(caplog):
     assert one.device.left_out == 1 and "casts scans too slowly: 1." in caplog.text
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_device_that_fails_says_so(tmp_path):
-    """On a pseudo-terminal."""
-
-    class Broken(SerialDevice):
-        baudrate = 9600
-
-        def receive(self, data, at):
-            raise RuntimeError("broken")
-
-    with Broken(tmp_path / "x", REAL) as device, serial.Serial(device.path, 9600) as port:
-        port.write(b"x")
-        device.port.join(60)
-        assert str(device.error) == "broken" and not os.path.lexists(device.path)
-
-
 # ------------------------------------------------------------------------------------------------ the head
-
-QUERY, UP = "FF 01 00 53 00 00 54", "FF 01 00 08 00 3F 48"
-STOPPED, TO_30 = "FF 01 00 00 00 00 01", "FF 01 00 4D 80 E8 B6"
-LEVEL = bytes.fromhex("FF 01 00 5B 00 00 5C")
-
-
-def at_head(**options):
-    return Bench(head(**options))
-
-
-def moved(one, wait):
-    """Degrees the head turns in a while."""
-    before = one.device.pitch()
-    one.run(wait)
-    return float(np.degrees(one.device.pitch() - before))
-
-
-def test_absolute_tilt_and_queries():
-    one = at_head()
-    assert one.send(QUERY) == LEVEL
-    assert one.send(TO_30) == b""
-    assert one.send(QUERY) == b""  # no answers while it makes an absolute move
-    one.run(4.0)
-    assert one.send(QUERY) == bytes.fromhex("FF 01 00 5B 80 E8 C4")
-    assert np.degrees(one.device.pitch()) == pytest.approx(30, abs=0.02)
-
-
-@pytest.mark.parametrize(("command", "stop", "speed"), [
-    (UP, "FF 01 00 00 20 00 21", 12.6), ("FF 01 00 10 00 00 11", "FF 01 88 00 00 00 89", -0.5),
-])  # fmt: skip
-
-
-def test_up_is_up_speed_0_is_slow_and_stop_ignores_speeds(command, stop, speed):
-    one = at_head(speeds=(0.5, 12.6))
-    one.send(command, wait=0.5)
-    assert moved(one, 1.0) == pytest.approx(speed, abs=0.01)
-    one.send(stop)
-    assert moved(one, 1.0) == 0
 
 
 def test_play_of_the_gear_and_stretch():

@@ -152,28 +152,13 @@ def test_a_second_writer_is_told_who_writes(folder):
     assert open_session(path).placements == (1,)
 
 
-def test_check_finds_what_two_writers_left(folder, monkeypatch):
-    """Two of them, let in side by side, record the same placement in turns."""
-    path = folder / "telegrams"
-    fuzz.recorder(path).finish()
-    assert not [text for text in validate(path) if " line " in text]
-    monkeypatch.setattr("lrfcal_lib.session.stated.alone", lambda path: contextlib.nullcontext())
-    both = [fuzz.recorder(path) for _ in range(2)]
-    for writer in both:
-        writer.begin_placement(5)
-    for writer in both:
-        fuzz.record(writer, 5)
-    both[0].finish_placement()
-    found = "\n".join(validate(path))
-    assert re.search(r"images.csv line 5: images/left/0003.png stands in line 4 already; remove one", found)
-    assert re.search(r"index.csv line 8: t_s runs back from 5.5 to 5: two writers at once\? Record the", found)
-
-
-def test_check_finds_an_edge_that_is_picked_twice_and_times_that_are_none(folder):
+def test_check_finds_what_two_writers_or_hands_do_to_tables(folder):
     with (folder / "scans" / "edges.csv").open("a") as table:
         table.write("left,images/left/0001.png,ab,1,2,20,9\n")
     told = "\n".join(validate(folder / "scans"))
-    assert "edges.csv line 4: left, images/left/0001.png, ab stands in line 2" in told
+    assert "edges.csv line 4: left, images/left/0001.png, ab stands in line 2 already; remove one" in told
     replaced("images.csv", "\n2", "\nnoon")(folder / "telegrams")  # of the placement that was not finished
+    replaced("lrf/index.csv", "\n1.5", "\n0.5")(folder / "telegrams")
     told = "\n".join(validate(folder / "telegrams"))
     assert re.search("images.csv line 3: t_s is 'noon.*': a number of seconds is needed", told)
+    assert re.search(r"index.csv line 3: t_s runs back from 1 to 0.5: two writers at once\? Record the", told)

@@ -102,56 +102,21 @@ def test_a_port_that_vanishes_is_a_lost_line(wire):
 
 
 class Far(SerialDevice):
-    """A device that says what a test lets it say."""
+    """A device that hears, and says what a test lets it say."""
 
-    baudrate = 38400
-
-    def __init__(self):
+    def __init__(self, baudrate=38400):
         super().__init__("far", VirtualHost())
-        self.heard = []
+        self.heard, self.baudrate = [], baudrate
         self.start()
 
     def receive(self, data, at):
         self.heard.append((at, data))
 
-    def say(self, data):
-        self.write(data, self.host.now())
-
-
-def linked(rate=38400):
-    far = Far()
-    far.baudrate = rate
-    return far, Link(far.path, rate, host=far.host)
-
-
-def received(link, far, data):
-    """What the link makes of bytes."""
-    far.say(data)
-    out = []
-    while link.silent_s < 0.1:
-        out += link.receive()
-    return [one.raw for one in out]
-
-
-@pytest.mark.parametrize(("data", "acknowledged", "declined"), [
-    (b"\x06", True, False), (b"\x15", False, True), (b"\x33\x15", False, True), (b"\x15\x33", False, False),
-    (encode_telegram(0x31) + b"\x06", True, False),  # an echo, which holds 15 itself
-    (encode_telegram(0xB2, b"\x15", status=0x15), False, False),
-    (b"\x15" + encode_telegram(0xB2, status=0x10)[:4], False, False),
-])  # fmt: skip
-
-
-def test_acknowledgements_count_only_where_they_can_be_ones(data, acknowledged, declined):
-    far, link = linked()
-    link.send(0x20, b"\x25")
-    received(link, far, data)
-    assert (link.acknowledged, link.declined) == (acknowledged, declined)
-
 
 @pytest.mark.parametrize(("rate", "writes"), [(38400, 1), (500000, 8)])
 def test_bytes_are_paced_at_500000_baud_only(rate, writes):
-    far, link = linked(rate)
-    link.send(0x20, b"\x25")
+    far = Far(rate)
+    Link(far.path, rate, host=far.host).send(0x20, b"\x25")
     times, pieces = zip(*far.heard, strict=True)
     assert b"".join(pieces) == encode_telegram(0x20, b"\x25") and len(pieces) == writes
     assert np.all(np.diff(times) >= 75e-6 - 1e-9)
@@ -170,10 +135,49 @@ def test_nobody_there_and_somebody_else_are_told_apart():
     talk(far.host.now())
     with pytest.raises(WrongDevice, match=r"bytes arrive, but no telegram of an LMS2xx at .* Bd, address 0 \(any\)"):
         opened(far, find_s=1.2)
-    with pytest.raises(WrongDevice, match="'LMX400' answers, not an LMS2xx"):
-        opened(emulated(model="LMX400;302063;X01.27 "))
-    with pytest.raises(PortError, match="there is no port lrf: .*present are none"):
-        LMS2xx("lrf", host=VirtualHost())
+
+
+LMS211 = {"model": "LMS211;302063;X01.27 ", "variant": (100, 50), "baudrates": (9600, 19200, 38400)}
+NO_RANGES = [{"configuration": Configuration().changed(measuring_mode=mode)} for mode in (0x0F, 0x3F)]
+
+
+@pytest.mark.parametrize(("habits", "options", "error", "message"), [
+    ({}, {"baudrate": 57600}, ValueError, "an LMS2xx has 9600, 19200, 38400, 500000 Bd, got 57600"),
+    ({}, {"address": 128}, ValueError, "an address is 0 to 127, got 128"),
+    ({}, {"password": b"SICK"}, ValueError, "a password has 8 bytes, got 4"),
+    ({"model": "LMX400;302063;X01.27 "}, {}, WrongDevice, "'LMX400' answers, not an LMS2xx"),
+    (NO_RANGES[0], {}, WrongDevice, "in measuring mode 0F, .*state measuring_mode, 0 to 6"),
+    (NO_RANGES[1], {}, WrongDevice, "in measuring mode 3F, .*state measuring_mode, 0 to 6"),
+    (LMS211, {"baudrate": 500000}, Refused, r"declines 500000 Bd \(A0 02\)"),
+])  # fmt: skip
+
+
+def test_what_cannot_be_opened_is_said_and_nothing_is_changed(habits, options, error, message):
+    device = emulated(**habits)
+    with pytest.raises(error, match=message):
+        opened(device, **options)
+    assert device.baudrate == 38400 and device.memory.flash_writes == 0
+
+
+def test_a_measuring_mode_without_ranges_is_changed_at_opening():
+    device = emulated(**NO_RANGES[0])
+    with opened(device, measuring_mode=4, unit="mm") as lms:
+        assert device.memory.flash_writes == 1 and lms.configuration.measuring_mode == 4
+        assert len(lms.request().ranges) == 361
+
+
+def test_what_the_device_declines_is_said(monkeypatch):
+    device = emulated(**LMS211)
+    with opened(device, password=b"WRONG_PW") as lms:
+        with pytest.raises(Refused, match=r"declines the password of the installation mode \(A0 01\)"):
+            lms.configure(unit="cm")
+        with pytest.raises(Refused, match="LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0"):
+            lms.set_variant(180, 0.5)
+        assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
+    monkeypatch.setattr(device.memory, "write_configuration", lambda data: False)
+    with opened(device) as lms, pytest.raises(Refused, match="does not take the configuration 00 00"):
+        lms.configure(unit="cm")
+    assert device.memory.mode == 0x25
 
 
 # ----------------------------------------------------------------------------------------------- finding the rate
@@ -202,18 +206,6 @@ def test_a_device_with_an_address_is_found_by_broadcast_and_by_its_own(address):
         assert lms.status.address == 3 and len(lms.request().ranges) == 361
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"baudrate": 57600}, "an LMS2xx has 9600, 19200, 38400, 500000 Bd, got 57600"),
-    ({"address": 128}, "an address is 0 to 127, got 128"),
-    ({"password": b"SICK"}, "a password has 8 bytes, got 4"),
-])  # fmt: skip
-
-
-def test_bad_arguments_are_refused_before_the_port_is_touched(options, message):
-    with pytest.raises(ValueError, match=message):
-        LMS2xx("/dev/nowhere", **options)
-
-
 # ------------------------------------------------------------------------------------------------------ settings
 
 
@@ -236,38 +228,6 @@ def test_only_what_differs_is_set():
             lms.set_variant(180, 0.25)
         with pytest.raises(ValueError, match="unit is one of .*got 'inch'"):
             lms.configure(unit="inch")
-
-
-@pytest.mark.parametrize("mode", [0x0F, 0x3F])
-def test_a_measuring_mode_without_ranges_is_refused_or_changed_at_opening(mode):
-    device = emulated(configuration=Configuration().changed(measuring_mode=mode))
-    with pytest.raises(WrongDevice, match=f"in measuring mode {mode:02X}, .*state measuring_mode, 0 to 6"):
-        opened(device)
-    assert device.memory.flash_writes == 0
-    with opened(device, measuring_mode=4, unit="mm") as lms:
-        assert device.memory.flash_writes == 1 and lms.configuration.measuring_mode == 4
-        assert len(lms.request().ranges) == 361
-
-
-def test_what_the_device_declines_is_said():
-    device = emulated(model="LMS211;302063;X01.27 ", variant=(100, 50), baudrates=(9600, 19200, 38400))
-    with opened(device, password=b"WRONG_PW") as lms:
-        with pytest.raises(Refused, match=r"declines the password of the installation mode \(A0 01\)"):
-            lms.configure(unit="cm")
-        with pytest.raises(Refused, match="LMS211-302063 has no variant 180/0.5; it keeps 100 deg in steps of 0"):
-            lms.set_variant(180, 0.5)
-        assert lms.baudrate == 38400 and len(lms.request().ranges) == 201
-    with pytest.raises(Refused, match=r"declines 500000 Bd \(A0 02\)"):
-        opened(device, baudrate=500000)
-    assert device.baudrate == 38400
-
-
-def test_a_configuration_that_is_not_taken_is_said(monkeypatch):
-    device = emulated()
-    monkeypatch.setattr(device.memory, "write_configuration", lambda data: False)
-    with opened(device) as lms, pytest.raises(Refused, match="does not take the configuration 00 00"):
-        lms.configure(unit="cm")
-    assert device.memory.mode == 0x25
 
 
 def test_a_rate_that_does_not_come_through_is_given_up():
@@ -315,47 +275,16 @@ def test_old_and_repeated_scans_are_refused():
     assert ScanClock().place(-1, 3.0) == (3.0, 0)
 
 
-def assembler(variant=(180, 0.5), *, configuration=INDEXED, rate=38400, interlaced=False, clock=None):
-    return Assembler(variant, configuration, rate, interlaced, {"dropped": 0, "stale": 0}, clock)
-
-
-@pytest.mark.parametrize(("variant", "first_deg"), [((180, 1.0), 0), ((180, 0.5), 0), ((100, 0.5), 40),
-                                                    ((100, 0.25), 40)])  # fmt: skip
-
-
-def test_beams_have_their_own_instants(variant, first_deg):
-    count, turns = round(variant[0] / variant[1]) + 1, round(1 / variant[1])
-    raw = encode_scan(np.full(count, 2.0), indices=(0, 0))
-    reading, bearing = assembler(variant).feed(raw, 50.0), first_deg + variant[1] * np.arange(count)
-    np.testing.assert_allclose(np.degrees(reading.bearings), bearing, atol=1e-9)
-    begin = 50.0 - len(raw) * 10 / 38400 - turns * TURN_S
-    times = begin + (np.arange(count) % turns + bearing / 360) * TURN_S
-    np.testing.assert_allclose(reading.beam_times_s, times, atol=1e-9)
-    assert reading.time_s == reading.beam_times_s[0] and reading.scan_index == reading.telegram_index == 0
-
-
 def interlaced(partials, indexed, skipped=()):
     """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
-    one = assembler((100, 0.25), configuration=INDEXED.changed(realtime_indices=indexed), rate=500000, interlaced=True)
-    made = {}
+    configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}
+    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, None), {}
     for k, partial in enumerate(partials):
         ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
         raw = encode_scan(ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None)
         reading = None if k in skipped else one.feed(raw, 9 + k * TURN_S + transfer_s(len(raw), 500000))
         made |= {k: reading} if reading else {}
     return made
-
-
-@pytest.mark.parametrize("indexed", [True, False])
-def test_four_partial_scans_make_one(indexed):
-    made = interlaced([2, 3, 0, 1, 2, 3, 0, 1, 2, 3], indexed)
-    assert list(made) == [5, 9]
-    reading = made[5]
-    np.testing.assert_allclose(np.degrees(reading.bearings), np.arange(721) / 4, atol=1e-9)
-    np.testing.assert_allclose(reading.ranges, 1 + np.arange(721) / 1000, atol=1e-9)
-    expected = reading.time_s + (np.arange(721) % 4 + np.arange(721) / 1440) * TURN_S
-    np.testing.assert_allclose(reading.beam_times_s, expected, atol=1e-9)
-    assert len(reading.telegrams) == 4 and reading.telegram_index == (2 if indexed else None)
 
 
 @pytest.mark.parametrize("indexed", [True, False])
@@ -366,40 +295,30 @@ def test_four_partial_scans_make_one(indexed):
 
 def test_sets_with_a_missing_part_are_no_scan(indexed, missing, made):
     """The last: 0 and 1 of one set and 2 and 3 of the next."""
-    assert list(interlaced([0, 1, 2, 3] * 3, indexed, missing)) == made
+    found = interlaced([0, 1, 2, 3] * 3, indexed, missing)
+    assert list(found) == made
+    for reading in found.values():
+        np.testing.assert_allclose(reading.ranges, 1 + np.arange(721) / 1000, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------ scans of a device
 
 
 @pytest.mark.parametrize("rate", [38400, 500000])
-@pytest.mark.parametrize("variant", [(180, 0.5), (100, 0.25)])
+@pytest.mark.parametrize("variant", [(180, 0.5), (180, 1.0), (100, 0.5), (100, 0.25)])
 def test_scans_on_request_are_those_of_the_device(rate, variant):
-    device = emulated(baudrate=rate)
+    device, (angle, step) = emulated(baudrate=rate), variant
     with opened(device) as lms:
         lms.set_variant(*variant)
         for _ in range(3):
             reading = lms.request()
             (truth,) = record_of(device, reading)
+            np.testing.assert_allclose(np.degrees(reading.bearings), np.arange(90 - angle / 2, 90.1 + angle / 2, step))
             np.testing.assert_allclose(reading.beam_times_s, truth.beam_times_s, atol=1e-4)
+            assert reading.time_s == reading.beam_times_s[0]
             assert (reading.scan_index, reading.telegram_index) == (truth.turn % 256, truth.telegram_index)
             valid = reading.reasons == 0
             np.testing.assert_array_equal(np.rint(reading.ranges[valid] * 1000), truth.words[valid])
-
-
-def test_scans_of_a_stream_are_handed_out_from_an_instant_on():
-    device = emulated(baudrate=500000)
-    with opened(device) as lms:
-        lms.start()
-        (first,) = lms.take(1)
-        (later,) = lms.take(1, after=first.time_s + 0.3)
-        assert 0.3 < later.time_s - first.time_s < 0.35
-        with pytest.raises(NoReply, match="no new scan within 0.2 s"):
-            lms.take(1, after=later.time_s + 100, timeout=0.2)
-        device.faults.inject("skip", seconds=2.0)
-        device.host.sleep(0.9)
-        with pytest.raises(NoReply, match="no new scan within 0.3 s"):
-            lms.take(1, timeout=0.3)
 
 
 def test_calls_at_the_wrong_time_say_so():

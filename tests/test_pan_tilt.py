@@ -1,7 +1,6 @@
 """The pitch axis: emulated heads that answer fully, partly, with echo or not at all, in virtual time."""
 
 import contextlib
-import logging
 import math
 import signal
 import subprocess
@@ -215,25 +214,6 @@ def test_what_happens_once_is_made_up_for(opened):
 # ------------------------------------------------------------------------------------------------- timed moves
 
 
-def test_timed_moves_say_what_they_are(opened, caplog):
-    with caplog.at_level(logging.INFO):
-        _, head = opened(replace(TIMED, degrees_per_second=(20.0, 30.0)), feedback="none", head=Uneven)
-        assert head.pitch() == (0.0, False)
-        assert head.move_to(20 * DEGREE) == near(20, 1.5)
-    said = [record.message for record in caplog.records if "timed moves" in record.message]
-    assert len(said) == 1 and "20/30 deg/s (stated)" in said[0]
-    assert head.move_to(head.pitch()[0] + 0.02 * DEGREE) == head.pitch()[0]  # shorter than a motion can be
-
-
-def test_start_of_a_head_without_feedback(opened, caplog):
-    device, head = opened(replace(FAST, start_pitch_deg=-15.0, feedback=False))
-    assert "assumed, state degrees_per_second" in caplog.text
-    assert head.pitch() == (near(-15, 1e-6), False)
-    head.set_pitch(0.1)
-    assert head.pitch() == (0.1, False)
-    assert not sent(device, pelco_d.QUERY_TILT)
-
-
 # ------------------------------------------------------------------------------------------------------- sweeps
 
 SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "silent while moving": PARTIAL,
@@ -290,23 +270,6 @@ def test_stop_from_another_thread_ends_a_move(opened, settings, habits, stop, ab
     with pytest.raises(DeviceError, match="stopped before it arrived"):
         head.move_to(60 * DEGREE)
     assert halted(device) and -5 * DEGREE < device.pitch() < 30 * DEGREE
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
-def test_whatever_ends_a_move_stops_the_head(opened, monkeypatch, error):
-    device, head = opened(SURE)
-    moved = []
-
-    def fail(_):
-        device.host.sleep(0.2)
-        moved.append(device.head.moving(device.host.now()))
-        if moved[-1]:
-            raise error
-
-    monkeypatch.setattr(head.motion, "pause", fail)
-    with pytest.raises(error):
-        head.move_to(30 * DEGREE)
-    assert moved[-1] and not head.moving() and halted(device)
 
 
 def test_close_stops_the_head_and_is_final(opened):

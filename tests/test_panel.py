@@ -14,9 +14,8 @@ from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
-from lrfcal_lib.session.read import open_session, validate
 
-WAIT_S = 20  # guards against hanging
+WAIT_S = 120  # guards against hanging
 @pytest.fixture
 def fake(monkeypatch, tmp_path):
     """Makes a rig file, to whose plan keywords go, and the fake rig that opens for it."""
@@ -36,20 +35,11 @@ def fake(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def connect(fake, tmp_path):
-    """Connects a collector, anew each time, to a fake rig."""
+def connected(fake, tmp_path):
+    """A collector at a fake rig whose plan is one placement."""
     with Collector() as made:
-
-        def connect(**plan):
-            made.connect(fake(**plan), tmp_path / "s")
-            return made
-
-        yield connect
-
-
-@pytest.fixture
-def connected(connect):
-    return connect()
+        made.connect(fake(placements=[{"number": 1}]), tmp_path / "s")
+        yield made
 
 
 def in_background(call):
@@ -59,29 +49,6 @@ def in_background(call):
 
 
 # -------------------------------------------------------------------------------------------------- recording
-
-
-def test_placements_are_recorded_one_by_one(connected, tmp_path):
-    shares = []
-    lights = connected.capture(lambda share, text: shares.append(share))
-    assert connected.finished == (1,) and connected.task().title == "Placement 2 of 3"
-    assert lights[0].name == "scan" and connected.lights[1] == lights
-    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
-    connected.close()
-    assert validate(tmp_path / "s") == [] and open_session(tmp_path / "s").placements == (1,)
-
-
-def test_the_last_placement_can_be_recorded_again(connected):
-    with pytest.raises(RecordingError, match="at least three placements"):
-        connected.calibrate()
-    with pytest.raises(RecordingError, match="no placement to record again"):
-        connected.again()
-    connected.capture()
-    connected.capture()
-    assert connected.again() == 2 and connected.finished == (1,) and 2 not in connected.lights
-    assert connected.task().placement.number == 2
-    connected.capture()
-    assert connected.finished == (1, 2)
 
 
 def test_stop_ends_a_capture_and_nothing_of_it_counts(connected):
@@ -113,19 +80,26 @@ def test_one_thing_at_a_time(connected, monkeypatch):
     assert connected.finished == (1,)
 
 
-# ----------------------------------------------------------------------------------------------- the live view
-
-
-# --------------------------------------------------------------------------------------------------- bad input
-
-
-def test_nothing_works_without_a_rig():
+def test_what_cannot_be_done_yet_or_any_more(connected):
     made = Collector()
     for call in (made.capture, made.again, made.calibrate, lambda: made.move_to(0.0)):
         with pytest.raises(DeviceError, match="press connect"):
             call()
     made.stop()
     assert made.look().ranges is None and made.task() is None
+    with pytest.raises(RecordingError, match="at least three placements"):
+        connected.calibrate()
+    with pytest.raises(RecordingError, match="no placement to record again"):
+        connected.again()
+    connected.capture()
+    with pytest.raises(RecordingError, match="plan of this rig is done"):
+        connected.capture()
+
+
+def test_advice_where_nothing_is_determined_yet(monkeypatch):
+    monkeypatch.setattr(collector, "prepare", lambda session: session)
+    monkeypatch.setattr(collector, "calibrate_jointly", raising(collector.DegenerateGeometry("one placement only")))
+    assert collector.advise(None) == "not determined yet: one placement only"
 
 
 @pytest.mark.parametrize(("rig", "error", "said"), [
@@ -142,12 +116,6 @@ def test_a_rig_or_port_that_is_not_there(rig, error, said, tmp_path, monkeypatch
     with pytest.raises(error, match=said):
         made.connect(rig, tmp_path / "s")
     assert not made.connected and not (tmp_path / "s").exists()
-
-
-# ---------------------------------------------------------------------------------------------------- pictures
-
-
-# ------------------------------------------------------------------------------------------------------- words
 
 
 # ------------------------------------------------------------------------------------------------- the buttons

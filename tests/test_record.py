@@ -270,44 +270,34 @@ def test_a_disk_that_is_full_at_once(path, rig, monkeypatch):
 # ------------------------------------------------------------------------------------------------- at the terminal
 
 
-class Answers(list):
-    """Stands in for `input`; notes what was asked, and raises what is an error."""
-
-    def __init__(self, *texts):
-        super().__init__(texts)
-        self.asked = []
-
-    def __call__(self, text):
-        self.asked.append(text)
-        answer = self.pop(0) if self else EOFError()
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer
-
-
 @pytest.fixture
-def recorded(monkeypatch):
-    """Records at a terminal; what was asked."""
+def answered(monkeypatch):
+    """Stands in for `input`: gives answers one after the other, raises those that are errors; what was asked."""
 
-    def recorded(rig, path, *texts):
-        answers = Answers(*texts)
-        monkeypatch.setattr("builtins.input", answers)
-        record_session(rig, path)
-        return answers.asked
+    def answered(*texts):
+        asked, left = [], [*texts, EOFError()]
 
-    return recorded
+        def ask(text):
+            asked.append(text)
+            if isinstance(left[0], BaseException):
+                raise left[0]
+            return left.pop(0)
+
+        monkeypatch.setattr("builtins.input", ask)
+        return asked
+
+    return answered
 
 
-def test_the_last_placement_can_be_asked_for_again(recorded, path, rig):
-    asked = recorded(rig, path, "", "what?", "R", "", "q")
+def test_the_last_placement_can_be_asked_for_again(answered, path, rig):
+    asked = answered("", "what?", "R", "", "q")
+    record_session(rig, path)
     assert "dropped" in (path / "images.csv").read_text()
     assert "r: placement 1 again" in asked[1] and "again" not in asked[0]
     assert open_session(path).placements == (1,)
-
-
-def test_without_anybody_to_move_the_board(recorded, path, rig):
+    answered()
     with pytest.raises(RecordingError, match="nobody is there to move the board"):
-        recorded(rig, path)
+        record_session(rig, path.with_name("t"))
 
 
 PATTERN = np.full((SIZE[1] * 8, SIZE[0] * 8, 3), 200, np.uint8)  # the fake board's, small
@@ -324,10 +314,11 @@ def close_rig():
     return make_rig(data)
 
 
-def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(recorded, path, close_rig):
+def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(answered, path, close_rig):
     shown = [PATTERN, np.zeros_like(PATTERN), PATTERN, PATTERN]  # one is bad, one is of the placement
     close_rig.cameras["left"].show = lambda pitch, name: shown.pop(0)
-    asked = recorded(close_rig, path, "", "", "", "")
+    asked = answered("", "", "", "")
+    record_session(close_rig, path)
     session = open_session(path)
     assert len(session.images(purpose="intrinsics")) == 2 and all(r.placement == -1 for r in session.images()[:2])
     assert [text[15:26] for text in asked[:3]] == ["view 1 of 2", "view 2 of 2", "view 2 of 2"] and not shown
@@ -337,14 +328,14 @@ def test_images_for_the_intrinsics_are_repeated_until_they_show_the_pattern(reco
 
 
 @pytest.fixture
-def run(tmp_path, path, rig, monkeypatch, capsys):
+def run(tmp_path, path, rig, monkeypatch, answered, capsys):
     """Runs the program with the fake rig: exit code, what it says, what it complains about."""
     file = tmp_path / "rig.json"
     file.write_text(json.dumps(listed(-4, 0, 4)))
 
     def run(*texts, **options):
         monkeypatch.setattr(record, "Rig", opened(rig))
-        monkeypatch.setattr("builtins.input", Answers(*texts))
+        answered(*texts)
         code = main(file, path, **options)
         said = capsys.readouterr()
         return code, said.out, said.err.strip()

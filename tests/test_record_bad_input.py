@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -61,8 +60,8 @@ class Program:
             out, err = self.run.communicate(timeout=DEADLINE)
         finally:
             self.run.kill()
-        time.sleep(0.2)
-        assert not self.rig.world.head.moving(self.rig.host.now()) and "Traceback" not in err
+        until(lambda: not self.rig.world.head.moving(self.rig.host.now()))
+        assert "Traceback" not in err
         return self.run.returncode, out, err.strip()
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.session.lms2xx_codec import REASONS
-from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, measured, scan
+from lrfcal_lib.simulate.beam import LMS221, echo, ideal_readings, scan
 from lrfcal_lib.simulate.scene import Thing, World, plain, rectangle
 
 HEAD = RigidTransform.identity()
@@ -48,18 +47,6 @@ def test_a_step_mixes_over_the_width_of_the_spot(spot, distance):
     assert OFFSETS[np.argmin(np.abs(share - 0.5))] == pytest.approx(0.0, abs=0.05 * diameter)
 
 
-def test_surfaces_a_pulse_apart_do_not_mix():
-    front, back = sheet(2.0, width=10.0, shift=5.0, infrared=0.1), sheet(4.0, infrared=0.6)
-    reading = readings([front, back], np.pi / 2 - np.arctan(OFFSETS / 2.0))
-    assert np.all(np.minimum(np.abs(reading - 2.0), np.abs(reading - 4.0)) < 5e-3)
-    # the front needs a quarter of the back's echo: a share p of the disc with 0.025 p >= 0.25 * 0.0375 (1 - p)
-    edge = OFFSETS[reading < 3.0].min() / ((LMS221.spot_exit + 2.0 * LMS221.divergence) / 2)
-    share = 0.25 * 0.0375 / (0.025 + 0.25 * 0.0375)
-    t = np.linspace(-1, 1, 4001)
-    disc = (np.arccos(t) - t * np.sqrt(1 - t**2)) / np.pi  # part of the disc beyond t
-    assert -edge == pytest.approx(t[np.argmin(np.abs(disc - share))], abs=0.1)
-
-
 def test_echo_takes_the_first_that_is_strong_enough():
     beam = replace(LMS221, least_energy=0.2, least_share=0.3)
     distance = np.array([[1.0, 1.5, 4.0], [1.0, 4.0, 4.2], [1.0, np.inf, np.inf], [np.inf] * 3, [1.0, 3.0, 6.0]])
@@ -76,21 +63,3 @@ def test_noise_offset_and_rounding_of_scans(unit):
     error = words * unit - 2.0 / np.sin(beam.bearings())
     assert words.shape == (60, 201) and np.mean(error) == pytest.approx(0.02, abs=5e-4)
     assert np.std(error) == pytest.approx(np.hypot(0.010, unit / np.sqrt(12)), rel=0.05)
-
-
-def test_what_gives_no_range_has_a_reason():
-    reading, total = np.array([1.0, 0.001, np.nan, np.nan, 2.0]), np.array([1.0, 1.0, 0.0, 1e-6, 9.0])
-    exact = replace(LMS221, sigma_range=0.0, systematic=-0.002)
-    ranges, reasons = measured(exact, reading, total, np.arange(5) == 4, np.random.default_rng(0))
-    assert [REASONS[i] for i in reasons] == ["valid", "valid", "not valid", "noise", "dazzled"]
-    np.testing.assert_allclose(ranges[:2], [0.998, 0.0])
-
-
-def test_a_moving_head_smears_a_fine_scan():
-    """Neighbours of a fine scan are a turn of the mirror apart."""
-    beam = replace(LMS221, field_of_view=100, resolution=25, sigma_range=0.0)
-    ceiling = Thing(rectangle(40, 40), (plain, (0.6,) * 3), RigidTransform.from_translation([0, 0, 1.0]))
-    turns = np.arange(len(beam.bearings())) % beam.turns
-    pitch = np.radians(30) + np.radians(5.0) * turns / 75
-    middle = scan(beam, World([ceiling]), pitch[None], HEAD, np.random.default_rng(0))[0, 180:221] / 1000
-    assert middle[turns[180:221] == 0].mean() - middle[turns[180:221] == 3].mean() > 0.003

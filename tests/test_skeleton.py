@@ -73,12 +73,6 @@ esac
 """
 
 
-def run_in(folder, *command, **variables):
-    """Run a command that finds stand-ins for others in a folder."""
-    environment = {"PATH": f"{folder / 'bin'}:/usr/bin:/bin", "HOME": str(folder)} | variables
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-
-
 def write_command(path, script):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("#!/bin/bash\n" + script)
@@ -95,8 +89,9 @@ def run_setup(tmp_path):
 
     def run(missing="", **commands):
         for name, script in commands.items():
-            write_command(tmp_path / "bin" / name.replace("_", "-"), script)
-        return run_in(tmp_path, ".ci/setup", MISSING=missing)
+            write_command(tmp_path / "bin" / name, script)
+        environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path), "MISSING": missing}
+        return subprocess.run(".ci/setup", cwd=tmp_path, env=environment, capture_output=True, text=True)
 
     return run
 
@@ -130,8 +125,3 @@ def test_setup_says_what_to_do(run_setup, tmp_path, case):
     done = run_setup(**commands)
     assert done.returncode == status and words.format(tmp_path) in done.stderr
     assert status == 0 or not (tmp_path / ".venv").exists()
-
-
-def test_setup_installs_missing_libraries_as_root(run_setup, tmp_path):
-    assert run_setup("libusb-1.0-0", id="echo 0", apt_get='echo "apt-get $*" >>calls').returncode == 0
-    assert re.search(r"apt-get install .*libusb-1.0-0", (tmp_path / "calls").read_text())
