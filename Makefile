@@ -44,7 +44,7 @@ notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
 
 golden: setup
-	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadgroup tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py
+	STORE_GOLDEN=1 $(RUN) -m pytest -n 3 --dist loadgroup -m '' -k 'not figures' tests/test_golden.py tests/test_notebooks.py tests/test_notebooks_recording.py
 
 lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \

@@ -51,7 +51,7 @@ def run_nbval(path, report):
     command += ["--nbval-sanitize-with", "tests/nbval_sanitize.cfg", str(path)]
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
-    environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem}
+    environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     tests = Path(__file__).parent
     environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [environment.get("PYTHONPATH")])])
     environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")

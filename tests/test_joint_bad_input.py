@@ -64,8 +64,8 @@ def test_some_mislabelled_placements_are_left_out_by_name(mount, share):
 
 @pytest.mark.parametrize(
     ("mount", "share", "seed"),
-    [("head", 1.0, 3), ("platform", 0.5, 4), *(pytest.param(m, s, n, marks=campaign) for m, s, n in (
-        ("head", 0.5, 5), ("head", 0.5, 9), ("platform", 0.5, 9), ("platform", 1.0, 5)))],
+    [("head", 1.0, 3), *(pytest.param(m, s, n, marks=campaign) for m, s, n in (
+        ("platform", 0.5, 4), ("head", 0.5, 5), ("head", 0.5, 9), ("platform", 0.5, 9), ("platform", 1.0, 5)))],
 )  # fmt: skip
 def test_many_mislabelled_placements_are_refused(mount, share, seed):
     obs, *_ = draw(rng(seed), 20, mount=mount)

@@ -12,22 +12,34 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
 @each_notebook
-def test_stored_as_run_from_top_to_bottom(path):
+def test_stored_as_run_from_top_to_bottom_without_errors_and_traces_of_the_machine(path):
     notebook = read(path)
     nbformat.validate(notebook)
     assert len({cell.id for cell in notebook.cells}) == len(notebook.cells)
     run = [cell for cell in code_cells(notebook) if "nbval-skip" not in cell.metadata.get("tags", [])]
     assert [cell.execution_count for cell in run] == list(range(1, len(run) + 1))
     assert notebook.metadata.kernelspec.name == "python3"
+    for cell in code_cells(notebook):
+        shows = any("image/png" in output.get("data", {}) for output in cell.outputs)
+        assert "notebook.save(" in cell.source or not shows, f"no figure is shown before it is complete: {cell.source}"
+        for output in cell.outputs:
+            assert output.output_type != "error"
+            assert output.get("name") != "stderr", f"a warning is stored under: {cell.source.splitlines()[0]}"
+            text = str(output.get("text", "")) + str(output.get("data", {}).get("text/plain", ""))
+            assert "/home/" not in text and "/tmp/" not in text and " at 0x" not in text
 
 
 @each_notebook
-def test_begins_with_title_and_thesis(path):
-    first = read(path).cells[0]
-    assert first.cell_type == "markdown"
-    assert first.source.startswith("# ")
+def test_text_begins_with_title_and_thesis_and_stands_before_code(path):
+    notebook, formulas = read(path), []
+    first, kinds = notebook.cells[0], [cell.cell_type for cell in notebook.cells]
+    assert first.cell_type == "markdown" and first.source.startswith("# ")
     assert "\n> " in first.source, "the sentence after the title says what the notebook shows"
     assert "Reads:" in first.source and "Writes:" in first.source
+    assert kinds.count("markdown") * 2.5 >= kinds.count("code")
+    for cell in notebook.cells:
+        formulas += re.findall(r"\$[^$\n]+\$", cell.source) if cell.cell_type == "markdown" else []
+    assert not [f for f in formulas if re.search(r"\\\\[A-Za-z]", f)], "a doubled backslash shows as text"
 
 
 @each_notebook
@@ -40,38 +52,6 @@ def test_cells_are_short_and_plain(path):
             assert not isinstance(node, ast.ClassDef | ast.Try), f"belongs in lrfcal_lib, with a test: {lines[0]}"
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < LONGEST_FUNCTION, f"{node.name} belongs in lrfcal_lib"
-
-
-@each_notebook
-def test_text_stands_before_code(path):
-    kinds = [cell.cell_type for cell in read(path).cells]
-    assert kinds.count("markdown") * 2.5 >= kinds.count("code")
-
-
-@each_notebook
-def test_formulas_are_formulas(path):
-    """A doubled backslash within dollars shows as text."""
-    for cell in read(path).cells:
-        if cell.cell_type == "markdown":
-            formulas = re.findall(r"\$[^$\n]+\$", cell.source)
-            assert not [f for f in formulas if re.search(r"\\\\[A-Za-z]", f)]
-
-
-@each_notebook
-def test_no_figure_is_shown_before_it_is_complete(path):
-    for cell in code_cells(read(path)):
-        shows = any("image/png" in output.get("data", {}) for output in cell.outputs)
-        assert "notebook.save(" in cell.source or not shows, cell.source
-
-
-@each_notebook
-def test_outputs_show_no_errors_and_no_machine(path):
-    for cell in code_cells(read(path)):
-        for output in cell.outputs:
-            assert output.output_type != "error"
-            assert output.get("name") != "stderr", f"a warning is stored under: {cell.source.splitlines()[0]}"
-            text = str(output.get("text", "")) + str(output.get("data", {}).get("text/plain", ""))
-            assert "/home/" not in text and "/tmp/" not in text and " at 0x" not in text
 
 
 @each_notebook

@@ -47,12 +47,6 @@ def test_the_better_known_axis_wins(scale, scatter, wins):
     assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
 
 
-def test_without_a_stated_platform_the_data_stand_alone():
-    data = head(3)
-    found, covariance = pipeline.combine(estimate(data, np.eye(4)), None)
-    assert found is data and (covariance == np.eye(4)).all()
-
-
 BOARD = triangle_board()
 
 

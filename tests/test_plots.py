@@ -1,6 +1,5 @@
 """Figures show what they are given: in the right place, in the right colour, with units."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -213,27 +212,6 @@ def test_map_of_projection_sigma(ax, index, title, drawn):
     mesh = ax.collections[0]
     assert falls(ax.get_ylim()) and mesh.get_clim() == (0.0, max(drawn))
     assert mesh.get_array().compressed().tolist() == drawn
-
-
-def test_map_of_points_in_degrees_and_millimetres(ax):
-    results.point_map(ax, replace(SIGMA, columns=np.radians([80.0, 90, 100]), rows=np.radians([-5.0, 5])))
-    assert labels(ax) == ("bearing [deg]", "pitch [deg]") and ax.get_title() == "cloud at 1 m: 3.9e+03 mm rms"
-    assert falls(ax.get_xlim())  # bearings grow to the left, as one sees them
-
-
-def test_residuals_by_range_show_a_trend(ax):
-    distance = np.linspace(1, 3, 200)
-    results.residuals_by_range(ax, distance, 0.001 * (distance - 2))
-    x, y = ax.lines[1].get_data()
-    assert np.allclose(y, x - 2, atol=1e-9) and labels(ax) == ("range [m]", "predicted - measured [mm]")
-    assert ax.get_title() == "ranges: 0.58 mm rms"
-
-
-def test_residuals_by_region_are_arrows(ax):
-    results.residuals_by_region(ax, np.array([[100.0, 50.0]]), np.array([[3.0, 4.0]]), MODEL, "left")
-    arrows = ax.collections[0]
-    assert np.allclose([arrows.U, arrows.V], [[3.0], [4.0]]) and arrows.scale == pytest.approx(5 / 80)
-    assert ax.get_title() == "left: 5 px rms, predicted - seen" and ax.get_ylim() == (480, 0)
 
 
 FAULTS = {
