@@ -36,9 +36,9 @@ def wall(lines=3):
     return ranges, BEARINGS, np.radians(np.linspace(-1, 1, lines))
 
 
-def write(path, *sweeps):
+def write(path, *sweeps, **options):
     """A session of sweeps as :func:`wall` gives them, or of two sweeps and five images."""
-    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, licence="CC0", source="a test") as writer:
+    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, licence="CC0", source="a test", **options) as writer:
         for number, sweep in enumerate(sweeps, 1):
             writer.add_sweep(number, *sweep)
         if not sweeps:
