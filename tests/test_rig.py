@@ -9,7 +9,7 @@ from functools import partial, reduce
 
 import numpy as np
 import pytest
-from fake_rig import BEAMS, SIZE, Camera, Clock, Head, Lrf, make_rig, raising, rig_data
+from fake_rig import BEAMS, SIZE, make_rig, raising, rig_data
 
 from lrfcal_lib.drivers import rig as rig_module
 from lrfcal_lib.drivers.port import DeviceError, NoReply, PortError
@@ -224,24 +224,6 @@ def test_a_sweep_without_scans_is_given_up(monkeypatch):
 # --------------------------------------------------------------------------------------------- opening, the board
 
 
-def fake_drivers(monkeypatch, size=SIZE, **instead):
-    """Let Rig.open make fakes, and list which are open; a driver may raise an error instead."""
-    clock, made = Clock(), []
-    head = Head(clock)
-    lrf, camera = Lrf(head, clock), Camera("left", head, clock)
-    camera.size = size
-
-    def make(driver, fake, *_, **__):
-        made.append(driver)
-        fake.close = lambda: made.remove(driver)
-        return fake
-
-    for driver, fake in (("PanTilt", head), ("LMS2xx", lrf), ("Camera", camera)):
-        opener = raising(instead[driver]) if driver in instead else partial(make, driver, fake)
-        monkeypatch.setattr(rig_module, driver, opener)
-    return made
-
-
 @pytest.mark.parametrize(("options", "error", "message"), [
     ({"LMS2xx": PortError("there is no port")}, PortError, "lrf: there is no port"),
     ({"Camera": PortError("there is no port")}, PortError, "camera 'left': there"),
@@ -251,7 +233,18 @@ def fake_drivers(monkeypatch, size=SIZE, **instead):
 
 
 def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, error, message):
-    made = fake_drivers(monkeypatch, **options)
+    rig, made = make_rig(), []
+    rig.cameras["left"].size = options.get("size", SIZE)
+
+    def make(driver, fake, *_, **__):
+        if driver in options:
+            raise options[driver]
+        made.append(driver)
+        fake.close = lambda: made.remove(driver)
+        return fake
+
+    for driver, fake in (("PanTilt", rig.head), ("LMS2xx", rig.lrf), ("Camera", rig.cameras["left"])):
+        monkeypatch.setattr(rig_module, driver, partial(make, driver, fake))
     with pytest.raises(error, match=message):
         Rig.open(rig_of(rig_data()))
     assert made == []
