@@ -146,6 +146,7 @@ NO_RANGES = [{"configuration": Configuration().changed(measuring_mode=mode)} for
     ({}, {"address": 128}, ValueError, "an address is 0 to 127, got 128"),
     ({}, {"password": b"SICK"}, ValueError, "a password has 8 bytes, got 4"),
     ({"model": "LMX400;302063;X01.27 "}, {}, WrongDevice, "'LMX400' answers, not an LMS2xx"),
+    ({"variant": (90, 50)}, {}, WrongDevice, "the LMS221-302063 scans .* deg, which no LMS2xx does"),
     (NO_RANGES[0], {}, WrongDevice, "in measuring mode 0F, .*state measuring_mode, 0 to 6"),
     (NO_RANGES[1], {}, WrongDevice, "in measuring mode 3F, .*state measuring_mode, 0 to 6"),
     (LMS211, {"baudrate": 500000}, Refused, r"declines 500000 Bd \(A0 02\)"),
@@ -399,6 +400,16 @@ def test_a_stream_comes_back_by_itself_with_the_same_settings(fault):
         assert len(reading.ranges) == 201 and record_of(device, reading) and lms.counts["reconnects"] == 1
         assert device.baudrate == 500000 and device.memory.flash_writes == 0
     assert not device.streaming
+
+
+def test_a_stream_that_does_not_end_is_said(monkeypatch):
+    device = emulated()
+    with opened(device) as lms:
+        lms.start()
+        with monkeypatch.context() as patch:
+            patch.setattr(device, "set_mode", lambda data, at: device.answer(at, 0xA0, b"\0"))
+            with pytest.raises(Refused, match="confirms to stop streaming and goes on; switch it off and on"):
+                lms.stop()
 
 
 # ---------------------------------------------------------------------------------------------------- in real time

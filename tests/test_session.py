@@ -136,8 +136,9 @@ def test_finish_needs_sweeps(path):
 
 def test_an_existing_target_is_refused(path):
     before = (path / "session.json").read_text()
-    with pytest.raises(SessionError, match="exists already"):
-        SessionWriter(path, triangle_board(), LRF)
+    for target in (path, path / "session.json"):
+        with pytest.raises(SessionError, match="exists already"):
+            SessionWriter(target, triangle_board(), LRF)
     assert (path / "session.json").read_text() == before
 
 
