@@ -108,6 +108,7 @@ REFUSED = [
     (lambda _: recover_polar(line(39.6)), r"bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
     (lambda folder: read_bouguet(written(folder / "c.m", "fc = [ 1 ; 2 ];\n")), r"c\.m: no value of cc, kc"),
     (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),
+    (lambda folder: import_lasersetero(folder, folder / "dst", intrinsics="best"), "'own' or 'published', got 'best'"),
     (without("plane_*"), "plane_.*"),
     (without("left_*"), "left_.*"),
     (without("Calib_Results_right.m"), "Calib_Results_right.m"),
@@ -139,11 +140,12 @@ def test_import_makes_a_sound_session(source, tmp_path):
 
 
 def test_published_intrinsics(source, tmp_path):
-    import_lasersetero(source, tmp_path / "dst")
-    stated = open_session(tmp_path / "dst").reference["cameras"]["left"]
-    assert list(stated["intrinsics"].values())[:4] == [700.5, 701.5, 15.25, 11.75]
-    np.testing.assert_allclose(list(stated["intrinsics_sigma"].values())[:5], [1, 2, 0.1, 0.2, 0.001])
-    pose = transform_from_json(stated["T_camera_board"]["1"])
+    import_lasersetero(source, tmp_path / "dst", intrinsics="published")
+    session = open_session(tmp_path / "dst")
+    model = session.cameras["left"].model
+    assert (model.fx, model.fy, model.cx, model.cy) == (700.5, 701.5, 15.25, 11.75)
+    np.testing.assert_allclose(np.sqrt(np.diag(model.covariance))[:5], [1, 2, 0.1, 0.2, 0.001])
+    pose = transform_from_json(session.reference["cameras"]["left"]["T_camera_board"]["1"])
     np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
     np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
 
@@ -153,7 +155,7 @@ def test_published_intrinsics(source, tmp_path):
 
 def test_command_line(source, tmp_path, capsys):
     target = str(tmp_path / "dst")
-    assert main(["import", "lasersetero", str(source), target]) == 0
+    assert main(["import", "lasersetero", str(source), target, "--intrinsics", "published"]) == 0
     assert "rebuild to 0.00" in capsys.readouterr().out
     assert main(["check", target]) == 0
     (tmp_path / "dst" / "images" / "left" / "0001.png").unlink()
