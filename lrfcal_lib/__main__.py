@@ -1,7 +1,5 @@
 """``python -m lrfcal_lib VERB``: the work outside notebooks."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 

@@ -1,7 +1,5 @@
 """A recording: the events of a rig written to a session; ``python -m lrfcal_lib record`` asks for the board."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging

@@ -1,7 +1,5 @@
 """Execute the notebooks on a session and write what they found to ``reports/<session>/``."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

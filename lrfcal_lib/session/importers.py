@@ -1,7 +1,5 @@
 """Other people's recordings as sessions."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
