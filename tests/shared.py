@@ -1,8 +1,10 @@
 """What the processes of a test run share, and where things are."""
 
+import errno
 import os
 import shutil
 import time
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -32,6 +34,19 @@ def until(holds, longest_s=120.0):
     while not holds():
         assert time.monotonic() < end, "it does not happen"
         time.sleep(0.01)
+
+
+@contextmanager
+def at_write(monkeypatch, number, action):
+    """Let something happen instead of the n-th write (from 0) that is to be safe on the disk, and of all after it."""
+    fsync, left = os.fsync, iter(range(number))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", lambda handle: action() if next(left, None) is None else fsync(handle))
+        yield
+
+
+def disk_full():
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def chromium():

@@ -1,7 +1,6 @@
 """Recording: what is finished stays, the head stops whatever happens, and the checks see what is wrong."""
 
 import contextlib
-import errno
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from fake_rig import SIZE, make_rig, opened, picture, rig_data, telegram
-from shared import QUICK, campaign
+from shared import QUICK, at_write, campaign, disk_full
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.acquire import record
@@ -204,19 +203,6 @@ def test_placements_are_begun_and_finished_one_by_one(path, rig):
 
 
 # ------------------------------------------------------------------------------------------------ killed, disk full
-
-
-@contextlib.contextmanager
-def at_write(monkeypatch, number, action):
-    """Let something happen instead of the n-th write that is to be safe on the disk, counted from 0."""
-    fsync, left = os.fsync, iter(range(number))
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", lambda handle: action() if next(left, None) is None else fsync(handle))
-        yield
-
-
-def disk_full():
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.mark.parametrize("kills", [8, pytest.param(25, marks=campaign)])

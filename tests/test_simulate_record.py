@@ -1,14 +1,12 @@
 """Simulated recordings: platform, placements, the shipped sessions, and everything that can go wrong."""
 
-import errno
 import hashlib
-import os
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from shared import DATA, QUICK
+from shared import DATA, QUICK, at_write, disk_full
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.emulators.world import scaled
@@ -78,18 +76,10 @@ def test_an_existing_folder_is_left_alone(tmp_path, tiny, capsys):
     assert list((tmp_path / "s").iterdir()) == []
 
 
-@pytest.mark.parametrize("after", [1, 12])
-def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, after):
-    calls, real = [], os.fsync
-
-    def full(handle):
-        calls.append(handle)
-        if len(calls) > after:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(handle)
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(ValueError, match="No space left on device.*free some space; nothing was kept"):
+@pytest.mark.parametrize("free", [1, 12])
+def test_a_full_disk_leaves_nothing(tmp_path, tiny, monkeypatch, free):
+    message = "No space left on device.*free some space; nothing was kept"
+    with at_write(monkeypatch, free, disk_full), pytest.raises(ValueError, match=message):
         record.simulate(tmp_path / "s", tiny)
     assert list(tmp_path.iterdir()) == []
 

@@ -13,7 +13,6 @@ import select
 import termios
 import threading
 import tty
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -41,14 +40,12 @@ class SerialDevice:
 
     Attributes
     ----------
-    counts : Counter
-        Bytes 'lost' (buffer full), 'unheard' (port not open), 'garbled' (rates differ).
     error : Exception or None
         What ended the device by itself.
     """
 
     def __init__(self, path, host, seed=0):
-        self.path, self.host, self.error, self.counts = str(path), host, None, Counter()
+        self.path, self.host, self.error = str(path), host, None
         self.port = getattr(host, "terminal", Terminal)(self)  # a test's is in memory
         self._noise, self._agenda, self._order = np.random.default_rng([seed, 4]), [], itertools.count()
         self.busy_until, self._heard = 0.0, 0.0
@@ -116,15 +113,11 @@ class SerialDevice:
         """Bytes after the line; as much noise as fits into their time where its ends are set to different rates."""
         if sent == read:
             return data
-        self.counts["garbled"] += len(data)
         return self._noise.bytes(math.ceil(len(data) * read / sent) if sent else 0)
 
     def _put(self, data):
-        if not self.port.open:
-            self.counts["unheard"] += len(data)
-            return
-        data = self.through(data, self.baudrate, self.port.rate)
-        self.counts["lost"] += len(data) - self.port.put(data)
+        if self.port.open:
+            self.port.put(self.through(data, self.baudrate, self.port.rate))
 
 
 class Terminal(threading.Thread):
@@ -174,14 +167,13 @@ class Terminal(threading.Thread):
         self.open = not event & select.POLLHUP
 
     def put(self, data):
-        """Send bytes; how many went into the buffer."""
+        """Send bytes; what the buffer cannot hold is lost."""
         try:
-            return os.write(self._master, data)
+            os.write(self._master, data)
         except BlockingIOError:
-            return 0
+            pass
         except OSError:  # closed at this moment
             self.open = False
-            return len(data)
 
     def plug(self):
         """Make the pseudo-terminal and let its path point to it."""
