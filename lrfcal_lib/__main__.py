@@ -1,7 +1,5 @@
 """``python -m lrfcal_lib VERB``: the work outside notebooks."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 
@@ -15,7 +13,7 @@ def run(args):
         case "import":
             from lrfcal_lib.session.importers import import_lasersetero
 
-            miss = import_lasersetero(args.src, args.dst)
+            miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
             print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
         case "check":
             from lrfcal_lib.session.read import open_session, validate
@@ -37,21 +35,29 @@ def run(args):
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
 
-            simulate(args.dst, load_setup(args.setup), workers=2)
+            simulate(args.dst, load_setup(args.setup), workers=args.workers)
             print(f"{args.dst}: simulated")
         case "record":
             from lrfcal_lib.acquire.record import main
 
-            return main(args.rig_file, args.session, resume=args.resume)
+            return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
         case "report":
             from lrfcal_lib.report.report import main
 
-            return main(args.sessions, args.out, args.store)
+            return main(args.sessions, args.out, args.jobs, args.store)
         case "emulate":
             from lrfcal_lib.emulators.rig import main
 
-            return main(args.setup, args.rig_file)
+            return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
     return 0
+
+
+def how_many(text):
+    """A number of placements on the command line."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} placements: 1 or more are needed")
+    return value
 
 
 def parser():
@@ -63,23 +69,32 @@ def parser():
     add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
     add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m")
     add.add_argument("dst", help="folder of the new session")
+    choices = {"choices": ("own", "published"), "default": "own"}
+    add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
     simulate.add_argument("dst", help="folder of the new session")
+    simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
     record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
     record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
     record.add_argument("session", help="folder of the new session")
     record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
+    record.add_argument("--placements", type=how_many, metavar="N", help="record N placements of the plan")
+    record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
     emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
+    emulate.add_argument("--seed", type=int, default=0, help="of noise")
+    told = {"choices": ("full", "partial", "none"), "default": "full"}
+    emulate.add_argument("--feedback", **told, help="what the head tells of its position")
     report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
     report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the shipped one)")
     report.add_argument("--out", help="folder of the report (default reports/<session>)")
+    report.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
     report.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
     return top
 

@@ -153,9 +153,9 @@ class FaultyHead(FaultyLine, EmulatedHead):
     def stop(self, at):
         super().stop(at + SLIP_S * self.hit("slip"))
 
-    def tell(self, at):
+    def tell(self, opcode, at):
         if not self.hit("mute"):
-            super().tell(at)
+            super().tell(opcode, at)
 
     def prepare(self, raw):
         """A reply with the faults that keep its checksum sound."""

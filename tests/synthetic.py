@@ -1,7 +1,5 @@
 """Observations of made-up rigs with known truth, for the tests of the solvers (it shares no code with them)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

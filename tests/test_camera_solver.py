@@ -14,8 +14,7 @@ from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
 from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
-from lrfcal_lib.solvers.lines import distance_block, point_block, start_from_lines, start_from_scene
-from lrfcal_lib.solvers.planes import start_from_planes
+from lrfcal_lib.solvers.lines import distance_block, point_block
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 RESIDUALS = {"line": line_block, "wasielewski_strauss": distance_block, "bauermann": point_block}
@@ -142,14 +141,6 @@ def test_robust_loss_resists_wrong_edges():
     spoiled = replace(obs, crossing_lines=lines)
     plain, robust = (miss(solve_camera(spoiled, loss=loss), rig)[1] for loss in (None, "cauchy"))
     assert robust < 0.03 and robust < 0.5 * plain
-
-
-@pytest.mark.parametrize("start", [start_from_planes, start_from_lines, start_from_scene])
-@pytest.mark.parametrize("source", ["lrf", "platform"])
-def test_starts_without_a_guess(start, source):
-    rig, obs = camera_case(17, count=15, noise=1.0, source=source)
-    found = start(obs)
-    assert (miss(found if found.single else found[0], rig) < [0.05, 0.1]).all()
 
 
 def test_nothing_to_start_from():

@@ -70,18 +70,6 @@ def test_all_sides_have_cells_and_each_side_is_one_edge(made, found):
         assert len(set(nearest[mine])) == 1
 
 
-def test_no_spot_reaches_two_edges(made, found):
-    distance, _ = outside(made, found[1])
-    second = np.sort(distance, axis=1)[:, -2]
-    assert (second < -0.8 * found[1].radius).all()
-
-
-def test_background_follows_from_its_distance(made, found):
-    cells = found[1]
-    wall = 2 * np.log(cells.range_m / 3.5)  # the wall stands 3.5 m ahead; rays meet it at a slant
-    assert (cells.background < wall + 0.05).all() and (cells.background > wall - 0.6).all()
-
-
 def test_holes_what_hides_the_board_and_a_post_close_behind_are_left_out_but_a_close_wall_is_not(made):
     first = np.flatnonzero(made.on[75])[0]
 

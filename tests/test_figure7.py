@@ -3,7 +3,6 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from notebook_runs import NOTEBOOKS, code_cells, read
 from scipy.ndimage import map_coordinates
 from tiny_sessions import record, rectangle
 
@@ -39,10 +38,3 @@ def test_drawn_edges_lie_on_the_edges_of_the_board_in_the_drawn_image(ready):
             plt.close(fig)
     assert len(steps) >= 3 * 2 * 3
     assert min(steps) > 50  # the board is darker than the wall by 90 grey values
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_notebooks_draw_views_in_their_own_image(path):
-    for cell in code_cells(read(path)):
-        if any(f"recording.{name}(" in cell.source for name in ("board_view", "seen_points")):
-            assert "read_image(" not in cell.source, "Prepared.seen gives the view with its image"

@@ -459,26 +459,6 @@ def test_an_outline_that_no_image_shows_leaves_poses(session, monkeypatch):
         assert view.rejected == tuple((name, "the outline of the board is not known") for name in UNKNOWN.edges)
 
 
-def at_three_pitches(read, blank=()):
-    """Every picture of the left camera as three records, some of them without a board."""
-    records = [record("left", f"/s/left/{i}_{k}.png", i, p) for i in range(4) for k, p in enumerate((-0.3, 0.4, 0.1))]
-    return records, lambda r: BLANK if r.file.stem in blank else read(r)
-
-
-def one_each(records, read, board=SHEET):
-    return survey.survey(records, read, board, {"left": MODEL}, one_per_placement=True).views["left"]
-
-
-def test_one_image_a_placement_is_the_middle_one_that_shows_the_board(session):
-    records, read = at_three_pitches(session[2], {"1_2", "2_0", "2_1", "2_2"})
-    found = one_each(records, read)
-    assert [v.file for v in found] == ["0_2.png", "1_0.png", "2_2.png", "3_2.png"]
-    assert [v.reason == "" for v in found] == [True, True, False, True]
-    every = survey.survey(records[:6], read, SHEET, {"left": MODEL})
-    assert len(every.views["left"]) == 6 and every.board is SHEET and every.outline is None
-    assert [v.file for v in one_each([replace(r, pitch=np.nan) for r in records[:3]], read)] == ["0_0.png"]
-
-
 def test_surveys_that_cannot_work(session, surveyed):
     _, records, read = session
     both, triple = {"left": MODEL, "right": MODEL}, replace(UNKNOWN, edges=("a", "b", "c"))

@@ -108,6 +108,7 @@ REFUSED = [
     (lambda _: recover_polar(line(39.6)), r"bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
     (lambda folder: read_bouguet(written(folder / "c.m", "fc = [ 1 ; 2 ];\n")), r"c\.m: no value of cc, kc"),
     (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),
+    (lambda folder: import_lasersetero(folder, folder / "dst", intrinsics="best"), "'own' or 'published', got 'best'"),
     (without("plane_*"), "plane_.*"),
     (without("left_*"), "left_.*"),
     (without("Calib_Results_right.m"), "Calib_Results_right.m"),
@@ -125,9 +126,11 @@ def test_what_cannot_be_imported_is_named(source, tmp_path, work, message):
     assert not (tmp_path / "dst").exists()
 
 
-def test_import_makes_a_sound_session(source, tmp_path):
-    assert import_lasersetero(source, tmp_path / "dst") < 2e-6
-    session = open_session(tmp_path / "dst")
+def test_import_makes_a_sound_session(source, tmp_path, capsys):
+    target = tmp_path / "dst"
+    assert main(["import", "lasersetero", str(source), str(target), "--intrinsics", "published"]) == 0
+    assert "rebuild to 0.00" in capsys.readouterr().out and main(["check", str(target)]) == 0
+    session = open_session(target)
     assert session.problems == () and session.name == "dst" and session.placements == (1, 2)
     assert [c.mount for c in session.cameras.values()] == ["platform", "platform"]
     assert session.board.pattern.columns == 8 and session.board.corners is None
@@ -135,18 +138,17 @@ def test_import_makes_a_sound_session(source, tmp_path):
         assert record.purpose == "board" and np.isnan(record.pitch)
         original = source / f"{record.camera}_{record.placement:02d}.png"
         assert record.file.read_bytes() == original.read_bytes()
-    assert all(camera.model is None for camera in session.cameras.values())
-    published = session.reference["cameras"]["left"]
-    assert list(published["intrinsics"].values())[:4] == [700.5, 701.5, 15.25, 11.75]
-    np.testing.assert_allclose(list(published["intrinsics_sigma"].values())[:5], [1, 2, 0.1, 0.2, 0.001])
-    pose = transform_from_json(published["T_camera_board"]["1"])
+    model = session.cameras["left"].model
+    assert (model.fx, model.fy, model.cx, model.cy) == (700.5, 701.5, 15.25, 11.75)
+    np.testing.assert_allclose(np.sqrt(np.diag(model.covariance))[:5], [1, 2, 0.1, 0.2, 0.001])
+    pose = transform_from_json(session.reference["cameras"]["left"]["T_camera_board"]["1"])
     np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
     np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
 
 
 def test_commands_say_what_is_wrong(source, tmp_path, capsys):
-    assert main(["import", "lasersetero", str(source), str(tmp_path / "dst")]) == 0
-    assert "rebuild to 0.00" in capsys.readouterr().out and main(["check", str(tmp_path / "dst")]) == 0
+    assert import_lasersetero(source, tmp_path / "dst") < 2e-6
+    assert all(camera.model is None for camera in open_session(tmp_path / "dst").cameras.values())
     (tmp_path / "dst" / "images" / "left" / "0001.png").unlink()
     assert main(["check", str(tmp_path / "dst")]) == 1
     assert "0001.png" in capsys.readouterr().out

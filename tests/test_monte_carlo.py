@@ -8,7 +8,7 @@ from joint_draws import MOUNTS, draw, none
 from notebook_runs import GOLDEN
 from shared import campaign
 
-from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, spread
+from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo
 from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
@@ -42,17 +42,6 @@ def test_wrong_covariances_fail(scale):
     assert row.nees == pytest.approx(scale**2, rel=0.1) and not row.nees_low <= row.nees <= row.nees_high
     assert not row.coverage_low <= row.coverage <= row.coverage_high
     assert row.rmse_over_crb == pytest.approx(scale, rel=0.1)
-
-
-def test_units():
-    trials = normal_trials(np.random.default_rng(0))
-    wide = consistency(trials)
-    assert wide.unit.tolist() == ["deg", "deg", "mm", "mm", ""]
-    turn = np.degrees(np.sqrt(np.mean(np.sum(trials.errors[:, :2] ** 2, axis=1))))
-    assert wide.rmse[0] == pytest.approx(turn)
-    found = spread(np.diag(np.square([0.003, 0.004, 0.02, 0.005, 0.001])), NAMES)  # the root of the trace
-    expected = {"axis direction": np.degrees(0.005), "left rotation": np.degrees(0.02)}
-    assert found == pytest.approx(expected | {"left translation": 5.0, "range offset": 1.0})
 
 
 def test_bad_trials_are_refused():

@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.evaluate.uncertainty import SigmaMap
-from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel, pinhole, project, undistort
 from lrfcal_lib.plots import recording, results, rig
 from lrfcal_lib.session.read import Sweep
@@ -121,19 +120,6 @@ def test_board_view_is_cut_to_the_board_and_names_what_is_missing(ax):
     recording.board_view(ax, np.zeros((480, 640, 3), np.uint8), view, MODEL, margin=20)
     assert lines_of(ax, "right") and ax.get_title() == "right, placement 3; not used: top"
     assert ax.get_xlim()[1] == pytest.approx(320.0) and falls(ax.get_ylim())
-
-
-def test_dark_pictures_are_brightened_and_say_so(ax):
-    recording.picture(ax, np.full((8, 8, 3), [10, 20, 50], np.uint8))
-    assert ax.images[0].get_array()[0, 0].tolist() == [150, 60, 30] and texts(ax.texts) == ["brightened 3.0 times"]
-
-
-def test_board_plan_has_sizes_and_squares_where_they_are(ax):
-    board = Board("b", ("ab", "bc", "ca"), np.array([[0, 0], [0.3, 0], [0, 0.4]]), Chessboard(3, 2, 0.05, (0.06, 0.06)))
-    recording.board_plan(ax, board)
-    assert texts(ax.texts) == ["AB 300.0 mm", "BC 500.0 mm", "CA 400.0 mm"] and ax.get_aspect() == 1
-    squares = np.array([p.get_xy() for p in ax.patches[1:]])
-    assert len(squares) == 6 and np.allclose(squares.min(axis=0), 0.01), "half of 4 x 3, one square before the first"
 
 
 def test_feature_surfaces_lie_where_the_feature_puts_them():

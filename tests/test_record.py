@@ -336,9 +336,20 @@ def at_scan(rig, number, action):
 
 
 def test_a_recording_by_command(run, path):
-    code, said, _ = run("", "", "q")
+    code, said, _ = run("", "", count=2)
     assert code == 0 and "placements 1, 2 are safe; 'python -m lrfcal_lib calibrate" in said
     assert run("", resume=True)[0] == 0 and open_session(path).placements == (1, 2, 3)
+
+
+def test_options_of_the_command_line_reach_the_recording(monkeypatch, capsys):
+    got = {}
+    monkeypatch.setattr(record, "main", lambda *args, **options: got.update(options, args=args) or 0)
+    line = ["record", "rig.json", "s", "--resume", "--mode", "continuous", "--placements"]
+    assert command_line.main([*line, "3"]) == 0
+    assert got == {"args": ("rig.json", "s"), "resume": True, "count": 3, "mode": "continuous"}
+    with pytest.raises(SystemExit):
+        command_line.main([*line, "0"])
+    assert "1 or more are needed" in capsys.readouterr().err
 
 
 def interrupt():

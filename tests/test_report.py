@@ -16,9 +16,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from shared import ROOT
-from test_session import wall, write
+from test_session import CAMERAS, HEAD, LRF, wall
 
+from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.report import notebook, report
+from lrfcal_lib.session.write import SessionWriter
 
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 GOOD = """
@@ -53,7 +55,10 @@ print("x" * 300)
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A recording of one flat wall."""
-    return write(tmp_path_factory.mktemp("sessions") / "wall", wall(), simulated=True)
+    path, about = tmp_path_factory.mktemp("sessions") / "wall", {"licence": "CC0", "source": "a test"}
+    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, simulated=True, **about) as writer:
+        writer.add_sweep(1, *wall())
+    return path
 
 
 def write_notebook(path, *cells):

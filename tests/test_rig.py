@@ -41,7 +41,8 @@ def test_a_rig_file_is_read(tmp_path):
     rig = read(tmp_path, rig_data(cameras=("left", "right"), mode="continuous"))
     assert rig.devices.lrf.port == "/dev/fake_lrf" and rig.devices.head.port == "/dev/fake_head"
     assert list(rig.cameras) == list(rig.devices.cameras) == ["left", "right"]
-    assert rig.plan.mode == "continuous" and rig.devices.control is None
+    assert rig.plan.mode == "continuous" and rig.with_mode("stop-and-go").plan.mode == "stop-and-go"
+    assert rig.with_mode(None) is rig and rig.devices.control is None
 
 
 WRONG = {
@@ -104,10 +105,9 @@ def test_no_rig_file(tmp_path, made, message):
 
 
 def test_interlaced_scans_need_a_head_at_rest(tmp_path):
-    data = changed("devices.lrf.interlaced", True)
-    data["plan"]["mode"] = "continuous"
+    stated = read(tmp_path, changed("devices.lrf.interlaced", True))
     with pytest.raises(RigFileError, match=r"devices\.lrf\.interlaced is true"):
-        read(tmp_path, data)
+        stated.with_mode("continuous")
 
 
 @pytest.mark.parametrize(("step", "stops"), [(0.1, 151), (0.3, 51), (1, 16), (2.5, 7), (7, 4), (100, 2)])

@@ -1,7 +1,5 @@
 """Is what was just recorded any good? Lights for one placement of the board, from what is on the disk."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """What the panel does, without any widget: one rig, one recording, one thing at a time."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

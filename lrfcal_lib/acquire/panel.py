@@ -1,7 +1,5 @@
 """The data collection panel: words, pictures, widgets, and what buttons do."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

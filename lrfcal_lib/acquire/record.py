@@ -1,7 +1,5 @@
 """A recording: the events of a rig written to a session; ``python -m lrfcal_lib record`` asks for the board."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging
@@ -44,6 +42,8 @@ class Recording(Closed):
         Folder of the session.
     resume : bool
         Go on with the recording in `path` if there is one: its finished placements stay.
+    count : int, optional
+        Record only so many placements of the plan.
 
     Raises
     ------
@@ -66,8 +66,8 @@ class Recording(Closed):
 
     finished = property(lambda self: self.writer.finished, doc="Numbers of the placements that are complete and safe.")
 
-    def __init__(self, rig, path, *, resume=False):
-        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(), rig.stated
+    def __init__(self, rig, path, *, resume=False, count=None):
+        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(count), rig.stated
         reference = {
             "recording": HOW[stated.plan.mode],
             "pitch": "told by the head" if rig.head.has_feedback else "dead reckoning: the head does not tell it",
@@ -213,19 +213,19 @@ def show(light, name=None):
     print(f"{MARKS[light.state]}  {name or light.name}: {light.text}", flush=True)
 
 
-def record_session(rig, path, *, resume=False):
+def record_session(rig, path, *, resume=False, count=None):
     """Record a session with an open rig, from the first placement that is missing to the last of the plan.
 
     Parameters
     ----------
-    rig, path, resume
+    rig, path, resume, count
         As of :class:`Recording`, which is returned: finished, with all placements or those that the user wanted.
 
     Raises
     ------
     DeviceError, SessionError, RecordingError
     """
-    with Recording(rig, path, resume=resume) as recording:
+    with Recording(rig, path, resume=resume, count=count) as recording:
         if recording.finished:
             print(f"{path}: going on, {recording.safe()}", flush=True)
         try:
@@ -275,16 +275,16 @@ def _placements(recording):
             show(light)
 
 
-def main(rig_file, path, *, resume=False):
-    """Record from the command line; options as of :func:`record_session`.
+def main(rig_file, path, *, resume=False, count=None, mode=None):
+    """Record from the command line; options as of :func:`record_session`, `mode` instead of the plan's.
 
     0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal. The head
     is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
-        with Rig.open(read_rig_file(rig_file)) as rig:
-            recording = record_session(rig, path, resume=resume)
+        with Rig.open(read_rig_file(rig_file).with_mode(mode)) as rig:
+            recording = record_session(rig, path, resume=resume, count=count)
     except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
         text, code = f"error: {error}", FAILED
         if isinstance(error, KeyboardInterrupt):

@@ -1,7 +1,5 @@
 """One answer for the outline of a board: all that is known of a placement, each weighted by what it is worth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

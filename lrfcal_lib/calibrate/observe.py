@@ -1,7 +1,5 @@
 """Pair what the LRF and the cameras saw: name the sides that scans cross, stack the observations of every method."""
 
-from __future__ import annotations
-
 from itertools import combinations, product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Edge lengths of boards in the cloud: by least squares, by likelihood, and with the edges that images show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

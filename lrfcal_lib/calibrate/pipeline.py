@@ -1,7 +1,5 @@
 """The stages in order, each one call: prepare a session, calibrate platform, cameras, and everything at once."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial

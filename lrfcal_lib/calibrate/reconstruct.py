@@ -1,7 +1,5 @@
 """Sweeps, images and a calibration make a coloured cloud, block by block: any number of points in bounded memory."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace

@@ -51,6 +51,7 @@ class Closed(AbstractContextManager):
 
 
 _moving_things = weakref.WeakSet()
+_before = {}
 
 
 def guard(device):
@@ -58,11 +59,18 @@ def guard(device):
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP: go on
-                signal.signal(number, _on_signal)
+            if signal.getsignal(number) not in (_on_signal, signal.SIG_IGN):  # nohup ignores SIGHUP: go on
+                _before[number] = signal.signal(number, _on_signal)
 
 
-release = _moving_things.discard
+def release(device):
+    """Forget a device that was closed."""
+    _moving_things.discard(device)
+    if not _moving_things and threading.current_thread() is threading.main_thread():
+        while _before:
+            number, handler = _before.popitem()
+            if signal.getsignal(number) is _on_signal:
+                signal.signal(number, handler or signal.SIG_DFL)
 
 
 def _stop_all():
@@ -71,9 +79,13 @@ def _stop_all():
 
 
 def _on_signal(number, frame):
-    """Stop; what would kill becomes an exit that closes files."""
+    """Stop, then do what would have been done; what would kill becomes an exit that closes files."""
     _stop_all()
-    raise SystemExit(128 + number)
+    before = _before.get(number)
+    if callable(before):
+        before(number, frame)
+    elif before != signal.SIG_IGN:
+        raise SystemExit(128 + number)
 
 
 atexit.register(_stop_all)

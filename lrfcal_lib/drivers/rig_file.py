@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -263,6 +263,10 @@ class RigFile:
                 f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the head at rest, "
                 "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
             )
+
+    def with_mode(self, mode):
+        """The same with another mode of the plan (None: its own)."""
+        return self if mode is None else replace(self, plan=self.plan.model_copy(update={"mode": mode}))
 
 
 def read_rig_file(path):

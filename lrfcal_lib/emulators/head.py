@@ -16,6 +16,7 @@ WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed
 WOBBLE_HZ = 4.0
 KEPT = 2000  # pieces of motion; ten times as many frames
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
+ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}  # to queries of pan, tilt, zoom, magnification
 FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
 
 
@@ -160,8 +161,8 @@ class EmulatedHead(SerialDevice):
         self.cancel("watchdog")
         if self.watchdog_s:
             self.at(at + self.watchdog_s, self.stop, "watchdog")
-        if frame.command2 == QUERY_TILT:
-            return self.tell(at)
+        if frame.command2 in ANSWERS:
+            return self.tell(frame.command2, at)
         head, way = self.head, {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
         if not frame.command2 & 1:
             if way is None:  # without a direction it is a stop whatever the speeds say
@@ -183,9 +184,9 @@ class EmulatedHead(SerialDevice):
         self.absolute_until = -math.inf
         self.head.stop(at)
 
-    def tell(self, at):
+    def tell(self, opcode, at):
         """Answer a query, unless the head is too busy or does not know how."""
         busy = at < self.absolute_until or (self.feedback == "partial" and self.head.moving(at))
         if self.feedback != "none" and not busy:
-            tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at))
-            self.reply(encode_extended(self.address, TILT, tilt), at + TURN_AROUND_S)
+            tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at)) if opcode == QUERY_TILT else 0
+            self.reply(encode_extended(self.address, ANSWERS[opcode], tilt), at + TURN_AROUND_S)

@@ -81,14 +81,23 @@ class EmulatedRig:
         return self.lrf.error or self.pan_tilt.error
 
     def plan(self):
-        """What a recording of this rig can do: each of its placements."""
+        """What a recording of this rig can do: the sweep that holds all placements, and each of them."""
         setup, each = self.setup, []
         for p in self.world.placements.values():
             board = p.T_platform_board is not None
             step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
             sweep, images = (np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch))
             each.append({"number": p.number, "board": board, "pitch_deg": [*sweep, step], "image_pitch_deg": images})
-        return {"mode": "stop-and-go", "intrinsics_images": setup.intrinsics_views, "placements": each}
+        boards = [p for p in each if p["board"]] or each
+        ends = np.array([p["pitch_deg"][:2] for p in boards])
+        return {
+            "mode": "stop-and-go",
+            "scans_per_stop": 1,
+            "intrinsics_images": setup.intrinsics_views,
+            "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), math.degrees(setup.step)],
+            "image_pitch_deg": np.unique(np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))).tolist(),
+            "placements": each,
+        }
 
     def rig_file(self):
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
@@ -155,7 +164,7 @@ def quick_file(rig):
     return data
 
 
-def main(name, rig_file=None):
+def main(name, rig_file=None, *, seed=0, feedback="full"):
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
 
     Its rig file is written where it is asked for, and removed at the end. ValueError for a set-up that there is not.
@@ -165,7 +174,7 @@ def main(name, rig_file=None):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
                 stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
-        rig = stack.enter_context(EmulatedRig(load_setup(name)))
+        rig = stack.enter_context(EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback}))
         if rig_file is not None:
             stack.callback(Path(rig_file).unlink, missing_ok=True)
             Path(rig_file).write_text(json.dumps(rig.rig_file(), indent=1) + "\n")

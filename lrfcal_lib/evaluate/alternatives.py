@@ -1,7 +1,5 @@
 """What else could be wrong: statements tested one by one against the data, with words that name cause and remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What is wrong with a recording, as tables and in words: cameras that moved, boards that bend, a pitch that is off."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

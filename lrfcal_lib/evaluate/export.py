@@ -1,7 +1,5 @@
 """Calibrations and clouds on disk: ``calibration.json``, PLY, PCD."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Monte-Carlo trials of the joint estimate and of every method on single shots, beside bound and truth."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What a joint estimate knows badly, and which of the placements that a rig could record next would help most."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """How good a coloured scene is: predicted sigma of its points, flatness of a wall, errors against a simulated room."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables that judge calibrations, the joint estimate among them, and the truth of simulated sessions."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import suppress

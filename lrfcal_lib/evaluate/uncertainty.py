@@ -3,8 +3,6 @@
 What counts is relative to the head at the pitch of the image: a point measured at that pitch owes nothing to the axis.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Can this calibration be trusted, for what error, and what to record next: the first page of a report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from itertools import product
 

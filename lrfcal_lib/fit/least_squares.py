@@ -11,8 +11,6 @@ whitening takes the bias out. To first order it is the Jacobian at the point mov
 hands over as `corrected`. Robust weights are frozen while a step is judged and renewed for the next one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Residuals with analytic Jacobians: beams about edges, lines of sight, planes, views, priors; padded by placement."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property

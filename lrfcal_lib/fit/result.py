@@ -1,7 +1,5 @@
 """What every solver hands back, and the names of unknowns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

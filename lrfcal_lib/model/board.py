@@ -1,7 +1,5 @@
 """The calibration board: outline, edges, printed pattern."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

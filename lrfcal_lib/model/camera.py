@@ -1,7 +1,5 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

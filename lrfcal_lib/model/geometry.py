@@ -1,7 +1,5 @@
 """From polar measurements to points, the tilt of the platform, lines and planes, poses as arrays, motions in words."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What solvers take: of one camera and the LRF, and of a whole rig at once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np

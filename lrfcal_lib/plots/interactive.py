@@ -1,7 +1,5 @@
 """A scene to turn in a browser: points, frames, the tilt axis, boards and camera frusta in one offline page."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lrfcal_lib.plots.recording import AXES_RGB, COLORS, color_of

@@ -1,7 +1,5 @@
 """Figures of what was recorded: scans, range images, pictures, edges; and one colour for each sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.patches import Rectangle
 

@@ -1,7 +1,5 @@
 """Figures of results: bars, strips, maps, uncertainty, diagnosis."""
 
-from __future__ import annotations
-
 import textwrap
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drawings in space, and coloured clouds as a camera sees them."""
 
-from __future__ import annotations
-
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial.transform import RigidTransform, Rotation

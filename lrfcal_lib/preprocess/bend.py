@@ -6,8 +6,6 @@ A pitch that is recorded too small by a share s makes a flat board look bent by 
 over 0.86 m at 1.4 m are 6.6 mm. The corners of a printed pattern in the images tell such a scan from a bent board.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The board in one image: its pose and its straight outer edges, with a pattern or plain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

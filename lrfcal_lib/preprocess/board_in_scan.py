@@ -1,7 +1,5 @@
 """The board in the range image of a sweep: pieces without a jump, planes, a median filter, lines."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

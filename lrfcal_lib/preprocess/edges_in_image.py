@@ -1,7 +1,5 @@
 """Straight edges in an image at sub-pixel level: profiles, votes, a robust line fit; the wide search."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Where the board's edges cross the scan: edge points with covariance, straight sides, beams about them, background."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

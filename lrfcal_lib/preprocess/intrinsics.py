@@ -1,7 +1,5 @@
 """From a chessboard's corners in images: poses, intrinsics, the mounting of cameras, the waves of the sheet."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """The printed chessboard in an image: its inner corners at sub-pixel level, and the orders that they may have."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

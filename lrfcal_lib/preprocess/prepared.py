@@ -1,7 +1,5 @@
 """A session after preprocessing: the board in every sweep and image, and what could not be used."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Did a camera that is fixed to the base stand still while the board was carried about?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

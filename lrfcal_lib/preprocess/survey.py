@@ -1,7 +1,5 @@
 """What the cameras of a session see of the board: intrinsics, poses, turns, edges, the outline that nobody measured."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import PurePath
@@ -27,24 +25,6 @@ SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the o
 
 
 @dataclass(frozen=True)
-class Survey:
-    """The board in all images of a session.
-
-    `views` (lists of BoardView) and `models` are by camera. `outline` is None where the board is known or has no
-    pattern; `board` has corners, unless the images do not show them. `relief` (k,) are the heights of the pattern's
-    corners over the sheet's mean plane, metres. `unseen` tells why the outline of the board is not known; its views
-    have poses then and no edges.
-    """
-
-    views: dict
-    models: dict
-    outline: Outline | None
-    board: Board
-    relief: np.ndarray | None = field(default=None, repr=False)
-    unseen: str = ""
-
-
-@dataclass(frozen=True)
 class Outline:
     """The outer edges of a board, measured in the scale of its pattern.
 
@@ -67,6 +47,24 @@ class Outline:
     line_sd: np.ndarray
     length_sd: dict
     n_lengths: dict
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The board in all images of a session.
+
+    `views` (lists of BoardView) and `models` are by camera. `outline` is None where the board is known or has no
+    pattern; `board` has corners, unless the images do not show them. `relief` (k,) are the heights of the pattern's
+    corners over the sheet's mean plane, metres. `unseen` tells why the outline of the board is not known; its views
+    have poses then and no edges.
+    """
+
+    views: dict
+    models: dict
+    outline: Outline | None
+    board: Board
+    relief: np.ndarray | None = field(default=None, repr=False)
+    unseen: str = ""
 
 
 def views_of(session, models=None, *, one_per_placement=False):

@@ -4,8 +4,6 @@ Nothing is written outside a report run (:mod:`lrfcal_lib.report.report`), which
 session), ``LRFCAL_REPORT`` (takes ``figures/``, ``tables/`` and ``parts/``) and ``LRFCAL_NOTEBOOK`` (a name in these).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Pages out of executed notebooks: formulas that any browser draws, code folded, figures and tables numbered."""
 
-from __future__ import annotations
-
 import base64
 import html
 import re

@@ -1,7 +1,5 @@
 """Execute the notebooks on a session and write what they found to ``reports/<session>/``."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -59,7 +57,7 @@ class Run:
     notebook: nbformat.NotebookNode
 
 
-def make_report(session_path, out=None, notebooks=None):
+def make_report(session_path, out=None, jobs=2, notebooks=None):
     """Execute the notebooks on a session and write the report.
 
     Parameters
@@ -70,6 +68,8 @@ def make_report(session_path, out=None, notebooks=None):
         Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and takes
         its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that are no
         report's are kept.
+    jobs : int
+        Notebooks executed at the same time.
     notebooks : sequence of path, optional
         All of ``notebooks/`` unless given.
 
@@ -86,7 +86,7 @@ def make_report(session_path, out=None, notebooks=None):
     paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
     with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
-        runs = _execute_all(paths, environment)
+        runs = _execute_all(paths, environment, jobs)
         found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
         found |= {part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")}
         shutil.rmtree(new / "parts")
@@ -140,7 +140,7 @@ def store(path, session_path, cache=""):
     return ""
 
 
-def main(sessions=(), out=None, stored=False):
+def main(sessions=(), out=None, jobs=2, stored=False):
     """Report on sessions, or store the notebooks as run on them; the shipped one where none is named.
 
     0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it.
@@ -149,7 +149,7 @@ def main(sessions=(), out=None, stored=False):
     before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
         sessions = [Path(path) for path in sessions] or [SHIPPED]
-        return max(_store_all(session) if stored else _report(session, out) for session in sessions)
+        return max(_store_all(session) if stored else _report(session, out, jobs) for session in sessions)
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
@@ -169,9 +169,9 @@ def _stop(number, frame):
     raise KeyboardInterrupt(number)
 
 
-def _report(session, out):
+def _report(session, out, jobs):
     begin, out = time.monotonic(), Path(out or ROOT / "reports" / session.resolve().name).resolve()
-    runs = make_report(session, out)
+    runs = make_report(session, out, jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
         print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
@@ -216,9 +216,9 @@ def _take_place(new, out):
     new.rename(out)
 
 
-def _execute_all(paths, environment):
+def _execute_all(paths, environment, jobs):
     """Execute notebooks side by side; the bar shows on a terminal only."""
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:

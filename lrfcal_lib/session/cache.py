@@ -6,8 +6,6 @@ Results are pickles: they hold nested dataclasses with arrays and transforms of 
 short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root).
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

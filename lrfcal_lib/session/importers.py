@@ -1,7 +1,5 @@
 """Other people's recordings as sessions."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
+from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import image_size
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, read_bytes, reading, transform_to_json
@@ -27,14 +26,16 @@ LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijin
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
 
 
-def import_lasersetero(src, dst):
+def import_lasersetero(src, dst, *, intrinsics="own"):
     """Make a session `dst` of the public LMS400 + ZED recording.
 
     Parameters
     ----------
     src : path-like
         Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and ``Calib_Results_{left,right}.m``.
-        The intrinsics are estimated from the images; those of the Bouguet results are kept in the session's reference.
+    intrinsics : {'own', 'published'}
+        'own' leaves the intrinsics open, so that they are estimated from the session's images; 'published' takes them
+        from the Bouguet results. Either way the published ones are kept in the session's reference.
 
     Returns
     -------
@@ -46,12 +47,15 @@ def import_lasersetero(src, dst):
     SessionError
         For missing or truncated files, an existing target, or if rebuilding misses by more than 0.01 mm.
     """
+    if intrinsics not in ("own", "published"):
+        raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
     clouds = numbered(src, "plane_*.pcd")
     published = {name: read_bouguet(Path(src) / f"Calib_Results_{name}.m") for name in ("left", "right")}
     images = {name: numbered(src, f"{name}_*.png") for name in published}
     first = {name: next(iter(files.values())) for name, files in images.items()}
     sizes = {name: image_size(file, read_bytes(file)) for name, file in first.items()}
-    cameras = [CameraInfo(name, "platform", *sizes[name]) for name in published]
+    models = {name: result["model"] if intrinsics == "published" else None for name, result in published.items()}
+    cameras = [CameraInfo(name, "platform", *sizes[name], models[name]) for name in published]
     edges, view = ("top", "right", "bottom", "left"), tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG]))
     board = Board("chessboard 9 x 7", edges, None, Chessboard(8, 6, 0.0775), ("left", "top"))
     lrf = LrfInfo("SICK LMS400", view, np.radians(STEP_DEG), 0.005, 0.0, COUNT, 3.0)
@@ -63,7 +67,7 @@ def import_lasersetero(src, dst):
         "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes).",
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
         "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
-        "cameras": published,
+        "cameras": {name: result["reference"] for name, result in published.items()},
     }
     about = {"licence": "none stated by the authors", "source": LASERSETERO, "reference": reference}
     about["platform_sigma"] = LASERSETERO_PLATFORM_SIGMA
@@ -171,10 +175,11 @@ def read_bouguet(file):
     """
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
-    need = ("fc", "cc", "kc", "fc_error", "cc_error", "kc_error")
+    need = ("fc", "cc", "kc", "nx", "ny", "fc_error", "cc_error", "kc_error")
     if lacking := [key for key in need if key not in values]:
         raise SessionError(f"{file}: no value of {', '.join(lacking)}; is this a Calib_Results.m?")
     intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
+    model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
     poses = {}
     for key in values:
         if (number := re.fullmatch(r"omc_(\d+)", key)) and f"Tc_{number[1]}" in values:
@@ -182,4 +187,5 @@ def read_bouguet(file):
             poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
     both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
-    return {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
+    reference = {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
+    return {"model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)), "reference": reference}

@@ -1,7 +1,5 @@
 """Telegrams of the SICK LMS2xx: bytes to values and back, without a port."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

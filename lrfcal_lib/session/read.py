@@ -1,7 +1,5 @@
 """Open a session, check it, and hand out its sweeps and images."""
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass, field

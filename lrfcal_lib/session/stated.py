@@ -1,7 +1,5 @@
 """session.json and how files of a session are opened: within its folder, bounded, by one writer at a time."""
 
-from __future__ import annotations
-
 import csv
 import fcntl
 import html

@@ -1,7 +1,5 @@
 """Scan lines out of recorded telegrams: lrf/telegrams.bin (bytes as the device sent them) and lrf/index.csv."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write a session so that a crash loses at most what was being written, placement by placement."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

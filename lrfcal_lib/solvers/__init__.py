@@ -1,7 +1,5 @@
 """Calibration methods of one camera on one least-squares core: the same observations in, a `Solution` out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

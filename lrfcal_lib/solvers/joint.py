@@ -1,7 +1,5 @@
 """One maximum-likelihood estimate of the whole rig from ranges, edges and images at all pitch angles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Noise levels of the joint estimate, the share of the intrinsics, misfits, and what is suspicious, in words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

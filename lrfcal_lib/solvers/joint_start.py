@@ -1,7 +1,5 @@
 """Start values of the joint estimate from closed forms: cameras from planes, the axis from how the cameras turn."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Residuals of cameras from lines (eqs. 16-21), by likelihood, after Wasielewski and Strauss, after Bauermann."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve

@@ -1,7 +1,5 @@
 """Errors of the recorded pitch, found from the boards that cameras on the base see."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import reduce
 

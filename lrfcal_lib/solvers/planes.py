@@ -1,7 +1,5 @@
 """Cameras from planes (Zhang and Pless 2004): compressed points, closed form, refinement, intrinsics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 from math import comb

@@ -1,7 +1,5 @@
 """The tilt axis from edges swept at known pitch angles (eqs. 1-15): in space, and projected as printed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 
