@@ -14,7 +14,7 @@ from lrfcal_lib.calibrate.outline import as_recorded, measure_board
 from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
@@ -23,6 +23,7 @@ from lrfcal_lib.simulate.rig import load_setup
 from lrfcal_lib.simulate.scene import World
 
 MODEL = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
+WIDE = CameraModel(64, 48, 22.0, 22.0, 31.5, 23.5, np.array([-0.25, 0.02, 0.0, 0.0, 0.0]))  # 110 deg, folds
 STILL = RigidTransform.identity()
 AHEAD = RigidTransform.from_rotation(Rotation.from_matrix([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))  # looks along y
 STEP = np.radians(0.25)
@@ -48,6 +49,43 @@ def paint(points, *views, step=0.04, noise=0.03):
     painter = rec.Painter(views, step, noise)
     painter.hide(points)
     return painter.paint(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
+
+
+def plainly(points, normals, seen_from, step, noise):
+    """What the compiled loops do, in NumPy, for one view."""
+    model, p = seen_from.model, seen_from.T_camera_platform.apply(points)
+    uv, distance, cell = project(p, model), np.linalg.norm(p, axis=1), max(2.0, 2 * step * model.fx)
+    inside = np.all((uv >= -0.5) & (uv < [model.width - 0.5, model.height - 0.5]), axis=1)
+    inside &= (p[:, :2] ** 2).sum(axis=1) < rec.fold(model) * p[:, 2] ** 2
+    index = (np.where(inside[:, None], uv + 0.5, 0) // cell).astype(int) @ [1, 1000]
+    nearest = np.full(100_000, np.inf)
+    np.minimum.at(nearest, index[inside], distance[inside])
+    cosine = np.clip(np.abs(np.sum(seen_from.T_camera_platform.rotation.apply(normals) * p, axis=1)) / distance, 0.1, 1)
+    slack = noise + cell / model.fx * distance * np.sqrt(1 - cosine**2) / cosine
+    seen = inside & (distance <= nearest[index] + slack)
+    u, v = np.clip(uv[seen], 0, [model.width - 1, model.height - 1]).T
+    i, j = np.minimum(v.astype(int), model.height - 2), np.minimum(u.astype(int), model.width - 2)
+    f, g, image = (u - j)[:, None], (v - i)[:, None], seen_from.image.astype(float)
+    top, low = image[i, j] * (1 - f) + image[i, j + 1] * f, image[i + 1, j] * (1 - f) + image[i + 1, j + 1] * f
+    return seen, (top * (1 - g) + low * g)[:, ::-1]
+
+
+@pytest.mark.parametrize("model", [MODEL, WIDE])
+def test_compiled_loops_do_what_plain_numpy_does(model):
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-2, -2, -1], [2, 2, 4], (20_000, 3)).astype(np.float32).astype(float)
+    normals = rng.normal(size=points.shape).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.1, 0.2, 0]))
+    one = view(rng.integers(10, 240, (48, 64, 3)), model, turned)
+    painter = rec.Painter([one], 0.02, 0.03)
+    painter.hide(points)
+    colors, seen, source = painter.paint(points, normals)
+    expected, their_colors = plainly(points, normals, one, 0.02, 0.03)
+    assert (seen != expected).sum() <= 2  # a rounding at the border of a cell
+    both = seen[expected]
+    np.testing.assert_allclose(colors[expected][both], their_colors[both], atol=0.01)
+    assert (source[seen] == 0).all() and (source[~seen] == -1).all() and 500 < seen.sum() < 15_000
 
 
 def test_exposures_are_compared_and_taken_off():
