@@ -36,24 +36,18 @@ def wall(lines=3):
     return ranges, BEARINGS, np.radians(np.linspace(-1, 1, lines))
 
 
-def write(path, *sweeps, **options):
-    """A session of sweeps as :func:`wall` gives them, or of two sweeps and five images."""
-    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, licence="CC0", source="a test", **options) as writer:
-        for number, sweep in enumerate(sweeps, 1):
-            writer.add_sweep(number, *sweep)
-        if not sweeps:
-            writer.add_sweep(1, *wall())
-            writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
-            for camera in ("left", "right"):
-                writer.add_image(camera, pixels(1), 1, pitch=0.1)
-                writer.add_image(camera, pixels(2), 2, time_s=3.5)
-            writer.add_image("left", pixels(3), purpose="intrinsics")
-    return path
-
-
 @pytest.fixture(scope="module")
 def written_once(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("sessions") / "trip")
+    """Two sweeps and five images."""
+    path, about = tmp_path_factory.mktemp("sessions") / "trip", {"licence": "CC0", "source": "a test"}
+    with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, **about) as writer:
+        writer.add_sweep(1, *wall())
+        writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
+        for camera in ("left", "right"):
+            writer.add_image(camera, pixels(1), 1, pitch=0.1)
+            writer.add_image(camera, pixels(2), 2, time_s=3.5)
+        writer.add_image("left", pixels(3), purpose="intrinsics")
+    return path
 
 
 @pytest.fixture
