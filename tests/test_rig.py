@@ -37,18 +37,9 @@ def read(tmp_path, data):
     return read_rig_file(file)
 
 
-def test_a_rig_file_is_read(tmp_path):
-    rig = read(tmp_path, rig_data(cameras=("left", "right"), mode="continuous"))
-    assert rig.devices.lrf.port == "/dev/fake_lrf" and rig.devices.head.port == "/dev/fake_head"
-    assert list(rig.cameras) == list(rig.devices.cameras) == ["left", "right"]
-    assert rig.plan.mode == "continuous" and rig.with_mode("stop-and-go").plan.mode == "stop-and-go"
-    assert rig.with_mode(None) is rig and rig.devices.control is None
-
-
 WRONG = {
     r"devices\.lrf\.port is missing": ("devices.lrf.port", None),
     r"lrf\.port and head\.port are both /dev/fake_lrf": ("devices.head.port", "/dev/fake_lrf"),
-    r"devices\.head is 7: an object": ("devices.head", 7),
     r"devices\.head: adress is not known; known are address, .*port": ("devices.head.adress", 1),
     r"devices\.head\.tilt_speed is 99: a whole number from 0 to 63": ("devices.head.tilt_speed", 99),
     r"devices\.head\.address is 'one': a whole number from 0 to 255": ("devices.head.address", "one"),
@@ -56,24 +47,17 @@ WRONG = {
     r"devices\.lrf\.unit is 'inch': 'mm' or 'cm'": ("devices.lrf.unit", "inch"),
     r"devices\.lrf\.variant is 180: a valid tuple": ("devices.lrf.variant", 180),
     r"devices\.lrf\.baudrate is 300: 9600, 19200, 38400 or 500000": ("devices.lrf.baudrate", 300),
-    r"devices\.cameras\.left: focus is not known": ("devices.cameras.left.focus", 3),
     r"devices\.cameras\.left\.size is \[640, 480\], rig\.cameras\.left states \[32, 24\]":
         ("devices.cameras.left.size", [640, 480]),
     r"devices\.cameras are none, rig\.cameras left": ("devices.cameras", {}),
     r"plan\.mode is 'fast': 'stop-and-go' or 'continuous'": ("plan.mode", "fast"),
-    r"plan\.count is True": ("plan.count", True),
     r"plan\.pitch_deg is \[-4, 4, 0\]: first, last, and a step of 0\.001 or more": ("plan.pitch_deg", [-4, 4, 0]),
     r"plan\.pitch_deg is \[-4, 4\]: a list of 3": ("plan.pitch_deg", [-4, 4]),
-    r"plan\.pitch_deg is \[0, 0, 1\]": ("plan.pitch_deg", [0, 0, 1]),
-    r"plan\.image_pitch_deg is '0'": ("plan.image_pitch_deg", "0"),
     r"plan\.image_pitch_deg\.0 is 'up': a number from -180 to 180 deg": ("plan.image_pitch_deg", ["up"]),
     r"placement 1 asks for a pitch of -4 to 90 deg, .*pitch_limits_deg are -60 to 60": ("plan.image_pitch_deg", [90]),
-    r"plan\.placements\.0\.number is -3": ("plan.placements", [{"number": -3}]),
-    r"plan\.placements\.0: pitch is not known": ("plan.placements", [{"pitch": 3}]),
     r"plan: placements: numbers must differ, got \[1, 1\]": ("plan.placements", [{"number": 1}, {"number": 1}]),
     r"square_m": ("board.pattern.square_m", -1),
     r"board is missing": ("board", None),
-    r"rig\.lrf\.sigma_range_m is missing": ("rig.lrf.sigma_range_m", None),
     r"rig\.platform is \[\]: an object": ("rig.platform", []),
     r"more than 10000000 bytes": ("source", "x" * 10_000_000),
 }  # fmt: skip

@@ -163,21 +163,16 @@ def test_scan_lines_that_cannot_be_used_are_listed(path):
 
 CHANGES = [  # place in session.json, what stands there instead ("gone": nothing), message
     ("schema", "lrfcal-session/9", "schema is 'lrfcal-session/9', this version reads"),
-    ("schema", "gone", "schema is None"),
     ("board", "gone", "json: board is missing"),
-    ("rig.cameras", "gone", r"rig\.cameras is missing"),
     ("name", "../up", "name is '../up': this becomes a file name"),
-    ("rig.cameras.a/", {}, r"name is 'a/': this becomes a file name"),
     ("placements", [1, 1], r"placements is \[1, 1\]: placements are different numbers"),
     ("placements", [1, "o"], "placements.1 is 'o': a valid integer"),
     ("rig.platform.T_head_lrf.translation_m", [0, 0, 157], "translation_m.2 is 157: less than .* 10 .*millimetres"),
-    ("rig.platform.T_head_lrf.translation_m", [0, 0], "translation_m.2 is missing"),
     ("board.corners_m", [[0, 0], [315, 0], [0, 380]], "board is 380 m large: millimetres"),
     ("board.corners_m", [[0, 0], [1, 0]], "corners_m must be one corner for each of 3 edges, got 2"),
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
     ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
-    ("board.edges", ["a\x1b]0;title\x07", "ab", "ca"], "board.edges.0 is "),
     ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
     ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
     ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
@@ -186,14 +181,10 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("rig.cameras.left.mount", "wall", "left.mount is 'wall': 'head' or 'platform' is needed"),
     ("rig.cameras.left.width", 0, "left.width is 0: greater than or equal to 1"),
     ("rig.cameras.left.intrinsics.fx", -1, "left.intrinsics.fx is -1: greater than 0 is needed"),
-    ("rig.cameras.left.intrinsics.distortion", [0, 0], "distortion.2 is missing"),
     ("rig.cameras.left.intrinsics.covariance", [0.0], r"covariance.0 is 0\.0: a valid tuple"),
     ("rig.lrf.field_of_view_deg", [120, 60], r"field_of_view_deg is \[120, 60\]: two ascending"),
-    ("rig.lrf.bearing_step_deg", 0, "bearing_step_deg is 0: greater than 0"),
     ("rig.lrf.sigma_range_m", 5, "sigma_range_m is 5: .*millimetres"),
     ("rig.lrf.sigma_range_m", math.nan, "sigma_range_m is nan: a finite number is needed"),
-    ("rig.lrf.spot_exit_m", 12, "spot_exit_m is 12: .*millimetres"),
-    ("rig.platform.sigma_offset_m", 5, "sigma_offset_m is 5: .*millimetres"),
 ]
 
 
@@ -254,13 +245,9 @@ SCANS, IMAGES, OUT = "lrf/scans.npz", "images.csv", "must stay inside the sessio
 DAMAGE = [
     (gone("session.json"), r"session\.json: No such file"),
     (written("session.json", b""), "not JSON"),
-    (written("session.json", b"{"), "not JSON"),
-    (written("session.json", b"\xff"), "not JSON"),
     (written("session.json", b"[1]"), "holds a list"),
     (gone(SCANS), r"scans\.npz: no such file"),
     (written(SCANS, b""), "cannot be read.*truncated"),
-    (written(SCANS, lambda data: data[:10]), "cannot be read.*truncated"),
-    (written(SCANS, lambda data: data[: len(data) // 2]), "cannot be read.*truncated"),
     (written(SCANS, lambda data: data[: int(0.98 * len(data))]), "cannot be read.*truncated"),
     (written(SCANS, lambda data: data[:100] + bytes(60) + data[160:]), r"scans\.npz: cannot be read"),
     (lambda path: np.savez(path / SCANS, ranges=np.ones((2, 61)), bearings=BEARINGS), "key 'placement' is missing"),
@@ -277,14 +264,12 @@ DAMAGE = [
     (lambda path: (path / SCANS).rename(path / "lrf" / "telegrams.bin"), r"index\.csv: No such file.*needs this file"),
     (cell("file", "../trip/session.json"), OUT + "'../trip/session.json'"),
     (cell("file", "/etc/passwd"), OUT + "'/etc/passwd'"),
-    (cell("file", ""), OUT + "''"),
     (cell("file", "..\\x.png"), OUT + r"'\.\.\\"),
     (cell("file", "images/left/0009.png"), "0009.png: No such file"),
     (cell("file", "session.json"), "neither PNG nor JPEG"),
     (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
     (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
     (cell("placement", "12"), "placement 12 is not in session.json"),
-    (cell("placement", "first"), "line 2: invalid literal"),
     (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
     (written("images/left/0002.png", cv2.imencode(".png", pixels()[:20])[1]), r"0002\.png: 32 x 20 pixels, but camera"),
     (gone(IMAGES), r"images\.csv: No such file"),
@@ -297,7 +282,6 @@ DAMAGE = [
     (pick("left,images/left/0001.png,top,1,2,20,3"), "edge is one of ab, bc, ca, got 'top'"),
     (pick("left,images/left/0001.png,ab,1,2,2,3"), "too close for a direction"),
     (pick("left,images/left/0001.png,ab,1,2,nan,3"), "u1, v1, u2, v2 must be 4 finite"),
-    (pick("left,images/left/0001.png,ab,1,2,x,3"), "could not convert"),
 ]
 
 
@@ -326,7 +310,6 @@ def test_an_image_that_cannot_be_decoded_is_found_by_validate(path):
 RANGES, _, PITCH = wall()
 REFUSED = [
     ("add_sweep", (2, 1000 * RANGES, BEARINGS, PITCH), "placement 2: the median range .*millimetres"),
-    ("add_sweep", (2, RANGES, BEARINGS, PITCH[:2]), "pitch has shape"),
     ("add_sweep", (2, RANGES, BEARINGS + 0.1, PITCH), "one grid a session"),
     ("add_image", ("up", pixels()), "camera 'up', purpose 'board': cameras are left, right"),
     ("add_image", ("left", pixels()[:, 1:]), "31 x 24 pixels, but camera 'left' has 32 x 24"),
@@ -341,6 +324,3 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path):
             getattr(writer, method)(*wrong)
     with pytest.raises(SessionError, match="purposes intrinsics, board, scene"):
         writer.add_image("left", pixels(), purpose="fun")
-    with pytest.raises(SessionError, match="left.mount is 'car'"):
-        SessionWriter(tmp_path / "t", triangle_board(), LRF, [CameraInfo("left", "car", 32, 24)])
-    assert not (tmp_path / "t").exists()
