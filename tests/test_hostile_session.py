@@ -52,16 +52,6 @@ def test_only_plain_files_of_a_size_are_read(folder, name, told):
         fuzz.read_all(folder / name.partition("/")[0])
 
 
-@pytest.mark.parametrize("name", ["lrf", "images", "images/left"])
-def test_folders_that_are_links_are_not_entered(folder, name):
-    for path in (folder / "scans", folder / "telegrams"):
-        (path / name).rename(folder / path.name.upper())
-        (path / name).symlink_to(folder / path.name.upper())
-    for work, path in ((open_session, "scans"), (fuzz.recorder, "telegrams")):
-        with pytest.raises(SessionError, match=rf"{name}: is a link, not a folder"):
-            work(folder / path)
-
-
 @pytest.mark.parametrize("name", ["session.json.draft", "images.csv.draft", "lrf/index.csv.draft", "writer.lock",
                                   "platform.csv", "images.csv", "lrf/index.csv", "lrf/telegrams.bin"])  # fmt: skip
 def test_nothing_is_written_behind_a_link(folder, name):

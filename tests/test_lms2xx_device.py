@@ -263,19 +263,6 @@ def test_late_arrivals_do_not_shift_scans():
     assert list(steps[1:]) == np.diff(turns).tolist()
 
 
-def test_old_and_repeated_scans_are_refused():
-    clock = ScanClock()
-    assert clock.place(250, 10.0) == (10.0, 0)
-    instant, step = clock.place(2, 10.0 + 8 * TURN_S)
-    assert step == 8 and instant == pytest.approx(10 + 8 * TURN_S)
-    assert clock.place(2, 10.2)[0] is None and clock.place(250, 10.4)[0] is None
-    assert clock.place(18, 10.0 + 24 * TURN_S)[1] == 16
-    assert clock.place(200, 100.0) == (100.0, 0)  # after a long pause nothing is known
-    refused = [clock.place((200 - k) % 256, 100.1 + k * TURN_S)[0] for k in range(1, 8)]
-    assert refused[:5] == [None] * 5 and refused[5] is not None  # a device that counts anew is believed in the end
-    assert ScanClock().place(-1, 3.0) == (3.0, 0)
-
-
 def interlaced(partials, indexed, skipped=()):
     """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
     configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}

@@ -109,11 +109,6 @@ def go_away(device):
     device.port.plug()
 
 
-def sent(device, opcode):
-    """Frames of a kind that a head has heard."""
-    return [frame for _, frame in device.frames if frame.command2 == opcode]
-
-
 # ------------------------------------------------------------------------------------------------------ moves
 
 HABITS = {
@@ -201,19 +196,6 @@ def test_what_cannot_be_is_said_and_the_head_stands(opened, settings, habits, fa
         assert head.move_to(10 * DEGREE) == near(10)
 
 
-def test_what_happens_once_is_made_up_for(opened):
-    device, head = opened()
-    device.faults.inject("stall")
-    assert head.move_to(10 * DEGREE) == near(10)
-    assert len(sent(device, pelco_d.SET_TILT)) == 2
-    device.faults.inject("jump")  # a reading that is not believed
-    assert head.pitch() == (near(10), True)
-    assert device.faults.counts["jump"] == 1
-
-
-# ------------------------------------------------------------------------------------------------- timed moves
-
-
 # ------------------------------------------------------------------------------------------------------- sweeps
 
 SWEEPS = {"full": {}, "echo and general": {"echo": True, "confirms": True}, "silent while moving": PARTIAL,
@@ -243,17 +225,6 @@ def test_sweep_logs_the_pitch(opened, habits):
     assert measured[-1] == head.has_feedback and any(measured[3:-3]) == told
     worst = max(abs(np.interp(instant, times, pitches) - pitch) for instant, pitch in truth)
     assert worst < (0.5 if told else 1.5) * DEGREE
-
-
-def test_sweep_is_ended_by_a_stop(opened):
-    device, head = opened(SLOW)
-    assert head.track == []
-    head.start_sweep(50 * DEGREE)
-    device.host.sleep(0.3)
-    head.stop()
-    assert not head.moving() and halted(device)
-    assert 0 < device.pitch() < 20 * DEGREE
-    assert head.finish_sweep()[-1][1] == near(device.pitch() / DEGREE)
 
 
 # --------------------------------------------------------------------------------------------------------- stops
