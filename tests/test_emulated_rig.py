@@ -21,7 +21,7 @@ from lrfcal_lib.emulators.rig import EmulatedRig, main
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import world_of
-from lrfcal_lib.simulate.rig import Placement, load_setup, placements_of
+from lrfcal_lib.simulate.rig import load_setup, placements_of
 
 DEADLINE = 180.0  # s, against hanging
 QUARTERS = np.arange(160, 561)
@@ -59,13 +59,6 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(worl
     error = np.array(scans) - beam.systematic - ideal
     assert np.nanstd(error) == pytest.approx(beam.sigma_range, rel=0.05)
     assert abs(np.nanmean(error)) < 5 * beam.sigma_range / np.sqrt(error.size)
-
-
-def test_images_of_another_width_show_the_same():
-    small = scaled(SETUP.rig, 320)
-    for a, b in zip(small.cameras, SETUP.rig.cameras, strict=True):
-        assert (a.model.width, a.model.height) == (320, 240) and a.model.fx == b.model.fx / 2
-        assert (a.model.cx + 0.5) / a.model.fx == pytest.approx((b.model.cx + 0.5) / b.model.fx)
 
 
 @pytest.fixture(scope="module")
@@ -123,17 +116,9 @@ def test_an_image_begun_before_a_move_is_not_sent(small):
     server.close()
 
 
-def test_own_placements_and_unknown_setups(tmp_path):
-    mine = [Placement(7, placements_of(SETUP)[0].T_platform_board, (-0.1, 0.1), (0.0,))]
-    with EmulatedRig(SETUP, placements=mine, folder=tmp_path / "rig") as rig:
-        rig.world.put(7)
-        assert (tmp_path / "rig" / "lrf").is_symlink()
-    EmulatedRig(SETUP, folder=tmp_path / "rig").close()  # what was not started can be closed
-    assert list((tmp_path / "rig").iterdir()) == []
-    before = signal.getsignal(signal.SIGHUP)
+def test_a_setup_that_is_not_there():
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         main("x")
-    assert signal.getsignal(signal.SIGHUP) is before
 
 
 def test_the_command_line_cleans_up(tmp_path):

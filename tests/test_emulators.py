@@ -1,33 +1,29 @@
 """Emulated devices in virtual time: byte-exact replies, times."""
 
-
 import numpy as np
 import pytest
-from virtual import Bench, Source, VirtualHost, lms
+from virtual import Bench, lms
 
 from lrfcal_lib.emulators.head import REACT_S, Head
 from lrfcal_lib.emulators.lms2xx import VARIANTS
-from lrfcal_lib.session.lms2xx_codec import (
-    Configuration,
-    encode_telegram,
-    parse_status,
-)
+from lrfcal_lib.session.lms2xx_codec import encode_telegram
 from lrfcal_lib.simulate.rig import Platform
 
 ZEROS = "00 " * 21
-TURN = 1 / 75.08
 TYPE, STATUS, ERRORS, CONFIG, SCAN, RESET = (
     "02 00 01 00 3A 1E 12", "02 00 01 00 31 15 12", "02 00 01 00 32 16 12", "02 00 01 00 74 50 12",
     "02 00 02 00 30 01 31 18", "02 00 01 00 10 34 12",
 )  # fmt: skip
-STREAM, STOP = "02 00 02 00 20 24 34 08", "02 00 02 00 20 25 35 08"
+STOP = "02 00 02 00 20 25 35 08"
 INSTALL = "02 00 0A 00 20 00 53 49 43 4B 5F 4C 4D 53 BE C5"
 VARIANT = {v: encode_telegram(0x3B, np.array(v, "<u2").tobytes()) for v in VARIANTS}
 WRITE_TL = f"02 00 23 00 77 00 00 70 00 00 00 01 00 00 02 02 {ZEROS} 02 00 11 88"
 WRITE_CAP = f"02 00 23 00 77 00 00 70 00 00 04 01 00 00 02 02 {ZEROS} 02 00 94 8A"
-def bench(source=None, rate=None, **options):
+
+
+def bench(rate=None, **options):
     """A laser range finder and a program at its line."""
-    return Bench(lms(source, **options), rate)
+    return Bench(lms(**options), rate)
 
 
 # ------------------------------------------------------------------------------------------------ byte-exact replies
@@ -90,16 +86,6 @@ def test_reset_tells_its_power_on_string():
     assert one.device.baudrate == 9600 and one.device.memory.variant == (180, 50)
 
 
-def test_the_status_tells_the_settings():
-    """Where each stands is compared with a real device's reply in test_lms2xx."""
-    one = bench(configuration=Configuration().changed(measuring_mode=4, unit="mm"), baudrate=38400)
-    raw = one.send(STATUS)[1:]
-    status = parse_status(raw)
-    assert len(raw) == 0x9A + 6
-    assert (status.firmware, status.serial, status.measuring_mode, status.fault) == ("X01.27", "05270497", 4, 0)
-    assert (status.scan_angle_deg, status.resolution_deg, status.unit) == (180, 0.5, "mm")
-
-
 # ------------------------------------------------------------------------------------------------ times
 
 
@@ -115,22 +101,6 @@ def test_times_of_replies(request_, least, most):
     assert one.out[0][0] <= 0.060 and least - 4 <= 1000 * one.out[-1][0] <= most + 4
 
 
-def test_a_stream_that_this_machine_is_too_slow_for_leaves_scans_out(caplog):
-    """Casting a scan takes the processor a time that passes meanwhile."""
-    host, late = VirtualHost(), iter([0.0, 0.0, 0.9, 0.0, 1.5])
-
-    class Slow(Source):
-        def scan(self, *args):
-            host._now += next(late, 0.0)
-            return super().scan(*args)
-
-    one = Bench(lms(Slow(), host, baudrate=38400))
-    one.send(STREAM, wait=8.0)
-    gaps = np.diff([record.turn for record in one.device.scans]) * TURN
-    assert np.sum(gaps > 1.01 * min(gaps)) == 1 and max(gaps) > 1.2  # what is less late is caught up with
-    assert one.device.left_out == 1 and "casts scans too slowly: 1." in caplog.text
-
-
 # ------------------------------------------------------------------------------------------------ the head
 
 
@@ -144,15 +114,3 @@ def test_play_of_the_gear_and_stretch():
     turning = head.pitch(np.linspace(4.0 + REACT_S, 5.0, 300))
     assert np.count_nonzero(np.abs(np.diff(turning)) < 1e-12) > 20  # the play, then down
     assert np.all(np.diff(turning) <= 0) and np.ptp(turning) > 0.05
-
-
-def test_a_head_wobbles_and_settles():
-    head = Head(Platform(settle=0.5))
-    head.move(0.0, 1.0, 0.2)
-    head.stop(2.0)
-    assert not head.settled(2.2) and head.settled(2.6)
-    rest = float(head.pitch(3.0))
-    swing = head.pitch(np.linspace(2.05, 2.5, 100)) - rest
-    assert 1e-4 < np.abs(swing).max() < 5e-3 and head.pitch(2.6) == rest
-    head.stop(3.0)
-    assert np.all(head.pitch(np.linspace(3.0, 4.0, 50)) == rest)  # a stop at rest shakes nothing

@@ -134,24 +134,20 @@ def pressed(panel, name):
     return panel.parts
 
 
-def test_buttons_do_it_all(panel):
+def test_buttons_that_the_browser_does_not_press(panel):
+    """Connect, capture, calibrate and close are pressed in test_panel_browser."""
     parts = panel.parts
     assert parts.capture.disabled and parts.close.disabled and not parts.connect.disabled and not parts.stop.disabled
     pressed(panel, "connect")
-    assert "ready" in parts.state.value and not parts.capture.disabled and parts.calibrate.disabled
-    until(lambda: all(picture.image.value for picture in parts.pictures.values()))
-    assert set(parts.pictures) == {"scan", "sweep", "left"}
-    before = parts.pictures["sweep"].image.value
+    assert not parts.capture.disabled and parts.calibrate.disabled
     pressed(panel, "capture")
-    assert "scan" in parts.lights.value and "recorded: 1" in parts.task.value and not parts.calibrate.disabled
-    until(lambda: parts.pictures["sweep"].image.value != before)
+    assert "recorded: 1" in parts.task.value and not parts.calibrate.disabled
     pressed(panel, "again")
     assert "nothing is recorded yet" in parts.task.value
     parts.slider.value = 3.0
     pressed(panel, "go")
     until(lambda: "+3.00°" in parts.pitch.value)
-    pressed(panel, "close")
-    assert "not connected" in parts.state.value and parts.capture.disabled and parts.error.value == ""
+    assert parts.error.value == ""
 
 
 def test_errors_appear_in_the_panel(panel, tmp_path):

@@ -1,6 +1,5 @@
 """Recording: what is finished stays, the head stops whatever happens, and the checks see what is wrong."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -15,11 +14,10 @@ from shared import QUICK, at_write, campaign, disk_full
 
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.acquire import record
-from lrfcal_lib.acquire.checks import Light, check_image, check_placement, check_scan
+from lrfcal_lib.acquire.checks import check_image, check_placement, check_scan
 from lrfcal_lib.acquire.record import Recording, RecordingError, main, record_session
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.port import DeviceError
-from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder
@@ -187,19 +185,14 @@ def test_a_session_is_never_written_over(path, rig):
 
 def test_placements_are_begun_and_finished_one_by_one(path, rig):
     recorder = SessionRecorder(path, rig.stated.board, rig.stated.lrf, rig.stated.cameras.values())
-    for message, call, *arguments in (
-        ("placement 1 was not begun", recorder.add_telegrams, 1, [telegram(0.0)], 0.0),
-        ("", recorder.begin_placement, 1),
-        ("", recorder.add_telegrams, 1, [telegram(0.0)], 0.0),
-        ("", recorder.finish_placement),
-        ("placement 1 cannot be begun; recorded: 1", recorder.begin_placement, 1),
-        ("no placement 4 to drop; recorded: 1", recorder.drop_placement, 4),
-        ("", recorder.begin_placement, 2),
-        ("", recorder.finish),
-    ):
-        with pytest.raises(SessionError, match=message) if message else contextlib.nullcontext():
-            call(*arguments)
-    assert open_session(path).placements == (1,)
+    with pytest.raises(SessionError, match="placement 1 was not begun"):
+        recorder.add_telegrams(1, [telegram(0.0)], 0.0)
+    recorder.begin_placement(1)
+    recorder.finish_placement()
+    with pytest.raises(SessionError, match="placement 1 cannot be begun; recorded: 1"):
+        recorder.begin_placement(1)
+    with pytest.raises(SessionError, match="no placement 4 to drop; recorded: 1"):
+        recorder.drop_placement(4)
 
 
 # ------------------------------------------------------------------------------------------------ killed, disk full
@@ -341,17 +334,6 @@ def test_a_recording_by_command(run, path):
     assert run("", resume=True)[0] == 0 and open_session(path).placements == (1, 2, 3)
 
 
-def test_options_of_the_command_line_reach_the_recording(monkeypatch, capsys):
-    got = {}
-    monkeypatch.setattr(record, "main", lambda *args, **options: got.update(options, args=args) or 0)
-    line = ["record", "rig.json", "s", "--resume", "--mode", "continuous", "--placements"]
-    assert command_line.main([*line, "3"]) == 0
-    assert got == {"args": ("rig.json", "s"), "resume": True, "count": 3, "mode": "continuous"}
-    with pytest.raises(SystemExit):
-        command_line.main([*line, "0"])
-    assert "1 or more are needed" in capsys.readouterr().err
-
-
 def interrupt():
     raise KeyboardInterrupt
 
@@ -399,22 +381,16 @@ def test_a_session_removed_amid_a_recording_is_not_called_safe(run, rig, path, r
         assert "are safe" not in out + err
 
 
-@pytest.mark.parametrize(("part", "name", "value", "message"), [
-    ("head", "port", "/dev/no_such_port", "error: head: there is no port /dev/no_such_port"),
-    ("head", "pitch_limits_deg", [0, 1], "pitch_limits_deg are 0 to 1: ask for less"),
-    ("plan", "mode", "fast", "plan.mode is 'fast'"),
-])  # fmt: skip
-
-
-def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, path, capsys, part, name, value, message):
+def test_what_cannot_be_recorded_is_exit_code_2(tmp_path, path, capsys):
     data = listed(-4)
-    {**data, **data["devices"]}[part][name] = value
+    data["devices"]["head"]["port"] = "/dev/no_such_port"
     (tmp_path / "rig.json").write_text(json.dumps(data))
     assert command_line.main(["record", str(tmp_path / "rig.json"), str(path)]) == 2
     text = capsys.readouterr().err
-    assert message in text and text.count("\n") == 1 and not path.exists()
-
-
+    assert "error: head: there is no port /dev/no_such_port" in text and text.count("\n") == 1 and not path.exists()
+    with pytest.raises(SystemExit):
+        command_line.main(["record", "rig.json", "s", "--placements", "0"])
+    assert "1 or more are needed" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------------------------------------------- lights
@@ -454,13 +430,6 @@ def test_images_that_are_blurred_dark_bright_or_empty_are_seen(quick, change, st
     assert light.state == state and text in light.text and light.name == "camera left"
 
 
-def test_a_board_without_a_pattern_needs_intrinsics(quick):
-    bare, image = replace(quick.board, pattern=None), quick.read_image(quick.images("left", 2)[0])
-    assert check_image(image, bare).state == "warn"
-    light = check_image(np.zeros_like(image), bare, CameraModel(640, 480, 670.0, 670.0, 320.0, 240.0, np.zeros(5)))
-    assert light.state == "bad" and light.text
-
-
 @pytest.mark.parametrize(("change", "state", "text"), [
     (lambda sweep: None, "bad", "no scan line with a range"),
     (lambda sweep: replace(sweep, ranges=np.random.default_rng(1).uniform(1, 9, sweep.ranges.shape)), "bad",
@@ -473,10 +442,3 @@ def test_a_board_without_a_pattern_needs_intrinsics(quick):
 def test_the_board_missing_cut_off_or_hardly_hit_is_seen(quick, change, state, text):
     first, *rest = check_scan(change(quick.sweep(2)), quick.board, quick.T_head_lrf)
     assert first.state == state and text in first.text and bool(rest) == (state == "warn")
-
-
-def test_a_camera_without_images_is_red(path):
-    data = listed(-4)
-    data["plan"]["placements"][0]["image_pitch_deg"] = []
-    write(make_rig(data), path)
-    assert check_placement(open_session(path), 1)[-1] == Light("camera left", "bad", "no image")
