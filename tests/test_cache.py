@@ -129,15 +129,6 @@ def test_a_loop_is_shared_in_order(two, tmp_path):
     assert cache.spread(abs, []) == [] and cache.spread(abs, [-1]) == [1] and cache._processes == 2
 
 
-def test_results_do_not_hang_on_who_worked_them_out(two, monkeypatch):
-    """Nor does the layout of their arrays, on which the last digit of sums hangs."""
-    every = [np.asfortranarray(np.arange(12.0).reshape(3, 4)), np.arange(12.0)[::2], np.arange(12.0).reshape(3, 4).T]
-    shared = cache.spread(lambda i: every[i], range(3))
-    monkeypatch.setattr(cache, "_processes", 1)
-    for one, other in zip(shared, cache.spread(lambda i: every[i], range(3)), strict=True):
-        assert np.array_equal(one, other) and one.strides == other.strides and one.flags.owndata == other.flags.owndata
-
-
 def test_what_another_process_cannot_do_is_done_here(two):
     here = os.getpid()
 
