@@ -60,8 +60,7 @@ def camera_case(seed, count=12, spread=0.6, **options):
     return rig, camera_observations(rng, rig, random_board_poses(rng, count, rig, spread), **options)
 
 
-def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf", face=40, pattern=True,
-                        corners=CORNERS, sigma=(0.005, 0.002)):  # fmt: skip
+def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf", face=40, pattern=True):
     """What a camera and one scan (``source='lrf'``) or a sweep (``source='platform'``) see of boards.
 
     `noise` scales errors that are drawn from the stated standard deviations (0: exact observations). Outline corners
@@ -69,17 +68,17 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     """
     model, numbers, flown = rig.model, np.arange(1, len(poses) + 1), 1e-3 if source == "platform" else 0.0
     boards = [rig.T_camera_lrf.inv() * pose for pose in poses]
-    crossings, edges = zip(*(_crossings(rng, board, source, corners) for board in boards), strict=True)
+    crossings, edges = zip(*(_crossings(rng, board, source) for board in boards), strict=True)
     faces = [_face(rng, board, c, source, face) for board, c in zip(boards, crossings, strict=True)]
-    outlines, given = [board.apply(flat(corners)) for board in boards], {}
+    outlines, given = [board.apply(flat(CORNERS)) for board in boards], {}
     for name, group, spread in (("crossing", crossings, flown), ("plane", faces, flown), ("scene", outlines, 1e-3)):
-        points, covariance, half_step = measured(rng, np.concatenate(group), noise, spread, *sigma)
+        points, covariance, half_step = measured(rng, np.concatenate(group), noise, spread)
         given |= {f"{name}_points": points, f"{name}_covariance": covariance}
         given[f"{name}_placement"] = np.repeat(numbers, [len(x) for x in group])
         if name == "crossing":
             spacing = half_step[:, :, None] * half_step[:, None, :] / 3
             given |= {"crossing_half_step": half_step, "crossing_noise": covariance - spacing}
-    given |= _images(rng, poses, model, corners, edges, noise, sigma_px, pattern)
+    given |= _images(rng, poses, model, edges, noise, sigma_px, pattern)
     off = noise * rng.normal(size=(len(poses), 6)) * SIGMA_BOARD
     known = [
         RigidTransform.from_components(pose.translation + d[3:], Rotation.from_rotvec(d[:3]) * pose.rotation)
@@ -90,16 +89,16 @@ def camera_observations(rng, rig, poses, *, noise=0.0, sigma_px=0.2, source="lrf
     return CameraObservations(model, camera="left", source=source, board_covariance=covariance, **given)
 
 
-def _images(rng, poses, model, corners, edges, noise, sigma_px, pattern):
+def _images(rng, poses, model, edges, noise, sigma_px, pattern):
     """Image lines of the edges that were crossed, outline corners, and corners of the pattern."""
     lines = [
-        outline_lines(corners)[e] @ np.linalg.inv(model.matrix @ T.as_matrix()[:3, [0, 1, 3]])
+        outline_lines(CORNERS)[e] @ np.linalg.inv(model.matrix @ T.as_matrix()[:3, [0, 1, 3]])
         for T, e in zip(poses, edges, strict=True)
     ]
     lines, edges = np.concatenate(lines), np.concatenate(edges)
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     lines[:, 2] += noise * rng.normal(0, SIGMA_LINE, len(lines))
-    outline = np.concatenate([pinhole(pose.apply(flat(corners)), model) for pose in poses])
+    outline = np.concatenate([pinhole(pose.apply(flat(CORNERS)), model) for pose in poses])
     outline += noise * rng.normal(0, SIGMA_LINE, outline.shape)
     seen = np.array([project(pose.apply(PATTERN), model) for pose in poses])
     seen += noise * rng.normal(0, sigma_px, seen.shape)
@@ -112,12 +111,12 @@ def _images(rng, poses, model, corners, edges, noise, sigma_px, pattern):
     }  # fmt: skip
 
 
-def _crossings(rng, T_source_board, source, corners):
+def _crossings(rng, T_source_board, source):
     """Points where the plane z = 0 of the LRF crosses the outline, or along all edges for a sweep; their edges."""
     if source == "platform":
         edges = np.repeat(np.arange(4), 3)
-        return T_source_board.apply(on_sides(corners, edges, rng.uniform(0.1, 0.9, len(edges)))), edges
-    outline = T_source_board.apply(flat(corners))
+        return T_source_board.apply(on_sides(CORNERS, edges, rng.uniform(0.1, 0.9, len(edges)))), edges
+    outline = T_source_board.apply(flat(CORNERS))
     following = np.roll(outline, -1, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = outline[:, 2] / (outline[:, 2] - following[:, 2])

@@ -61,17 +61,6 @@ def test_the_suggested_placement_brings_what_it_promises(good, suggested):
     assert gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
 
 
-def test_the_suggestion_in_words(suggested):
-    words, place = suggested.sentence(), suggested.place.copy()
-    ahead, fixed = f"board {place.distance:.1f} m ahead", replace(suggested, pitches=None, place=place)
-    assert words.startswith(f"Record next: {ahead}")
-    assert all(part in words for part in ("images at pitch", "axis", "left", "% less"))
-    place.bearing, place.elevation, place.turn, place.towards, place.lean = np.radians(-20), 0.0, 0.0, "", 0.0
-    assert fixed.words() == f"{ahead}, 20 deg to the right, upright"
-    place.towards, place.lean, place.turn, place.elevation = "left", *np.radians([35, 60, -12])
-    assert fixed.words().endswith("12 deg down, turned 60 deg in its plane, facing left by 35 deg")
-
-
 def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
     near = COARSE | {"distances": (0.1,)}

@@ -1,4 +1,4 @@
-"""Boards that bend: synthetic scans of sheets whose shape is known, then recordings."""
+"""Boards that bend: synthetic scans of sheets whose shape is known, then a recording."""
 
 from dataclasses import replace
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from lrfcal_lib.calibrate.observe import board_maps, rough_poses
-from lrfcal_lib.evaluate.diagnosis import bend_words, bends_table
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.preprocess import bend as module
-from lrfcal_lib.preprocess.bend import Bend, BoardBends, Face, around_pattern, bend_of, common_level
+from lrfcal_lib.preprocess.bend import Face, around_pattern, bend_of, common_level
 
 SIZE = 0.8
 BOARD = Board("square", ("a", "b", "c", "d"), SIZE * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),
@@ -69,20 +68,6 @@ def test_one_material_has_no_level():
     assert np.isnan(common_level([])[0])
     bare = replace(a_face(np.random.default_rng(0)), around=np.zeros(4000))
     assert np.isnan(common_level([bare] * 6)[0])
-
-
-def test_bends_in_words_and_in_a_table():
-    bends = {15: Bend(15, 0.012, 0.001, 1e-5, True, sheet=0.001, sheet_sigma=0.001),
-             16: Bend(16, 0.008, 0.001, 1e-5, True, sheet=0.006, sheet_sigma=0.001),
-             17: Bend(17, 0.002, 0.001, 0.3, False)}  # fmt: skip
-    words = bend_words(BoardBends(bends, 0.0043, 0.0002, True))
-    assert words[0] == "the board around the pattern reads 4.3 +- 0.2 mm farther than the pattern"
-    assert words[1].startswith("placements 15 and 16 bend by 8 to 12 mm in the scan")
-    assert "by 1 to 6 mm (at 15 by less than half" in words[1]
-    assert bend_words(BoardBends({17: bends[17]})) == []
-    assert bend_words(BoardBends({16: replace(bends[16], sheet=np.nan)})) == ["placement 16 bends by 8 mm in the scan"]
-    table = bends_table(BoardBends(bends))
-    assert list(table.bend_mm) == [12.0, 8.0, 2.0] and list(table.bends) == [True, True, False]
 
 
 def test_real_boards_that_bend_are_found(lms400):

@@ -1,4 +1,4 @@
-"""What all camera methods share, and the line methods: exact data, Jacobians, covariance, start values, bad input."""
+"""What all camera methods share, and the line methods: exact data, covariance, start values, bad input."""
 
 import doctest
 from dataclasses import replace
@@ -13,7 +13,7 @@ from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
-from lrfcal_lib.solvers import METHODS, find_outlying_placements, solve_camera, starting_transform
+from lrfcal_lib.solvers import METHODS, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -48,20 +48,6 @@ def test_every_method_recovers_exact_data(name, source):
     assert (miss(found, rig) < 1e-9).all()
     assert found.converged and found.unobservable == ()
     assert found.covariance.shape == (len(found.names),) * 2 and np.isfinite(found.covariance).all()
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_every_method_is_invariant_to_the_source_frame(name):
-    rig, obs = camera_case(2, noise=1.0, source="platform")
-    move = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 0.2, -0.7]))
-    R = move.rotation.as_matrix()
-    groups = {f"{g}_points": move.apply(getattr(obs, f"{g}_points")) for g in ("crossing", "plane", "scene")}
-    spreads = {f"{g}_covariance": R @ getattr(obs, f"{g}_covariance") @ R.T for g in ("crossing", "plane", "scene")}
-    spreads |= {"crossing_noise": R @ obs.crossing_noise @ R.T, "crossing_half_step": obs.crossing_half_step @ R.T}
-    here = solve_camera(obs, name, rig.T_camera_lrf)
-    there = solve_camera(replace(obs, **groups, **spreads), name, rig.T_camera_lrf * move.inv())
-    angle, distance = transform_difference(there.transform * move, here.transform)
-    assert angle < 1e-7 and distance < 1e-7
 
 
 @pytest.mark.parametrize("field", ["crossing_points", "crossing_covariance", "plane_points", "scene_points"])
@@ -164,12 +150,3 @@ def test_points_on_one_line_leave_a_rotation_open():
     q = rig.T_camera_lrf.apply(points) @ rig.model.matrix.T
     with pytest.raises(DegenerateGeometry, match="do not determine rotation about"):
         solve_camera(replace(obs, scene_points=points, scene_pixels=q[:, :2] / q[:, 2:]), "bauermann", rig.T_camera_lrf)
-
-
-def test_outlying_placements_are_found_untold():
-    _, obs = camera_case(23, count=16, noise=1.0, source="platform")
-    assert find_outlying_placements(obs)[1] == {}
-    poses = obs.board_poses.copy()
-    poses[[3, 8], :3, 3] += 0.08 * poses[[3, 8], :3, 2]
-    inliers, outlying = find_outlying_placements(replace(obs, board_poses=poses))
-    assert set(outlying) == {4, 9} and min(outlying.values()) > 0.05 and len(inliers) == 14

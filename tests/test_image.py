@@ -343,12 +343,6 @@ def test_edges_of_a_known_board_at_any_roll(roll):
     assert all(line_distance(centre, e.line) < 0 for e in view.edges)
 
 
-def test_edges_before_clutter():
-    pose = pose_of(0.1)
-    view = seen(render(pose, background=clutter()))
-    assert len(view.edges) == 4 and worst_edge(view, pose) < 0.3
-
-
 def test_the_order_of_corners_follows_the_outline():
     for pose, background in zip(view_poses(3, seed=6), (170.0, clutter(1), clutter(2)), strict=True):
         picture, exact = render(pose, background=background), pixels_of([pose])[0]
@@ -356,15 +350,6 @@ def test_the_order_of_corners_follows_the_outline():
             orders = exact[start][pattern_orders(PATTERN)]
             poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
             np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, orders, poses))], exact)
-
-
-def test_a_board_frame_whose_z_points_out_is_recognised_by_its_outline():
-    # the same sheet with y counted upwards: x to y turns left as seen from the front
-    upside = CORNERS * [1, -1] + [0, 3 * PATTERN.square]
-    board, pose = replace(SHEET, corners=upside[::-1].copy(), edges=("bottom", "right", "top", "left")), pose_of()
-    view = seen(render(pose), board)
-    assert len(view.edges) == 4 and view.T_camera_board.rotation.as_matrix()[2, 2] < 0
-    np.testing.assert_allclose(view.pixels, pixels_of([pose])[0][pattern_orders(PATTERN)[2]], atol=0.3)
 
 
 def test_line_covariance_tells_the_error_over_noise():
@@ -448,15 +433,6 @@ def test_survey_measures_the_outline_and_turns_all_views_alike(session, surveyed
         assert length == pytest.approx(expected[name], abs=0.001) and outline.length_sd[name] < 0.003
     alone = survey.measure_outline(surveyed.views["left"][:1], UNKNOWN, surveyed.models)
     assert np.isnan([*alone.line_sd, *alone.length_sd.values()]).all()
-
-
-def test_an_outline_that_no_image_shows_leaves_poses(session, monkeypatch):
-    monkeypatch.setattr(survey, "edge_votes", lambda *_: np.zeros((4, len(edges_in_image.wide_distances(PATTERN)))))
-    found = survey.survey(session[1][:2], session[2], UNKNOWN, {"left": MODEL})
-    assert "do not agree on the top edge" in found.unseen and found.outline is None and found.board.corners is None
-    for view in found.views["left"]:
-        assert view.T_camera_board is not None and not view.edges
-        assert view.rejected == tuple((name, "the outline of the board is not known") for name in UNKNOWN.edges)
 
 
 def test_surveys_that_cannot_work(session, surveyed):
@@ -548,11 +524,7 @@ def test_plain_boards_that_cannot_be_used():
 def test_real_cameras_edges_and_outline(lms400):
     found = lms400.prepared
     for camera, model in found.models.items():
-        views = found.views[camera].values()
-        assert model.rms_px < 0.32
-        names = [e.name for v in views for e in v.edges]
-        assert len(names) >= 70 and len(names) - names.count("bottom") >= 58
-        assert all(reason.startswith(("cut by", "no clear")) for v in views for _, reason in v.rejected)
+        assert model.rms_px < 0.32, camera
     for name, length in found.board.lengths().items():
         assert length == pytest.approx(0.858, abs=0.004), name
         assert found.outline.length_sd[name] < 0.007

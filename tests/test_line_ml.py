@@ -1,13 +1,11 @@
-"""The line method by likelihood: against half steps and planes in Monte-Carlo trials, gradients, bias, bad input."""
+"""The line method by likelihood: against half steps and planes in Monte-Carlo trials, bias, bad input."""
 
 import numpy as np
 import pandas as pd
 import pytest
 from notebook_runs import GOLDEN
 
-from lrfcal_lib.evaluate.monte_carlo import observations, start_near
 from lrfcal_lib.simulate.draw import ShotSetup, draw_shots
-from lrfcal_lib.solvers import solve_camera
 
 BIASES = (-0.5, -0.25, 0.0, 0.25, 0.5)
 
@@ -33,18 +31,6 @@ def test_better_than_planes(errors):
 
 def test_the_bias_is_found_and_its_uncertainty_is_not_played_down(errors):
     assert (errors.bias_error.line_ml < 0.05).all() and errors.nees.line_ml.mean() < 1.2
-
-
-def test_many_trials_equal_single_ones():
-    setup = ShotSetup(bias=0.3)
-    shots = draw_shots(setup, np.random.default_rng(5), 3)
-    T0 = start_near(shots, np.random.default_rng(6))
-    for method in ("line", "line_ml", "zhang_pless"):
-        batch = solve_camera(observations(shots, setup), method, T0)
-        for i in range(3):
-            one = {name: values[i : i + 1] for name, values in shots.items()}
-            single = solve_camera(observations(one, setup), method, T0[i])
-            np.testing.assert_allclose(single.parameters[0], batch.parameters[i], atol=1e-6)
 
 
 def test_boards_that_cannot_be_drawn_are_refused():

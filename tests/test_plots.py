@@ -1,13 +1,11 @@
 """Figures show what they are given: in the right place, in the right colour, with units."""
 
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from figure_checks import complaints
-from matplotlib.colors import to_hex
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
@@ -17,13 +15,12 @@ from lrfcal_lib.plots import recording, results, rig
 from lrfcal_lib.session.read import Sweep
 
 MODEL = CameraModel(640, 480, 500.0, 505.0, 320.0, 240.0, np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
-IN_SPACE = pytest.mark.parametrize("ax", ["3d"], indirect=True)
 
 
 @pytest.fixture
-def ax(request):
+def ax():
     """Axes whose figure is drawn after the test."""
-    fig, ax = plt.subplots(subplot_kw={"projection": getattr(request, "param", None)})
+    fig, ax = plt.subplots()
     yield ax
     fig.canvas.draw()
     plt.close(fig)
@@ -40,29 +37,16 @@ def scan():
     return SimpleNamespace(placement=4, sweep=sweep, mask=mask, filtered=on_board, fitted=on_board + 0.001)
 
 
-def image_edge(*ends, name="left"):
-    return SimpleNamespace(name=name, ends=np.array(ends))
-
-
-def a_view(*edges, **found):
-    about = {"camera": "right", "placement": 3, "pixels": None, "edges": edges, "rejected": ()}
-    return SimpleNamespace(**about | found)
+def image_edge(*ends):
+    return SimpleNamespace(ends=np.array(ends))
 
 
 def labels(ax):
     return ax.get_xlabel(), ax.get_ylabel()
 
 
-def legend(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
-
-
 def texts(found):
     return [text.get_text() for text in found]
-
-
-def lines_of(ax, role):
-    return [line for line in ax.lines if to_hex(line.get_color()) == recording.COLORS[role]]
 
 
 def falls(limits):
@@ -79,12 +63,6 @@ def test_range_image_is_seen_from_behind_the_sensor(ax, scan):
     assert shown.mask[5, 0] and shown.mask.sum() == 1, "what did not come back stays blank"
 
 
-def test_range_images_that_share_colours_are_cut_to_the_board(ax, scan):
-    drawn = recording.range_image(ax, scan.sweep, scan.mask, (0.0, 2.5))
-    assert drawn.get_clim() == (0.0, 2.5) and len(ax.figure.axes) == 1, "the colour bar is the caller's"
-    assert ax.get_xlim() == pytest.approx((105, 74)), "6 deg beside the board, which is seen from 80 to 99 deg"
-
-
 @pytest.mark.parametrize(("end", "bearing"), [(1, 99.5), (-1, 79.5)])
 def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
     points = 2.0 * np.array([[np.cos(np.radians(b)), np.sin(np.radians(b)), 0.0] for b in (79.5, 99.5)])
@@ -94,15 +72,6 @@ def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
     assert mark.get_xdata()[0] == pytest.approx(bearing)
     with pytest.raises(ValueError, match="no beam of scan line 0 is on the board of placement 4"):
         recording.edge_of_line(ax, scan, 0)
-
-
-def test_projection_picks_its_plane_and_draws_fits_over_their_points(ax):
-    points = [1.0, 2.0, 3.0] + np.linspace(0, 1, 5)[:, None] * [0.0, 3.0, 4.0]
-    recording.projection(ax, {"ab": points}, "yz", {"ab": (points[2], np.array([0.0, 0.6, 0.8]))})
-    dots, fit = ax.lines
-    np.testing.assert_allclose(dots.get_xydata(), points[:, 1:])
-    np.testing.assert_allclose(fit.get_xydata(), points[[0, -1], 1:])
-    assert labels(ax) == ("y [m]", "z [m]")
     with pytest.raises(ValueError, match="plane must be one of xz, yz, xy, got 'zz'"):
         recording.projection(ax, {}, "zz")
 
@@ -112,29 +81,6 @@ def test_an_image_edge_goes_back_through_the_lens():
     np.testing.assert_allclose(undistort(recording.stretch_in_image(edge, MODEL), MODEL)[[0, -1]], edge.ends, atol=1e-6)
     ends = recording.stretch_in_image(image_edge(*pinhole(points, MODEL)), MODEL, 2)
     np.testing.assert_allclose(ends, project(points, MODEL), atol=1e-9)
-
-
-def test_board_view_is_cut_to_the_board_and_names_what_is_missing(ax):
-    pixels, edge = np.array([[200.0, 150.0], [300.0, 250.0]]), image_edge((100.0, 60.0), (110.0, 400.0))
-    view = a_view(edge, pixels=pixels, rejected=(("top", "too dim"),))
-    recording.board_view(ax, np.zeros((480, 640, 3), np.uint8), view, MODEL, margin=20)
-    assert lines_of(ax, "right") and ax.get_title() == "right, placement 3; not used: top"
-    assert ax.get_xlim()[1] == pytest.approx(320.0) and falls(ax.get_ylim())
-
-
-def test_feature_surfaces_lie_where_the_feature_puts_them():
-    axes, point, direction = Mock(), np.array([1.0, 0.0, 2.0]), np.array([0.6, 0.0, 0.8])
-    rig.cylinder(axes, point, direction, 0.5, 2.0)
-    rig.sphere(axes, point, 0.7)
-    rig.slab(axes, point, direction, 0.4, 1.0)
-    cylinder, sphere = (np.stack(call.args, axis=-1).reshape(-1, 3) for call in axes.plot_surface.call_args_list)
-    np.testing.assert_allclose(np.linalg.norm(np.cross(cylinder - point, direction), axis=1), 0.5)
-    np.testing.assert_allclose(np.ptp((cylinder - point) @ direction), 4.0)
-    np.testing.assert_allclose(np.linalg.norm(sphere - point, axis=1), 0.7)
-    curves = (np.stack(call.args, axis=-1) for call in axes.plot.call_args_list)
-    line, face, parallel = ((curve - point) @ direction for curve in curves)
-    np.testing.assert_allclose(line, [-2.0, 2.0])
-    np.testing.assert_allclose(np.r_[face, parallel], np.repeat([0.0, 0.4], 5), atol=1e-12)
 
 
 IDENTITY = RigidTransform.identity()

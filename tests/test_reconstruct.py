@@ -1,4 +1,4 @@
-"""Reconstruction: occlusion, lenses, exposures, mixed pixels, normals, files, and measured boards."""
+"""Reconstruction: occlusion, lenses, exposures, mixed pixels, normals, files, and lengths of boards."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +10,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
 from lrfcal_lib.calibrate import reconstruct as rec
-from lrfcal_lib.calibrate.outline import as_recorded, measure_board
+from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
-from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
@@ -247,13 +246,6 @@ def test_bad_sweeps_are_refused(case):
         whole(change(scan(wall(2.0))[1]))
 
 
-def test_one_scan_line_makes_a_cloud():
-    one = scan(wall(2.0))[1]
-    one = replace(one, ranges=one.ranges[:1], pitch=one.pitch[:1], time_s=one.time_s[:1])
-    cloud = whole(one, [view(plain_image(), pose=AHEAD)])
-    assert len(cloud.points) + cloud.removed == len(BEARINGS) and cloud.seen.any()
-
-
 def test_an_image_of_another_size_is_refused():
     with pytest.raises(ValueError, match="camera 'left' has 64 x 48 pixels, its image 32 x 24"):
         view(np.zeros((24, 32, 3)))
@@ -314,17 +306,3 @@ def test_combined_lengths_of_left_out_placements_keep_their_promise(session, lea
     table = pd.read_csv(Path(__file__).parent / "golden" / session / "edge_summary.csv").set_index(["variant", "ends"])
     found = table.loc["combined", "image"]
     assert found.n >= least and found.mean_abs_error_mm <= limit and 83 <= found.within_90_percent <= 96
-
-
-def test_exact_edge_points_give_exact_lengths():
-    board = triangle_board()
-    pose = RigidTransform.from_components([0.1, 0.2, 1.5], Rotation.from_rotvec([0.2, 0.5, -0.7]))
-    corners = np.column_stack([board.corners, np.zeros(3)])
-    s = np.linspace(0.1, 0.9, 12)[:, None]
-    sides = {e: pose.apply(corners[i] * (1 - s) + corners[(i + 1) % 3] * s) for i, e in enumerate(board.edges)}
-    face = pose.apply(np.random.default_rng(0).dirichlet([1, 1, 1], 50) @ corners)
-    lengths = measure_board(face, sides, board.edges).lengths
-    for name, value in board.lengths().items():
-        assert lengths[name] == pytest.approx(value, abs=1e-9)
-    del sides["bc"]
-    assert measure_board(face, sides, board.edges).lengths == {}

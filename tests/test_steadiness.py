@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.evaluate.diagnosis import motion_words, pitch_words
+from lrfcal_lib.evaluate.diagnosis import motion_words
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots.results import background_motion
 from lrfcal_lib.preprocess import steadiness
@@ -121,13 +121,6 @@ def test_noise_alone_is_no_step(n):
     assert alarms <= 2, "a level of 0.001"
 
 
-@pytest.mark.parametrize("k", [2, 7, 18])
-def test_one_step_is_found_wherever_it_is(k):
-    (step,) = find_steps(*motion(step_at(k), 3e-5))
-    assert (step.before, step.after) == (k, k + 1)
-    assert abs(step.angle - np.linalg.norm([0.001, -0.0008, 0.0003])) < 4 * step.angle_sigma + 1e-5
-
-
 SMALL = 0.1 / MODEL.fx
 NO_STEP = {
     "one placement apart": (step_at(10, size=(0.003,) * 3) - step_at(11, size=(0.003,) * 3), 3e-5),
@@ -149,18 +142,6 @@ def test_a_camera_on_the_head_is_not_judged():
     assert motion_words({"left": found}) == [] and "0 images" in judge([]).reason
     with pytest.raises(ValueError, match="rides on the head"):
         background_motion(None, {"left": found})
-
-
-def test_pitch_is_put_in_words():
-    each = SimpleNamespace(offset=np.radians([0.3, -0.3]), stretch=np.array([0.05, -0.02]))
-    errors = SimpleNamespace(wanted="sweep_stretch", direction_offset=np.radians(0.25),
-                             direction_sigma=np.radians(0.05), models={"sweep_stretch": each})  # fmt: skip
-    words = pitch_words(errors)
-    assert "upward and downward sweeps differ by 0.50 +- 0.10 deg" in words[0]
-    assert "0.30 deg (sd)" in words[1] and "-2.0 to +5.0 %" in words[2]
-    errors.direction_sigma = np.radians(0.1)
-    assert len(pitch_words(errors)) == 2, "two and a half sigma are none"
-    assert pitch_words(None) == [] and pitch_words(SimpleNamespace(wanted="none")) == []
 
 
 @pytest.fixture(scope="module")
