@@ -1,7 +1,7 @@
 """Speed and memory, every figure beside a named alternative in the same run: ``make bench``.
 
-Writes bench.json and bench.csv into reports/bench. GTSAM is no part of the environment: `make bench` installs it, and
-its ratio is null where it cannot be had.
+Writes bench.json, bench.csv and growth.png into reports/bench. GTSAM is no part of the environment: `make bench`
+installs it, and its ratio is null where it cannot be had.
 """
 
 import argparse
@@ -11,12 +11,14 @@ import shutil
 import subprocess
 import sys
 import time
+import tracemalloc
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from joint_draws import draw, none
@@ -35,13 +37,14 @@ from lrfcal_lib.solvers.joint_start import start_states, thin
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = {
-    "repeats": 7, "trials": 1000, "joint": 100, "points": 10_000_000, "painted": 100_000_000, "telegrams": 20_000,
-    "session": "sim_lms221",
+    "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "points": 10_000_000,
+    "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
 }  # fmt: skip
 TINY = {  # for the test, which only asks whether everything is written
-    "repeats": 1, "trials": 2, "joint": 10, "points": 10_000, "painted": 1_000, "telegrams": 100, "session": None,
+    "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "points": 10_000, "growth": (1_000,),
+    "telegrams": 100, "session": None,
 }  # fmt: skip
-CHUNK = 1_000_000  # points that are handed over at a time
+CHUNK = 1_000_000  # points that growth hands over at a time
 SHORT = 0.02  # seconds
 ROWS = {"face": 40, "beam": 30}
 MODEL = CameraModel(1024, 768, 900.0, 900.0, 512.0, 384.0, np.array([-0.2, 0.1, 0.001, -0.001, 0.0]))
@@ -66,6 +69,15 @@ def elapsed(function, calls=1):
     return (time.perf_counter() - begin) / calls
 
 
+def memory(function):
+    """Largest size of what Python and NumPy hold during a call, MB."""
+    tracemalloc.start()
+    function()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 1e6
+
+
 def cameras(size):
     """One line calibration of twenty placements, and many at once, against scipy with a numeric Jacobian."""
     rng = np.random.default_rng(0)
@@ -86,11 +98,11 @@ def cameras(size):
 
     calls = [lambda: solve_camera(obs, "line", T0, search=False), lambda: scipy(obs.crossing_points)]
     ours, theirs = seconds(3 * size["repeats"], *calls)
-    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours
+    yield "camera_solve_ms", 1000 * ours, "camera_solve_vs_scipy", "scipy lm, numeric Jacobian", theirs / ours, calls[0]
     calls = [lambda: solve_camera(trials, "line", T0), lambda: [scipy(p) for p in some]]
     ours, theirs = seconds(size["repeats"], *calls)
     faster = theirs * len(points) / len(some) / ours
-    yield "monte_carlo_1000_s", ours, "monte_carlo_vs_scipy", "scipy in a loop", faster
+    yield "monte_carlo_1000_s", ours, "monte_carlo_vs_scipy", "scipy in a loop", faster, calls[0]
 
 
 def problem(count):
@@ -146,14 +158,15 @@ def with_gtsam(count):
 
 def joint(size):
     """The whole joint estimate, start values included, against GTSAM's iterations alone (on less: no beams)."""
-    obs, calls = problem(size["joint"]), []
+    obs = problem(size["joint"])
+    calls = [lambda: solve_joint(obs)]
     try:
-        calls = [with_gtsam(size["joint"])]
+        calls.append(with_gtsam(size["joint"]))
     except ImportError:
         print("no GTSAM here: its ratio stays empty", file=sys.stderr)
-    ours, *others = seconds(size["repeats"], lambda: solve_joint(obs), *calls)
+    ours, *others = seconds(size["repeats"], *calls)
     faster = others[0] / ours if others else np.nan
-    yield "joint_100_s", ours, "joint_vs_gtsam", "GTSAM's iterations, a factor a placement", faster
+    yield "joint_100_s", ours, "joint_vs_gtsam", "GTSAM's iterations, a factor a placement", faster, calls[0]
 
 
 def scene(rng, count):
@@ -192,7 +205,7 @@ def colouring(size):
 
     ours, tenth = seconds(size["repeats"], paint, with_opencv)
     against = "cv2.projectPoints, depth buffer, cv2.remap"
-    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours
+    yield "colour_mpoints_per_s", count / 1e6 / ours, "colour_vs_cv2", against, 10 * tenth / ours, paint
 
 
 def decoding(size):
@@ -205,7 +218,7 @@ def decoding(size):
         return decode_scans(data, stream.offset, stream.length)
 
     ours, theirs = seconds(size["repeats"], whole, lambda: [decode_scan(one) for one in raw])
-    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours
+    yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours, whole
 
 
 def commands(size):
@@ -219,40 +232,67 @@ def commands(size):
                 environment = os.environ | {"LRFCAL_CACHE": f"{folder}/cache", "PYTHONPATH": str(ROOT)}
                 where = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL}
                 taken = elapsed(partial(subprocess.run, command, check=True, **where))
-        yield key, taken, None, "", np.nan
+        yield key, taken, None, "", np.nan, None
 
 
 def paint_blocks(count):
-    """Colour so many points block by block; the largest memory of this process, MB."""
+    """Colour so many points block by block: seconds and the largest memory of this process, MB."""
     image = np.random.default_rng(1).integers(0, 255, (768, 1024, 3), dtype=np.uint8)
-    one, ahead = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1))
+    one, ahead, taken = painter(image), np.tile(np.float32([0, 0, -1]), (min(count, CHUNK), 1)), 0.0
+    one.paint(scene(np.random.default_rng(0), 10), ahead[:10])  # loads the compiled loops
     for work in (one.hide, lambda points: one.paint(points, ahead)):
         rng = np.random.default_rng(2)  # the same points again
         for start in range(0, count, CHUNK):
-            work(scene(rng, min(CHUNK, count - start)))
+            points = scene(rng, min(CHUNK, count - start))
+            begin = time.perf_counter()
+            work(points)
+            taken += time.perf_counter() - begin
     status = Path("/proc/self/status").read_text()  # getrusage would count the parent's memory
-    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+    return taken, int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def memory(size):
-    """Of colouring many points, in a process of its own."""
-    command = [sys.executable, __file__, "--paint", str(size["painted"])]
-    peak = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    yield "peak_mb_1e8_points", peak, None, "", np.nan
+def growth(size):
+    """Time and memory by number of points (a process each) and of placements."""
+    for count in size["growth"]:
+        command = [sys.executable, __file__, "--paint", str(count)]
+        taken, peak = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        yield "colouring", "points", count, taken, peak
+    for count in size["placements"]:
+        obs = problem(count)
+        taken = seconds(min(size["repeats"], 3), lambda obs=obs: solve_joint(obs))[0]
+        yield "joint estimate", "placements", count, taken, memory(lambda obs=obs: solve_joint(obs))
+
+
+def plot(table, path):
+    """Time and memory over size, both logarithmic."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for ax, (what, rows) in zip(axes, table.groupby("what"), strict=True):
+        ax.loglog(rows["count"], rows["seconds"], "o-", label="seconds")
+        ax.loglog(rows["count"], rows["peak_mb"], "s--", label="memory, MB")
+        ax.set(title=what, xlabel=rows["of"].iloc[0])
+        ax.grid(alpha=0.3)
+        ax.legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 def main(out, size=None):
-    """Measure everything at a size and write bench.json and bench.csv."""
+    """Measure everything at a size and write bench.json, bench.csv and growth.png."""
     size, rows, figures = size or FULL, [], {}
-    for part in (cameras, joint, colouring, decoding, commands, memory):
-        for key, value, ratio_key, against, times_faster in part(size):
-            rows.append([key, value, against, times_faster])
+    for part in (cameras, joint, colouring, decoding, commands):
+        for key, value, ratio_key, against, times_faster, call in part(size):
+            rows.append([key, value, against, times_faster, memory(call) if call else np.nan])
             figures |= {key: value, ratio_key: times_faster} if ratio_key else {key: value}
             print(f"{key} {value:.4g}" + (f", {times_faster:.3g} times {against}" if against else ""), flush=True)
+    grown = pd.DataFrame(growth(size), columns=["what", "of", "count", "seconds", "peak_mb"])
+    figures["peak_mb_1e8_points"] = grown[grown["of"] == "points"]["peak_mb"].iloc[-1]
+    print(grown.round(3).to_string(index=False))
     out.mkdir(parents=True, exist_ok=True)
-    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster"])
+    table = pd.DataFrame(rows, columns=["figure", "value", "against", "times_faster", "memory_mb"])
     table.to_csv(out / "bench.csv", index=False, float_format="%.5g")
+    plot(grown, out / "growth.png")
     figures = {key: None if np.isnan(value) else float(f"{value:.5g}") for key, value in figures.items()}
+    figures["growth"] = json.loads(grown.to_json(orient="records"))
     figures["sizes"], figures["machine"] = size, {"cpus": os.cpu_count(), "load": os.getloadavg()[0]}
     (out / "bench.json").write_text(json.dumps(figures, indent=1) + "\n")
 
@@ -264,6 +304,6 @@ if __name__ == "__main__":
     parser.add_argument("--paint", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.paint:
-        print(paint_blocks(options.paint))
+        print(json.dumps(paint_blocks(options.paint)))
     else:
         main(options.out, FULL | ({"session": None} if options.without_commands else {}))

@@ -160,12 +160,10 @@ def test_corners_are_found_at_subpixel_level(roll, negative, limit):
     assert np.sqrt(np.mean(off**2)) < limit
 
 
-def test_corners_run_clockwise_also_in_a_mirrored_image_and_in_a_grey_one():
-    picture = render(pose_of())
-    found = find_pattern(picture[:, ::-1].copy()).reshape(4, 6, 2)
+def test_corners_run_clockwise_also_in_a_mirrored_image():
+    found = find_pattern(render(pose_of())[:, ::-1].copy()).reshape(4, 6, 2)
     x, y = found[0, -1] - found[0, 0], found[-1, 0] - found[0, 0]
     assert x[0] * y[1] - x[1] * y[0] > 0
-    np.testing.assert_allclose(find_pattern(picture[..., 0]), find_pattern(picture), atol=0.01)
 
 
 @pytest.mark.parametrize(("shape", "kind", "message"), [

@@ -15,7 +15,9 @@ from lrfcal_lib.preprocess import survey
 from lrfcal_lib.session.read import ImageRecord, open_session
 from lrfcal_lib.session.stated import transform_from_json
 
-HALF, MIRROR = Rotation.from_rotvec([0, 0, np.pi]), Rotation.from_rotvec([np.pi, 0, 0])
+HALF = Rotation.from_rotvec([0, 0, np.pi])
+
+
 @pytest.fixture(scope="module")
 def centred(tmp_path_factory):
     return open_session(
