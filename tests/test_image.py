@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import campaign
 
 from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
@@ -538,6 +539,7 @@ def test_real_stereo(lms400):
     assert np.all(np.abs(off) < 3 * np.hypot(sigma, [0.017, 0.038, 0.007, 0.36, 0.14, 0.90]))
 
 
+@campaign
 def test_opencv_stereo_pairs(real_data):
     folder, pattern = real_data / "opencv_stereo13", Chessboard(9, 6, 0.025)
     corners, models = [], []

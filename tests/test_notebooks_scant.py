@@ -49,7 +49,7 @@ def scant(request, tmp_path_factory):
     return request.param, folder / "session", folder / "stages"
 
 
-LATER = ("lines", "07"), ("wall", "05")  # say something of their own, and take the longest
+LATER = ("lines", "03"), ("lines", "07"), ("wall", "04"), ("wall", "05")  # say something of their own, and take long
 
 
 @pytest.mark.parametrize(

@@ -290,8 +290,8 @@ def test_the_end_of_the_process_stops_the_head(tmp_path, way):
         if way != "exit":
             becomes(moving=True)
             process.send_signal(getattr(signal, way))
-        assert process.communicate(timeout=60)[0] == "files closed\n"
-        assert process.returncode == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
+        assert process.wait(timeout=60) == {"exit": 0, "SIGTERM": 143, "SIGINT": -signal.SIGINT}[way]
+        assert process.stdout.read() == "files closed\n"
         becomes(moving=False)
     assert device.error is None
 

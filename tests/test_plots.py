@@ -98,13 +98,6 @@ def test_measured_edges_lie_on_the_rendered_corners(ax):
     assert (picture[drawn[:, 1], drawn[:, 0]] == 0).all() and texts(ax.texts) == ["BC 499.0 mm\ntrue 500.0 mm"]
 
 
-@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
-def test_render_shows_the_nearer_point_whatever_the_order(order):
-    points, colors = np.array([[0, 0, 3.0], [0, 0, 1.0], [0, 0, 2.0]]), np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]])
-    picture = rig.render(points[order], colors[order], IDENTITY, (9, 9))
-    assert set(picture[3:6, 3:6].ravel()) == {2} and (picture == 255).sum() == 3 * (81 - 9)
-
-
 @pytest.mark.parametrize("eye", [[0, 0, 1], [0, 0, 5]])
 def test_look_at_refuses_an_impossible_view(eye):
     with pytest.raises(ValueError, match="choose another eye or another up"):

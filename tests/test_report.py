@@ -15,7 +15,7 @@ import nbformat
 import numpy as np
 import pandas as pd
 import pytest
-from shared import ROOT
+from shared import ROOT, campaign
 from test_session import CAMERAS, HEAD, LRF, wall
 
 from lrfcal_lib.model.board import triangle_board
@@ -209,7 +209,7 @@ sys.exit(report.main(sys.argv[2:3], sys.argv[3]))"""
 ENDS = {signal.SIGTERM: 143, signal.SIGKILL: -9}
 
 
-@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=campaign)], ids=lambda n: n.name)
 def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
     assert {signal.SIGINT, signal.SIGHUP} < set(report.ENDING), "end it as SIGTERM does"
     out = tmp_path / "reports" / "wall"

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 
-from shared import QUICK, ROOT
+from shared import QUICK, ROOT, campaign
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 CALIBRATE = "import os, runpy, sys; {}; runpy.run_module('lrfcal_lib', run_name='__main__', alter_sys=True)"
@@ -18,6 +18,7 @@ RUNS = {  # what comes before, and the environment; libraries that are there alr
 }  # fmt: skip
 
 
+@campaign
 def test_two_runs_side_by_side_give_the_same_bytes(tmp_path):
     base = {key: value for key, value in os.environ.items() if key not in THREADS} | {"PYTHONPATH": str(ROOT)}
     processes = []

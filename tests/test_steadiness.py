@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from shared import campaign
 
 from lrfcal_lib.evaluate.diagnosis import motion_words
 from lrfcal_lib.model.camera import CameraModel
@@ -153,6 +154,7 @@ def nudged(lms400_session):
     return {camera: steadiness.camera_steadiness(made, camera) for camera in session.cameras}
 
 
+@campaign
 def test_the_nudge_of_a_real_rig_is_found(nudged):
     """Without being told where the board is: half of the features lie on it or behind it."""
     for found in nudged.values():
