@@ -3,6 +3,7 @@
 import json
 
 import bench
+from shared import campaign
 
 KEYS = """
 camera_solve_ms camera_solve_vs_scipy monte_carlo_1000_s monte_carlo_vs_scipy joint_100_s joint_vs_gtsam
@@ -10,6 +11,7 @@ colour_mpoints_per_s colour_vs_cv2 decode_mb_per_s calibrate_s report_s peak_mb_
 """.split()
 
 
+@campaign
 def test_the_bench_writes_every_figure(tmp_path):
     bench.main(tmp_path, bench.TINY)
     found = json.loads((tmp_path / "bench.json").read_text())

@@ -2,10 +2,12 @@
 
 import pytest
 from notebook_runs import GOLDEN, NOTEBOOKS, WITH_SESSION, check_tables, run_plainly, tables_of
-from shared import QUICK, stages
+from shared import QUICK, campaign, stages
 
 
-@pytest.mark.parametrize("path", WITH_SESSION, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=campaign if p.stem > "05" else (), id=p.stem) for p in WITH_SESSION]
+)
 def test_tables_of_the_small_session(path, tmp_path):
     run_plainly(path, QUICK, stages(), tmp_path, drawn=False)  # figures are looked at on both larger sessions
     check_tables(tmp_path, "sim_quick", path)

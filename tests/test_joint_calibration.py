@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shared import QUICK
+from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
@@ -64,6 +64,7 @@ def test_it_is_handed_over_with_its_platform_and_sensor(quick):
     assert "sensor" not in calibration_record(quick, "line")
 
 
+@campaign
 def test_what_did_not_converge_is_not_handed_over(quick):
     bad = replace(quick.joint.solution, solution=replace(quick.joint.solution.solution, converged=False))
     assert tables.handed_over(replace(quick, joint=replace(quick.joint, solution=bad))) in ("line", "zhang_pless")

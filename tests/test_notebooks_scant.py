@@ -83,6 +83,7 @@ def test_calibrate_writes_what_is_handed_over_with_its_axis(scant, tmp_path, mon
     assert (np.diag(written["platform"]["axis_covariance"]) > 0).all(), "an axis that no data show is as stated"
 
 
+@campaign
 def test_half_of_the_scans_without_ranges_is_a_verdict(tmp_path):
     path = record(tmp_path / "session", rectangle(0.02), pitch_deg=np.arange(-14.0, 15.0, 2.0))
     scans = dict(np.load(path / "lrf/scans.npz"))

@@ -10,11 +10,8 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
 from lrfcal_lib.evaluate.uncertainty import SigmaMap
-from lrfcal_lib.model.camera import CameraModel, pinhole, project, undistort
 from lrfcal_lib.plots import recording, results, rig
 from lrfcal_lib.session.read import Sweep
-
-MODEL = CameraModel(640, 480, 500.0, 505.0, 320.0, 240.0, np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))
 
 
 @pytest.fixture
@@ -35,10 +32,6 @@ def scan():
     sweep, mask = Sweep(4, ranges, np.radians(np.arange(70.0, 111.0)), pitch, np.full(6, np.nan)), ranges < 2.5
     on_board = np.where(mask, ranges, np.nan)
     return SimpleNamespace(placement=4, sweep=sweep, mask=mask, filtered=on_board, fitted=on_board + 0.001)
-
-
-def image_edge(*ends):
-    return SimpleNamespace(ends=np.array(ends))
 
 
 def labels(ax):
@@ -74,13 +67,6 @@ def test_edge_of_line_marks_the_crossing_of_its_end(ax, scan, end, bearing):
         recording.edge_of_line(ax, scan, 0)
     with pytest.raises(ValueError, match="plane must be one of xz, yz, xy, got 'zz'"):
         recording.projection(ax, {}, "zz")
-
-
-def test_an_image_edge_goes_back_through_the_lens():
-    edge, points = image_edge((60.0, 40.0), (580.0, 60.0)), np.array([[-0.4, -0.3, 1.2], [0.3, 0.2, 0.9]])
-    np.testing.assert_allclose(undistort(recording.stretch_in_image(edge, MODEL), MODEL)[[0, -1]], edge.ends, atol=1e-6)
-    ends = recording.stretch_in_image(image_edge(*pinhole(points, MODEL)), MODEL, 2)
-    np.testing.assert_allclose(ends, project(points, MODEL), atol=1e-9)
 
 
 IDENTITY = RigidTransform.identity()

@@ -146,7 +146,7 @@ def stored(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("width", [1280, pytest.param(400, marks=campaign)])
 def test_nothing_is_cut_off_and_nothing_fetched(finished, stored, browser, width):
     view, said = browser.new_page(viewport={"width": width, "height": 800}), []
     view.set_default_timeout(120_000)  # a busy machine takes its time
@@ -209,7 +209,8 @@ sys.exit(report.main(sys.argv[2:3], sys.argv[3]))"""
 ENDS = {signal.SIGTERM: 143, signal.SIGKILL: -9}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=campaign)], ids=lambda n: n.name)
+@campaign
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 def test_an_ended_report_leaves_the_old_one(session, tmp_path, line, number):
     assert {signal.SIGINT, signal.SIGHUP} < set(report.ENDING), "end it as SIGTERM does"
     out = tmp_path / "reports" / "wall"

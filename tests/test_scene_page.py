@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from shared import campaign
 
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.plots import interactive
@@ -31,6 +32,7 @@ def test_the_page_holds_everything_itself(tmp_path):
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "nothing comes from the network"
 
 
+@campaign
 @pytest.mark.parametrize("browser", [BY_THE_PROCESSOR], indirect=True, ids=["webgl"])
 def test_a_browser_draws_it(tmp_path, browser):
     view = browser.new_page(viewport={"width": 900, "height": 700})
