@@ -107,7 +107,7 @@ def execute(path, environment):
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
     _CLIENTS.add(client)
     try:
-        client.execute(env={**os.environ, **environment})
+        client.execute(env={**os.environ, "MPLBACKEND": "", **environment})  # that of notebooks
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
         error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__  # no colours of a terminal
     finally:
