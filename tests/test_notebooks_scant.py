@@ -49,7 +49,8 @@ def scant(request, tmp_path_factory):
     return request.param, folder / "session", folder / "stages"
 
 
-LATER = ("lines", "03"), ("lines", "07"), ("wall", "04"), ("wall", "05")  # say something of their own, and take long
+# say something of their own, and take long
+LATER = ("lines", "03"), ("lines", "07"), ("wall", "04"), ("wall", "05"), ("edges", "07")
 
 
 @pytest.mark.parametrize(
