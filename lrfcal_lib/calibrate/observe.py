@@ -36,7 +36,7 @@ def stack(prefix, parts):
 
 def observe(
     prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
-    faces=FACE_POINTS,
+    faces=FACE_POINTS, made=None,
 ):
     """Pair what the LRF and one camera saw of the board.
 
@@ -54,6 +54,8 @@ def observe(
         :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
     crossings, faces : int
         Kept of each edge and of the face of a placement, evenly spread; without `faces` only crossings are paired.
+    made : dict, optional
+        Filled with what other calls with the same `T_head_lrf`, `correct` and `faces` need not work out again.
 
     Returns
     -------
@@ -64,7 +66,7 @@ def observe(
     pattern = np.zeros((0, 3)) if board.pattern is None else raised_points(board.pattern, prepared.relief)
     n, k = len(posed), len(pattern)
     pixels = [np.full((k, 2), np.nan) if view.pixels is None else view.pixels for view in posed.values()]
-    planes, crossed, one_scan = [], [], variant == ONE_SCAN
+    planes, crossed, one_scan, made = [], [], variant == ONE_SCAN, {} if made is None else made
     variant = "last_beam" if one_scan else variant
     for placement, scan in prepared.scans.items():
         view = prepared.views[camera].get(placement)
@@ -72,10 +74,13 @@ def observe(
             continue
         turn = source_of(prepared, camera, placement, T_head_lrf, correct)
         if placement in posed and faces:
-            points, pitch, covariance = face_points(scan, faces)
-            R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
-            points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-            planes.append({"points": points, "covariance": covariance, "pitch": pitch, "placement": number})
+            if (camera, placement) not in made:
+                points, pitch, covariance = face_points(scan, faces)
+                R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
+                points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
+                face = {"points": points, "covariance": covariance, "pitch": pitch, "placement": number}
+                made[camera, placement] = face
+            planes.append(made[camera, placement])
         crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
     return CameraObservations(
         camera=camera,
@@ -89,14 +94,14 @@ def observe(
         pattern_sigma_px=max(model.rms_px or 0.0, 0.05),
         **stack("plane_", planes),
         **stack("crossing_", crossed),
-        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf) if faces else ()),
+        **stack("scene_", _corners(prepared, camera, variant, T_head_lrf, made) if faces else ()),
     )
 
 
 def observe_all(prepared, T_head_lrf=None):
     """Observations of all cameras in every edge-point variant, keyed by (camera, variant)."""
-    keys = product(prepared.views, (*VARIANTS, ONE_SCAN))
-    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf) for camera, variant in keys}
+    keys, made = product(prepared.views, (*VARIANTS, ONE_SCAN)), {}
+    return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, made=made) for camera, variant in keys}
 
 
 def source_of(prepared, camera, placement, T_head_lrf, correct=as_recorded):
@@ -149,14 +154,16 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         }
 
 
-def _corners(prepared, camera, variant, T_head_lrf):
+def _corners(prepared, camera, variant, T_head_lrf, made):
     """Corners of the outline that the cloud and the image can both name: where two fitted edges meet."""
     edges, mount = prepared.board.edges, prepared.session.cameras[camera].mount
     for placement in prepared.names:
         view = prepared.views[camera].get(placement)
         if view is None or placement not in prepared.scans or placement not in prepared.swept[variant]:
             continue
-        board = outline_of(prepared, placement, variant, T_head_lrf)[0]
+        if (placement, variant) not in made:  # the same for all cameras
+            made[placement, variant] = outline_of(prepared, placement, variant, T_head_lrf)[0]
+        board = made[placement, variant]
         for before, name in zip(edges[-1:] + edges[:-1], edges, strict=True):
             seen = view.edge(name), view.edge(before)
             if name not in board.corners or None in seen:

@@ -345,8 +345,8 @@ def with_joint(calibration, joint):
     platform = calibration.platform
     if isinstance(joint, str):
         return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
-    cameras = joint.observations.cameras
-    seen = {(camera, "joint"): joint.seen_by(camera) for camera in cameras}
+    cameras, made = joint.observations.cameras, {}
+    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance
