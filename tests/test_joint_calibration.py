@@ -47,8 +47,8 @@ def test_corrections_undo_what_the_estimate_found(joint):
     solution = joint.solution
     p = np.array([[0.3, 1.8, 0.0], [-0.2, 1.1, 0.0]])
     away = p * (1 + solution.sensor["range_offset"] / np.linalg.norm(p, axis=1, keepdims=True))
-    back, pitch = solution.correct(99, away, np.array([0.1, -0.2]))
-    np.testing.assert_allclose(back, p, atol=2e-5)
+    pitch = solution.corrections.pitch(99, np.array([0.1, -0.2]))
+    np.testing.assert_allclose(solution.corrections.points(away), p, atol=2e-5)
     np.testing.assert_allclose(pitch, np.array([0.1, -0.2]) * (1 + solution.sensor["pitch_scale"]))
 
 

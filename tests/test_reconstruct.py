@@ -10,10 +10,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
 from lrfcal_lib.calibrate import reconstruct as rec
-from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
@@ -126,7 +126,7 @@ def step_edge(bearing, pitch):
 
 
 def whole(sweep, views=(), **options):
-    return rec.join(rec.reconstruct(sweep, views, STILL, as_recorded, lrf=LRF, **options))
+    return rec.join(rec.reconstruct(sweep, views, STILL, AS_RECORDED, lrf=LRF, **options))
 
 
 def test_mixed_pixels_go_and_sound_points_stay():
@@ -186,7 +186,7 @@ def test_a_plain_wall_loses_next_to_nothing_and_a_pinpoint_sensor_nothing():
     assert whole(noisy).removed < 0.001 * noisy.ranges.size
     _, edge = scan(step_edge)
     info = replace(LRF, spot_exit=None, spot_divergence=None)
-    assert rec.join(rec.reconstruct(edge, (), STILL, as_recorded, lrf=info)).removed == 0
+    assert rec.join(rec.reconstruct(edge, (), STILL, AS_RECORDED, lrf=info)).removed == 0
 
 
 def test_normals_point_to_the_sensor_up_to_the_edge():
@@ -200,7 +200,7 @@ def test_blocks_are_the_whole(monkeypatch, tmp_path):
     views = [view(plain_image(), pose=AHEAD), view(plain_image(140), pose=AHEAD, number=1)]
     at_once = whole(noisy, views)
     monkeypatch.setattr(rec, "BLOCK", 9 * len(BEARINGS))
-    blocks = list(rec.reconstruct(noisy, views, STILL, as_recorded, lrf=LRF))
+    blocks = list(rec.reconstruct(noisy, views, STILL, AS_RECORDED, lrf=LRF))
     assert len(blocks) == 6
     for name in rec.ROWS:
         np.testing.assert_allclose(getattr(rec.join(blocks), name), getattr(at_once, name), atol=1e-6, err_msg=name)
@@ -292,7 +292,7 @@ def test_real_sweeps_are_the_published_clouds(real_data, number):
     bearings, pitch = np.radians(raw["beam_deg"]), np.radians(raw["tilt_deg"])
     lrf = LrfInfo("SICK", (bearings[0], bearings[-1]), bearings[1] - bearings[0], 0.01)
     sweep = Sweep(1, ranges, bearings, pitch, np.arange(len(pitch)) * 0.1)
-    cloud = rec.join(rec.reconstruct(sweep, (), STILL, as_recorded, lrf=lrf))
+    cloud = rec.join(rec.reconstruct(sweep, (), STILL, AS_RECORDED, lrf=lrf))
     published = np.loadtxt(real_data / "kurt3d" / f"scan{number:03d}.3d")[np.isfinite(ranges).ravel()] / 100
     miss = np.linalg.norm(cloud.points - published[:, [0, 2, 1]] * [1, 1, -1], axis=1)
     assert miss.max() < 1e-4 and np.median(miss) < 1e-5

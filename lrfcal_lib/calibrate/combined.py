@@ -90,7 +90,8 @@ def case_of(joint, observations, placement):
         rows = found.side == side
         if name not in shown and not across:  # where a sweep begins and ends may be where a cloud was cut
             told.append(edges.index(name))
-            points, pitch = solution.correct(placement, found.points[rows], found.pitch[rows])
+            points = solution.corrections.points(found.points[rows])
+            pitch = solution.corrections.pitch(placement, found.pitch[rows])
             sides[name] = geometry.lrf_to_platform(points, pitch, solution.T_head_lrf)
     rough = outline.measure_board(face, sides, edges)
     lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])

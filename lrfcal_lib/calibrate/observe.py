@@ -1,13 +1,15 @@
 """Pair what the LRF and the cameras saw: name the sides that scans cross, stack the observations of every method."""
 
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lrfcal_lib.calibrate.outline import as_recorded, cells_of, named_sides, outline_of, platform_of
+from lrfcal_lib.calibrate.outline import cells_of, named_sides, outline_of, platform_of
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, lrf_to_source, tilt
+from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, tilt
+from lrfcal_lib.model.kinematics import AS_RECORDED, Corrections, SourceFrame
 from lrfcal_lib.model.observations import CameraObservations, JointObservations, PlatformObservations
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
@@ -35,8 +37,14 @@ def stack(prefix, parts):
 
 
 def observe(
-    prepared, camera, variant="half_step", T_head_lrf=None, correct=as_recorded, crossings=CROSSINGS_PER_EDGE,
-    faces=FACE_POINTS, made=None,
+    prepared,
+    camera,
+    variant="half_step",
+    T_head_lrf=None,
+    corrections: Corrections = AS_RECORDED,
+    crossings=CROSSINGS_PER_EDGE,
+    faces=FACE_POINTS,
+    made=None,
 ):
     """Pair what the LRF and one camera saw of the board.
 
@@ -49,13 +57,13 @@ def observe(
         middle one of the scan lines that cross both.
     T_head_lrf : RigidTransform, optional
         Platform calibration to use instead of the session's own.
-    correct : callable
-        ``correct(placement, p_lrf, pitch) -> (p_lrf, pitch)`` takes known errors out of what was recorded; see
-        :meth:`lrfcal_lib.solvers.joint.JointSolution.correct`.
+    corrections : Corrections
+        Known errors of what was recorded, which are taken out of points and pitch; see
+        :attr:`lrfcal_lib.solvers.joint.JointSolution.corrections`.
     crossings, faces : int
         Kept of each edge and of the face of a placement, evenly spread; without `faces` only crossings are paired.
     made : dict, optional
-        Filled with what other calls with the same `T_head_lrf`, `correct` and `faces` need not work out again.
+        Filled with what other calls with the same `T_head_lrf`, `corrections` and `faces` need not work out again.
 
     Returns
     -------
@@ -72,16 +80,12 @@ def observe(
         view = prepared.views[camera].get(placement)
         if view is None:
             continue
-        turn = source_of(prepared, camera, placement, T_head_lrf, correct)
+        source = source_of(prepared, camera, placement, T_head_lrf, corrections)
         if placement in posed and faces:
             if (camera, placement) not in made:
-                points, pitch, covariance = face_points(scan, faces)
-                R, number = _rotation(turn, pitch), np.full(len(pitch), placement)
-                points, covariance = turn(points, pitch), R @ covariance @ R.swapaxes(-1, -2)
-                face = {"points": points, "covariance": covariance, "pitch": pitch, "placement": number}
-                made[camera, placement] = face
+                made[camera, placement] = source.face(scan, faces)
             planes.append(made[camera, placement])
-        crossed += _crossings(prepared, placement, view, variant, turn, crossings, one_scan)
+        crossed += _crossings(prepared, placement, view, variant, source, crossings, one_scan)
     return CameraObservations(
         camera=camera,
         source="platform" if prepared.session.cameras[camera].mount == "platform" else "lrf",
@@ -104,21 +108,59 @@ def observe_all(prepared, T_head_lrf=None):
     return {(camera, variant): observe(prepared, camera, variant, T_head_lrf, made=made) for camera, variant in keys}
 
 
-def source_of(prepared, camera, placement, T_head_lrf, correct=as_recorded):
-    """Function of LRF points of a placement and their pitch: moves them into the frame that a camera is fixed to."""
-    mount, image_pitch = prepared.session.cameras[camera].mount, 0.0
+@dataclass(frozen=True)
+class RecordedSource:
+    """Points of one placement as recorded, moved into the frame that a camera is fixed to.
+
+    Known errors of ranges and pitch are taken out first; they change where a point lies, but not how its noise turns.
+    """
+
+    placement: int
+    frame: SourceFrame
+    corrections: Corrections
+
+    def points(self, p_lrf, pitch):
+        """Measured points (n, 3) at their recorded pitch (n,), in the camera's source frame, metres."""
+        corrected = self.corrections.pitch(self.placement, pitch)
+        return self.frame.apply(self.corrections.points(p_lrf), corrected)
+
+    def covariance(self, covariance, pitch):
+        """Covariances (n, 3, 3) of measured points, turned into the source frame."""
+        R = self.rotation(pitch)
+        return R @ covariance @ R.swapaxes(-1, -2)
+
+    def rotation(self, pitch):
+        """Rotation matrices (n, 3, 3) from the LRF at a recorded pitch (n,) to the source frame."""
+        return self.frame.rotation(self.corrections.pitch(self.placement, pitch))
+
+    def by_pitch(self, p_lrf, pitch):
+        """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a radian."""
+        corrected = self.corrections.pitch(self.placement, pitch)
+        return self.frame.by_pitch(self.corrections.points(p_lrf), corrected)
+
+    def face(self, scan, count):
+        """At most `count` points of a board's face, with covariance, pitch and placement: columns by name."""
+        points, pitch, covariance = face_points(scan, count)
+        return {
+            "points": self.points(points, pitch),
+            "covariance": self.covariance(covariance, pitch),
+            "pitch": pitch,
+            "placement": np.full(len(pitch), self.placement),
+        }
+
+
+def source_of(prepared, camera, placement, T_head_lrf, corrections=AS_RECORDED):
+    """The RecordedSource of a placement for one of its cameras."""
+    mount = prepared.session.cameras[camera].mount
+    image_pitch = 0.0
     if mount == "head":
-        image_pitch = float(correct(placement, np.zeros(3), prepared.views[camera][placement].pitch)[1])
-    return lambda p_lrf, pitch: lrf_to_source(*correct(placement, p_lrf, pitch), T_head_lrf, mount, image_pitch)
+        recorded = prepared.views[camera][placement].pitch
+        image_pitch = float(corrections.pitch(placement, recorded))
+    frame = SourceFrame(T_head_lrf, mount, image_pitch)
+    return RecordedSource(placement, frame, corrections)
 
 
-def _rotation(turn, pitch):
-    """From the LRF at some pitch angles to the frame that points are turned to, shape (n, 3, 3)."""
-    origin, *axes = turn(np.broadcast_to(np.eye(4, 3, -1)[:, None], (4, len(pitch), 3)), pitch)
-    return np.stack(axes, axis=-1) - origin[..., None]
-
-
-def _crossings(prepared, placement, view, variant, turn, count, one_scan):
+def _crossings(prepared, placement, view, variant, source, count, one_scan):
     """Crossings of named sides with the image line of the same edge, thinned evenly along each edge."""
     middle = np.mean(prepared.scans[placement].sweep.pitch)
     sides = list(named_sides(prepared, placement, variant))
@@ -134,16 +176,17 @@ def _crossings(prepared, placement, view, variant, turn, count, one_scan):
         rows = thin(np.flatnonzero(found.side == side), count)
         if one_scan:
             rows = np.flatnonzero((found.side == side) & np.isin(found.line, both[len(both) // 2 :][:1]))
-        p_lrf, pitch, n, step = found.points[rows], found.pitch[rows], len(rows), 1e-6
-        points, *beside = turn(np.stack([p_lrf] * 3), pitch + step * np.array([[0.0], [1.0], [-1.0]]))
-        moved = (beside[0] - beside[1]) / (2 * step) * prepared.pitch_noise.sigma(pitch, middle)[:, None]
-        R, error = _rotation(turn, pitch), moved[:, :, None] * moved[:, None, :]  # of the recorded pitch
+        n = len(rows)
+        p_lrf = found.points[rows]
+        pitch = found.pitch[rows]
+        by_pitch = source.by_pitch(p_lrf, pitch) * prepared.pitch_noise.sigma(pitch, middle)[:, None]
+        pitch_error = by_pitch[:, :, None] * by_pitch[:, None, :]
         yield {
-            "points": points,
+            "points": source.points(p_lrf, pitch),
             "pitch": pitch,
-            "covariance": R @ found.covariance[rows] @ R.swapaxes(-1, -2) + error,
-            "noise": R @ found.noise[rows] @ R.swapaxes(-1, -2) + error,
-            "half_step": (R @ found.half_step[rows][..., None])[..., 0],
+            "covariance": source.covariance(found.covariance[rows], pitch) + pitch_error,
+            "noise": source.covariance(found.noise[rows], pitch) + pitch_error,
+            "half_step": (source.rotation(pitch) @ found.half_step[rows][..., None])[..., 0],
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": found.background[rows],
             "lines": np.tile(edge.line, (n, 1)),
@@ -242,9 +285,9 @@ def board_maps(prepared, rough):
     for camera, T_camera_source in rough.items():
         for placement, view in prepared.views[camera].items():
             if view.T_camera_board is not None and placement in prepared.scans and placement not in maps:
-                turn = source_of(prepared, camera, placement, platform_of(prepared))
+                source = source_of(prepared, camera, placement, platform_of(prepared))
                 T = view.T_camera_board.inv() * T_camera_source
-                maps[placement] = lambda p_lrf, pitch, T=T, turn=turn: T.apply(turn(p_lrf, pitch))
+                maps[placement] = lambda p_lrf, pitch, T=T, source=source: T.apply(source.points(p_lrf, pitch))
     return maps
 
 

@@ -24,11 +24,6 @@ FAR = np.diag([1e2, 1.0])  # information of a side that no beam tells anything a
 ALONG = np.linspace(0.0, 1.0, 9)  # places along the stretch of an image edge
 
 
-def as_recorded(placement, p_lrf, pitch):
-    """Corrects nothing."""
-    return p_lrf, np.asarray(pitch)
-
-
 @dataclass(frozen=True)
 class MeasuredBoard:
     """The outline of a board as the cloud shows it.
@@ -166,10 +161,9 @@ def likely_outline_of(prepared, placement, model):
     """
     sides, scan = list(named_sides(prepared, placement, stretch=LEAST_STRETCH)), prepared.scans[placement]
     points, pitch, _ = face_points(scan)
-    face = points, model.correct(placement, points, pitch)[1], scan.sigma_range
+    face = points, model.corrections.pitch(placement, pitch), scan.sigma_range
     cells = cells_of(prepared, placement)
-    on_board = polar_to_points(cells.range_m, cells.bearing)
-    cells.pitch = model.correct(placement, on_board, cells.pitch)[1]
+    cells.pitch = model.corrections.pitch(placement, cells.pitch)
     names = {side: name for name, _, side, _ in sides}
     measured = measure_outline(cells, face, names, prepared.board.edges, model)
     return measured, frozenset(name for name, _, _, swept in sides if swept)
@@ -323,14 +317,16 @@ def fused_outline_of(joint, placement):
 
 def edges_in_cloud(solution, prepared, placement):
     """Face points (n, 3) of a placement under a JointSolution, and points of image edges in their plane, by edge."""
-    points, pitch = solution.correct(placement, *face_points(prepared.scans[placement])[:2])
+    recorded, recorded_pitch, _ = face_points(prepared.scans[placement])
+    points = solution.corrections.points(recorded)
+    pitch = solution.corrections.pitch(placement, recorded_pitch)
     face = lrf_to_platform(points, pitch, solution.T_head_lrf)
     pose, sides = plane_frame(face), {}
     for camera, views in prepared.views.items():
         view = views.get(placement)
         if view is None or camera not in solution.transforms:
             continue
-        T_platform_camera = solution.camera_at(camera, solution.correct(placement, np.zeros(3), view.pitch)[1]).inv()
+        T_platform_camera = solution.camera_at(camera, solution.corrections.pitch(placement, view.pitch)).inv()
         lens, o = prepared.models[camera], T_platform_camera.translation
         for edge in view.edges:  # where lines of sight of a few of its points meet the plane
             ends = edge.ends - (edge.ends @ edge.line[:2] + edge.line[2])[:, None] * edge.line[:2]

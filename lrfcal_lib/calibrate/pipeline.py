@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate import reconstruct
 from lrfcal_lib.calibrate.observe import name_sides, observe, observe_all, observe_joint, platform_observations
-from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
+from lrfcal_lib.model.kinematics import AS_RECORDED, camera_at
 from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import all_views
@@ -109,7 +109,9 @@ class JointCalibration:
         :func:`lrfcal_lib.calibrate.observe.observe`.
         """
         solution = solution or self.solution
-        return observe(self.prepared, camera, "half_step", solution.T_head_lrf, solution.correct, **options)
+        return observe(
+            self.prepared, camera, "half_step", solution.T_head_lrf, solution.corrections, **options
+        )
 
 
 @dataclass(frozen=True)
@@ -134,9 +136,12 @@ class Calibration:
     joint: JointCalibration | None = None
 
     def frame(self, method):
-        """``T_head_lrf`` that goes with a method's camera poses, and what takes known errors out of recorded points."""
+        """``T_head_lrf`` that goes with a method's camera poses, and the Corrections of what was recorded."""
         axis = self.platform.axis_with(method)
-        return self.platform.transform(axis), self.joint.solution.correct if axis == "joint" else as_recorded
+        T_head_lrf = self.platform.transform(axis)
+        if axis == "joint":
+            return T_head_lrf, self.joint.solution.corrections
+        return T_head_lrf, AS_RECORDED
 
 
 @cached
@@ -445,15 +450,15 @@ def views_of(calibration, method, placement):
 
     ValueError where there are images and none of them can be posed.
     """
-    session, views, (T_head_lrf, correct) = calibration.prepared.session, [], calibration.frame(method)
+    session = calibration.prepared.session
+    T_head_lrf, corrections = calibration.frame(method)
+    views = []
     records, posed = session.images(placement=placement), [name for name, own in calibration.solutions if own == method]
     for record in records:
         name, mount = record.camera, session.cameras[record.camera].mount
         if (name, method) in calibration.solutions and (mount == "platform" or np.isfinite(record.pitch)):
-            pose = calibration.solutions[name, method].transform
-            if mount == "head":  # while the head stood at this pitch
-                at = float(correct(placement, np.zeros(3), record.pitch)[1])
-                pose = pose * T_head_lrf.inv() * RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0.0, 0.0]))
+            pitch = float(corrections.pitch(placement, record.pitch))
+            pose = camera_at(calibration.solutions[name, method].transform, mount, T_head_lrf, pitch)
             number, model = session.image_records.index(record), calibration.prepared.models[name]
             views.append(reconstruct.View(number, name, pose, model, session.read_image(record)))
     if records and not views:

@@ -227,7 +227,7 @@ def _share(some, count):
         list(pool.map(work, range(WORKERS)))
 
 
-def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mask=None):
+def reconstruct(sweep, views, T_head_lrf, corrections, *, lrf, continuous=False, mask=None):
     """Turn a sweep of any size into coloured points of the platform frame.
 
     Parameters
@@ -236,8 +236,8 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     views : sequence of View
         Images that may colour it.
     T_head_lrf : RigidTransform
-    correct : callable
-        ``(placement, points, pitch)`` as they should have been, for instance `JointSolution.correct`.
+    corrections : Corrections
+        Known errors of ranges and pitch, for instance `JointSolution.corrections`.
     lrf : LrfInfo
         Its spot and noise tell mixed pixels.
     continuous : bool
@@ -259,7 +259,7 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
     turns = np.abs(np.diff(sweep.pitch))
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step
     painter = Painter(views, max(steps), 5 * lrf.sigma_range)  # the farthest and the nearest of a few points of a wall
-    blocks = _Blocks(sweep, steps, T_head_lrf, correct, lrf, continuous)
+    blocks = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
     blocks = list(blocks) if sweep.ranges.size <= 4 * BLOCK else blocks  # they are gone through twice
     some, every = [], max(1, sweep.ranges.size // GAIN_POINTS)
     for points, normals, _, hiding, good, _ in blocks:
@@ -285,8 +285,12 @@ def reconstruct(sweep, views, T_head_lrf, correct, *, lrf, continuous=False, mas
 class _Blocks:
     """Points, normals, scatter, what hides others (at first), sound points, and the scan lines, block by block."""
 
-    def __init__(self, sweep, steps, T_head_lrf, correct, lrf, continuous):
-        self.sweep, self.steps, self.T_head_lrf, self.correct, self.lrf = sweep, steps, T_head_lrf, correct, lrf
+    def __init__(self, sweep, steps, T_head_lrf, corrections, lrf, continuous):
+        self.sweep = sweep
+        self.steps = steps
+        self.T_head_lrf = T_head_lrf
+        self.corrections = corrections
+        self.lrf = lrf
         self.rate = np.gradient(sweep.pitch, sweep.time_s) if continuous and len(sweep.pitch) > 1 else None
         self.sound = {}  # by first line: looked for once, where blocks are gone through twice
 
@@ -298,7 +302,8 @@ class _Blocks:
             low, high = max(0, start - margin), min(lines, rows.stop + margin)
             inner = slice(start - low, rows.stop - low)
             ranges, pitch = sweep.ranges[low:high].astype(float), self._pitch(slice(low, high))
-            p_lrf, pitch = self.correct(sweep.placement, geometry.polar_to_points(ranges, sweep.bearings), pitch)
+            p_lrf = self.corrections.points(geometry.polar_to_points(ranges, sweep.bearings))
+            pitch = self.corrections.pitch(sweep.placement, pitch)
             points = geometry.lrf_to_platform(p_lrf, pitch, self.T_head_lrf)
             hiding, good = points, self.sound.get(start, np.isfinite(ranges))
             if self.lrf.spot_divergence is not None and start not in self.sound:

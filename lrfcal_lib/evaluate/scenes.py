@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.calibrate.outline import as_recorded
 from lrfcal_lib.calibrate.pipeline import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.tables import read_truth
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt
+from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.session.stated import read_json
 
 AT_ONCE = 1 << 16  # points
@@ -157,12 +157,12 @@ def scene_errors(cloud, calibration, method):
     from lrfcal_lib.simulate.rig import load_setup
 
     world = world_of(load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None)
-    T_head_lrf, correct = calibration.frame(method)
+    T_head_lrf, corrections = calibration.frame(method)
     gauge = truth.T_head_lrf * T_head_lrf.inv()
     turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
     sweep = session.sweep(placement)
-    turn += np.mean(truth.pitch[placement] - correct(placement, np.zeros(3), sweep.pitch)[1])
+    turn += np.mean(truth.pitch[placement] - corrections.pitch(placement, sweep.pitch))
     order = np.argsort(sweep.pitch)
     pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])
     points = tilt(cloud.points, turn) + shift
@@ -191,4 +191,4 @@ def as_stated(calibration):
     """The first scene with the platform as it is stated, ranges and pitch as recorded, and no colours; a Cloud."""
     session = calibration.prepared.session
     sweep, T_head_lrf = session.sweep(session.scene_placements[0]), calibration.platform.transform("stated")
-    return join(reconstruct(sweep, [], T_head_lrf, as_recorded, lrf=session.lrf))
+    return join(reconstruct(sweep, [], T_head_lrf, AS_RECORDED, lrf=session.lrf))

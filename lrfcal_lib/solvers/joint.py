@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import minimise, solve
@@ -11,6 +11,7 @@ from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, mov
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_parameters, pose_transform
+from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
@@ -138,30 +139,20 @@ class JointSolution:
         index = sum(map(self.columns, prefixes), [])
         return self.solution.trusted[np.ix_(index, index)]
 
-    def correct(self, placement, p_lrf, pitch):
-        """Measured points (n, 3) and recorded pitch of a placement as they should have been.
-
-        Without the range offset; with scale, offset by direction and the sweep's own errors, as far as they were
-        estimated.
-        """
-        p_lrf, pitch = np.asarray(p_lrf, float), np.asarray(pitch, float)
-        length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
-        points = p_lrf * (1 - self.sensor["range_offset"] / np.maximum(length, 1e-9))
-        corrected = pitch * (1 + self.sensor["pitch_scale"])
-        if placement in self.sweeps:
-            index = list(self.sweeps).index(placement)
-            offset, stretch = self.sweeps[placement]
-            turn = self.sensor["pitch_by_direction"] * self.observations.direction[index]
-            corrected = corrected + turn + offset + stretch * (pitch - self.observations.middle[index])
-        return points, corrected
+    @property
+    def corrections(self) -> Corrections:
+        """Errors of what was recorded, as far as they were estimated: range offset, scale and sweeps of the pitch."""
+        by_direction = self.sensor["pitch_by_direction"]
+        sweeps = {}
+        for row, (placement, (offset, stretch)) in enumerate(self.sweeps.items()):
+            turn = by_direction * self.observations.direction[row]
+            sweeps[placement] = SweepPitch(turn + offset, stretch, self.observations.middle[row])
+        return Corrections(self.sensor["range_offset"], self.sensor["pitch_scale"], sweeps)
 
     def camera_at(self, name, pitch):
         """``T_camera_platform`` of a camera while the head stands at a pitch (radians), or at several."""
-        pose = self.transforms[name]
-        if self.observations.mounts[self.observations.cameras.index(name)] == "platform":
-            return pose
-        turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0])))
-        return pose * self.T_head_lrf.inv() * turn
+        mount = self.observations.mounts[self.observations.cameras.index(name)]
+        return camera_at(self.transforms[name], mount, self.T_head_lrf, pitch)
 
     def camera(self, name):
         """The pose of one camera as a `Solution` like those of the other methods."""

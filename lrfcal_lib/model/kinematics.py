@@ -1,0 +1,127 @@
+"""The way of a beam: from the LRF over the head and the platform to a camera, equations (3) to (6) and (16)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from lrfcal_lib.model.geometry import lrf_to_source, tilt
+
+TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
+
+
+@dataclass(frozen=True)
+class SweepPitch:
+    """How the recorded pitch of one sweep errs: ``offset + stretch * (pitch - middle)`` has to be added to it.
+
+    `offset` and `middle` are in radians, `stretch` is a fraction.
+    """
+
+    offset: float
+    stretch: float
+    middle: float
+
+    def error(self, pitch: np.ndarray) -> np.ndarray:
+        """What has to be added to the recorded pitch, radians."""
+        return self.offset + self.stretch * (pitch - self.middle)
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Known errors of what a rig records; without arguments none.
+
+    Attributes
+    ----------
+    range_offset : float
+        By how much every range is too long, metres.
+    pitch_scale : float
+        The head turns ``1 + pitch_scale`` times as far as its recorded pitch says.
+    sweeps : dict of int to SweepPitch
+        What single sweeps are off by, by placement.
+    """
+
+    range_offset: float = 0.0
+    pitch_scale: float = 0.0
+    sweeps: Mapping[int, SweepPitch] = field(default_factory=dict)
+
+    def points(self, p_lrf: ArrayLike) -> np.ndarray:
+        """Measured points (..., 3) of the LRF frame without the range offset, metres."""
+        p_lrf = np.asarray(p_lrf, float)
+        length = np.linalg.norm(p_lrf, axis=-1, keepdims=True)
+        return p_lrf * (1 - self.range_offset / np.maximum(length, 1e-9))
+
+    def pitch(self, placement: int, recorded: ArrayLike) -> np.ndarray:
+        """The recorded pitch of a placement as it should have been, radians."""
+        recorded = np.asarray(recorded, float)
+        corrected = recorded * (1 + self.pitch_scale)
+        if placement in self.sweeps:
+            corrected = corrected + self.sweeps[placement].error(recorded)
+        return corrected
+
+
+AS_RECORDED = Corrections()
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """The frame that a camera is fixed to, as scan lines at any pitch reach it.
+
+    Attributes
+    ----------
+    T_head_lrf : RigidTransform
+    mount : {'head', 'platform'}
+        What the camera is fixed to.
+    image_pitch : float
+        True pitch at which the image was taken, radians; it matters for a camera on the head only.
+    """
+
+    T_head_lrf: RigidTransform
+    mount: str
+    image_pitch: float = 0.0
+
+    def apply(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Points (..., 3) of scans at some true pitch (...), moved from the LRF frame to this one, metres."""
+        return lrf_to_source(p_lrf, pitch, self.T_head_lrf, self.mount, self.image_pitch)
+
+    def rotation(self, pitch: np.ndarray) -> np.ndarray:
+        """Rotation matrices (n, 3, 3) from the LRF at some true pitch (n,) to this frame."""
+        head = self.T_head_lrf.rotation
+        turn = Rotation.from_rotvec(np.multiply.outer(self._turn(pitch), TILT_AXIS))
+        R_platform_lrf = (turn * head).as_matrix()
+        if self.mount == "platform":
+            return R_platform_lrf
+        return head.as_matrix().T @ R_platform_lrf
+
+    def by_pitch(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+        """Derivative (n, 3) of :meth:`apply` by the pitch, metres a radian."""
+        p_platform = tilt(self.T_head_lrf.apply(p_lrf), self._turn(pitch))
+        velocity = np.cross(TILT_AXIS, p_platform)
+        if self.mount == "platform":
+            return velocity
+        return self.T_head_lrf.rotation.apply(velocity, inverse=True)
+
+    def _turn(self, pitch):
+        """By how much the head turns from where the points of this frame are taken to be seen."""
+        if self.mount == "platform":
+            return np.asarray(pitch)
+        return np.asarray(pitch) - self.image_pitch
+
+
+def camera_at(T_camera: RigidTransform, mount: str, T_head_lrf: RigidTransform, pitch: ArrayLike) -> RigidTransform:
+    """``T_camera_platform`` while the head stands at a true pitch, or at several.
+
+    Parameters
+    ----------
+    T_camera : RigidTransform
+        ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the base.
+    mount : {'head', 'platform'}
+    T_head_lrf : RigidTransform
+    pitch : array_like
+        Radians.
+    """
+    if mount == "platform":
+        return T_camera
+    back = Rotation.from_rotvec(np.multiply.outer(pitch, -TILT_AXIS))
+    return T_camera * T_head_lrf.inv() * RigidTransform.from_rotation(back)
