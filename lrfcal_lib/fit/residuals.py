@@ -1,6 +1,5 @@
 """Residuals with analytic Jacobians: beams about edges, lines of sight, planes, views, priors; padded by placement."""
 
-import math
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 
@@ -10,34 +9,72 @@ from scipy.special import log_ndtr
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import line_distance, line_through, project, undistort
-from lrfcal_lib.model.geometry import cross, gradient_by_pose, hat, move_pose, pose_transform, rotate_points, tilt
+from lrfcal_lib.model.camera import CameraModel, line_distance, line_through, project, undistort
+from lrfcal_lib.model.geometry import (
+    cross,
+    gradient_by_pose,
+    hat,
+    move_pose,
+    moved_noise,
+    noise_correction,
+    pose_transform,
+    rotate_points,
+    tilt,
+)
 
 
-def line_block(pose, obs):
-    """Distances d(e, ab) of projected crossings from their image lines, pixels; equations (16), (19) and (20).
+def line_residuals(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Signed distances of projected points from image lines, equations (19) and (20).
 
-    The sign of the distance is kept, and behind the camera the formula goes on (mirrored), so that a poor start value
-    can still find its way. The whitener holds the crossing's covariance, projected, and the line's.
+    Behind the camera the formula goes on (mirrored), so that a poor start value can still find its way.
+
+    Parameters
+    ----------
+    moved : ndarray, shape (..., n, 3)
+        Points in the camera frame, equation (16), metres.
+    lines : ndarray, shape (..., n, 3)
+        ``(a, b, c)`` with ``a^2 + b^2 = 1``, undistorted pixels.
+    camera : CameraModel
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+        Undistorted pixels; the sign is that of the line.
     """
-    from lrfcal_lib.fit.loops import line_rows  # numba, which few need
+    u = camera.fx * moved[..., 0] / moved[..., 2] + camera.cx  # (19)
+    v = camera.fy * moved[..., 1] / moved[..., 2] + camera.cy
+    return lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]  # (20)
 
-    trials, m = np.broadcast_shapes(pose.shape[:-2], obs.crossing_points.shape[:-2]), obs.model
-    residuals, whitener = np.empty((2, *trials, obs.crossing_points.shape[-2]))
-    jacobian, corrected = np.empty((2, *residuals.shape, 6))
-    given = pose, obs.crossing_points, obs.crossing_covariance, obs.crossing_lines, obs.crossing_line_sigma
-    out = residuals, whitener, jacobian, corrected
 
-    def flat(v, own):
-        """With one leading axis, of all trials or of one that stands for all."""
-        return v[None] if v.ndim == own else v.reshape((math.prod(v.shape[: v.ndim - own]), *v.shape[v.ndim - own :]))
+def line_gradients(moved: np.ndarray, lines: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Derivatives (..., n, 3) of :func:`line_residuals` by the moved points, pixels a metre."""
+    by_x = lines[..., 0] * camera.fx / moved[..., 2]
+    by_y = lines[..., 1] * camera.fy / moved[..., 2]
+    by_z = -(by_x * moved[..., 0] + by_y * moved[..., 1]) / moved[..., 2]
+    return np.stack([by_x, by_y, by_z], axis=-1)
 
-    line_rows(
-        *(flat(np.ascontiguousarray(v, float), own) for v, own in zip(given, (2, 2, 3, 2, 1), strict=True)),
-        np.array([m.fx, m.fy, m.cx, m.cy]),
-        *(flat(v, own) for v, own in zip(out, (1, 1, 2, 2), strict=True)),
-    )
-    return Block(residuals, jacobian, whitener, corrected=corrected)
+
+def line_block(pose: np.ndarray, obs) -> Block:
+    """Distances d(e, ab) of projected crossings from their image lines: :func:`line_residuals` as a Block.
+
+    The whitener holds the crossing's covariance, projected, and the line's; `corrected` is the Jacobian without what
+    errors of the crossings put into it (:func:`lrfcal_lib.model.geometry.noise_correction`).
+
+    Parameters
+    ----------
+    pose : ndarray, shape (..., 3, 4)
+        ``T_camera_source``.
+    obs : CameraObservations
+    """
+    rotated = rotate_points(pose, obs.crossing_points)
+    moved = rotated + pose[..., None, :, 3]  # (16)
+    residuals = line_residuals(moved, obs.crossing_lines, obs.model)
+    gradients = line_gradients(moved, obs.crossing_lines, obs.model)
+    jacobian = gradient_by_pose(rotated, gradients)
+    noise = moved_noise(pose, gradients, obs.crossing_covariance)
+    variance = np.vecdot(gradients, noise) + obs.crossing_line_sigma**2
+    correction = noise_correction(rotated, moved, gradients, noise, residuals / variance)
+    return Block(residuals, jacobian, 1 / np.sqrt(variance), corrected=jacobian - correction)
 
 
 def read_pose(pose):
