@@ -28,9 +28,13 @@ def test_a_range_offset_does_not_shrink_the_noise(mount):
     covariance = polar_covariance(RANGES, BEARINGS, 0.01, 0.001)
     R = source(mount, WRONG).rotation(PITCH)
     np.testing.assert_allclose(np.linalg.det(R), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(R @ R.swapaxes(-1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        R @ R.swapaxes(-1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12
+    )
     turned = source(mount, WRONG).covariance(covariance, PITCH)
-    np.testing.assert_allclose(np.trace(turned, axis1=1, axis2=2), np.trace(covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(
+        np.trace(turned, axis1=1, axis2=2), np.trace(covariance, axis1=1, axis2=2)
+    )
 
 
 @pytest.mark.parametrize("mount", ["head", "platform"])
@@ -41,7 +45,9 @@ def test_rotation_and_derivative_are_those_of_the_points(mount):
     rotated = (frame.rotation(PITCH) @ p_lrf[..., None])[..., 0]
     np.testing.assert_allclose(frame.apply(p_lrf, PITCH), origin + rotated, atol=1e-14)
     beside = [frame.apply(p_lrf, PITCH + step) for step in (1e-6, -1e-6)]
-    np.testing.assert_allclose(frame.by_pitch(p_lrf, PITCH), (beside[0] - beside[1]) / 2e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        frame.by_pitch(p_lrf, PITCH), (beside[0] - beside[1]) / 2e-6, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("corrections", [AS_RECORDED, WRONG])
@@ -52,7 +58,9 @@ def test_a_point_reaches_a_camera_on_the_head_over_the_base_as_well(corrections)
     pitch = corrections.pitch(4, PITCH)
     direct = CAMERA.apply(frame.apply(p_lrf, pitch))
     T_camera_platform = camera_at(CAMERA, "head", HEAD, 0.1)
-    np.testing.assert_allclose(T_camera_platform.apply(lrf_to_platform(p_lrf, pitch, HEAD)), direct, atol=1e-12)
+    np.testing.assert_allclose(
+        T_camera_platform.apply(lrf_to_platform(p_lrf, pitch, HEAD)), direct, atol=1e-12
+    )
 
 
 def test_corrections_take_off_what_was_added():

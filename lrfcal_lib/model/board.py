@@ -62,7 +62,8 @@ class Board:
     def lengths(self):
         """Edge lengths in metres, keyed by edge name."""
         corners = self.known_corners()
-        return dict(zip(self.edges, np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1), strict=True))
+        sides = np.roll(corners, -1, axis=0) - corners
+        return dict(zip(self.edges, np.linalg.norm(sides, axis=1), strict=True))
 
     def points(self):
         """Corners of the outline in space, board frame, metres, shape (n, 3)."""
@@ -71,16 +72,19 @@ class Board:
     def known_corners(self):
         """Corners of the outline, metres, shape (n, 2); ValueError where nobody has measured them."""
         if self.corners is None:
-            raise ValueError(f"the outline of board '{self.name}' is not known: measure it from images first")
+            raise ValueError(
+                f"the outline of board '{self.name}' is not known: measure it from images first"
+            )
         return np.asarray(self.corners, float)
 
 
 def outline_lines(corners):
     """Lines ``a x + b y + c = 0`` (n, 3) of a polygon's sides, unit normals outwards; row i from corner i to i + 1."""
     corners = np.asarray(corners, float)
-    along = np.roll(corners, -1, axis=0) - corners
-    turn = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
-    normal = np.sign(turn) * np.stack([along[:, 1], -along[:, 0]], axis=1)
+    following = np.roll(corners, -1, axis=0)
+    along = following - corners
+    twice_area = np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1])
+    normal = np.sign(twice_area) * np.stack([along[:, 1], -along[:, 0]], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return np.column_stack([normal, -np.sum(normal * corners, axis=1)])
 

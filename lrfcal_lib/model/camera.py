@@ -47,24 +47,38 @@ class CameraModel:
     def with_parameters(self, values, covariance=None, rms_px=None):
         """The same image size with other intrinsics, given in the order of `parameters`."""
         fx, fy, cx, cy = (float(v) for v in values[:4])
-        return CameraModel(self.width, self.height, fx, fy, cx, cy, np.asarray(values[4:9], float), covariance, rms_px)
+        return CameraModel(
+            self.width,
+            self.height,
+            fx,
+            fy,
+            cx,
+            cy,
+            np.asarray(values[4:9], float),
+            covariance,
+            rms_px,
+        )
 
 
 def pinhole(p_camera, model):
     """Project points (..., 3) to undistorted pixels (..., 2), NaN where z <= 0; equation (19), K without a lens."""
-    p_camera = np.asarray(p_camera, float)
-    z = np.where(p_camera[..., 2] > 0, p_camera[..., 2], np.nan)
-    return np.stack([model.fx * p_camera[..., 0] / z + model.cx, model.fy * p_camera[..., 1] / z + model.cy], axis=-1)
+    x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
+    z = np.where(z > 0, z, np.nan)
+    u = model.fx * x / z + model.cx
+    v = model.fy * y / z + model.cy
+    return np.stack([u, v], axis=-1)
 
 
 def pinhole_jacobian(p_camera, model):
     """Derivative of :func:`pinhole` by the point, shape (..., 2, 3), pixels per metre."""
     p_camera = np.asarray(p_camera, float)
-    x, y, z = p_camera[..., 0], p_camera[..., 1], p_camera[..., 2]
-    out = np.zeros(p_camera.shape[:-1] + (2, 3))
-    out[..., 0, 0], out[..., 0, 2] = model.fx / z, -model.fx * x / z**2
-    out[..., 1, 1], out[..., 1, 2] = model.fy / z, -model.fy * y / z**2
-    return out
+    x, y, z = np.moveaxis(p_camera, -1, 0)
+    J = np.zeros(p_camera.shape[:-1] + (2, 3))
+    J[..., 0, 0] = model.fx / z  # u by x
+    J[..., 0, 2] = -model.fx * x / z**2  # u by z
+    J[..., 1, 1] = model.fy / z  # v by y
+    J[..., 1, 2] = -model.fy * y / z**2  # v by z
+    return J
 
 
 def distort(normalized, distortion):
@@ -86,7 +100,8 @@ def project(p_camera, model):
     """Project points (..., 3) to pixels (..., 2), NaN where z <= 0; equations (18) and (19)."""
     p_camera = np.asarray(p_camera, float)
     z = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
-    return distort(p_camera[..., :2] / z, model.distortion) * [model.fx, model.fy] + [model.cx, model.cy]
+    distorted = distort(p_camera[..., :2] / z, model.distortion)
+    return distorted * [model.fx, model.fy] + [model.cx, model.cy]
 
 
 def project_jacobians(p_camera, model):
@@ -101,21 +116,31 @@ def project_jacobians(p_camera, model):
     p_camera = np.asarray(p_camera, float)
     k1, k2, k3, k4, k5 = model.distortion
     z = p_camera[..., 2]
-    x, y = p_camera[..., 0] / z, p_camera[..., 1] / z
+    x = p_camera[..., 0] / z
+    y = p_camera[..., 1] / z
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k5)), 2 * (k1 + r2 * (2 * k2 + 3 * k5 * r2))
-    xx = radial + slope * x * x + 2 * k3 * y + 6 * k4 * x
-    xy = slope * x * y + 2 * k3 * x + 2 * k4 * y
-    yy = radial + slope * y * y + 6 * k3 * y + 2 * k4 * x
-    u = np.stack([xx / z, xy / z, -(xx * x + xy * y) / z], -1) * model.fx
-    v = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], -1) * model.fy
-    lens = distort(np.stack([x, y], -1), model.distortion)
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    du = [x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3]  # by k1..k5
-    dv = [y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3]
-    iu = np.stack([lens[..., 0], zero, one, zero, *(model.fx * d for d in du)], -1)
-    iv = np.stack([zero, lens[..., 1], zero, one, *(model.fy * d for d in dv)], -1)
-    return np.stack([u, v], axis=-2), np.stack([iu, iv], axis=-2)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k5 * r2))  # of radial by r2, twice
+
+    xx = radial + slope * x * x + 2 * k3 * y + 6 * k4 * x  # distorted x by x
+    xy = slope * x * y + 2 * k3 * x + 2 * k4 * y  # distorted x by y, and y by x
+    yy = radial + slope * y * y + 6 * k3 * y + 2 * k4 * x  # distorted y by y
+    u_by_point = np.stack([xx / z, xy / z, -(xx * x + xy * y) / z], axis=-1) * model.fx
+    v_by_point = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], axis=-1) * model.fy
+
+    lens_x, lens_y = np.moveaxis(distort(np.stack([x, y], axis=-1), model.distortion), -1, 0)
+    zero = np.zeros_like(x)
+    one = np.ones_like(x)
+    x_by_k = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=-1)
+    y_by_k = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=-1)
+    u_by_matrix = np.stack([lens_x, zero, one, zero], axis=-1)  # fx, fy, cx, cy
+    v_by_matrix = np.stack([zero, lens_y, zero, one], axis=-1)
+    u_by_intrinsics = np.concatenate([u_by_matrix, model.fx * x_by_k], axis=-1)
+    v_by_intrinsics = np.concatenate([v_by_matrix, model.fy * y_by_k], axis=-1)
+
+    by_point = np.stack([u_by_point, v_by_point], axis=-2)
+    by_intrinsics = np.stack([u_by_intrinsics, v_by_intrinsics], axis=-2)
+    return by_point, by_intrinsics
 
 
 def undistort(uv, model):
@@ -131,7 +156,7 @@ def undistort(uv, model):
 
 def line_through(a, b):
     """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels, shape (..., 3)."""
-    a, b = np.broadcast_arrays(np.asarray(a, float), np.asarray(b, float))
+    a, b = np.broadcast_arrays(np.asarray(a, float), b)
     along = b - a
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     if np.any(length == 0):
@@ -142,5 +167,5 @@ def line_through(a, b):
 
 def line_distance(uv, line):
     """Signed distance of pixels from lines, equation (20) with its sign kept; pixels."""
-    uv, line = np.asarray(uv, float), np.asarray(line, float)
-    return np.sum(uv * line[..., :2], axis=-1) + line[..., 2]
+    line = np.asarray(line, float)
+    return np.sum(np.asarray(uv, float) * line[..., :2], axis=-1) + line[..., 2]

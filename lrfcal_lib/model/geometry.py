@@ -13,9 +13,11 @@ class DegenerateGeometry(ValueError):
 def hat(v):
     """Cross-product matrices (..., 3, 3) of vectors (..., 3), ``hat(v) @ u == cross(v, u)``."""
     v = np.asarray(v, dtype=float)
-    out = np.zeros(v.shape + (3,))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return out - np.swapaxes(out, -1, -2)
+    upper = np.zeros(v.shape + (3,))
+    upper[..., 0, 1] = -v[..., 2]
+    upper[..., 0, 2] = v[..., 1]
+    upper[..., 1, 2] = -v[..., 0]
+    return upper - np.swapaxes(upper, -1, -2)
 
 
 def cross(a, b):
@@ -42,15 +44,23 @@ def polar_to_points(ranges, bearings):
         ``p_lrf``, metres; NaN rows where the range is NaN.
     """
     ranges, bearings = np.broadcast_arrays(np.asarray(ranges, float), np.asarray(bearings, float))
-    return np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings), 0.0 * ranges], axis=-1)
+    x = ranges * np.cos(bearings)
+    y = ranges * np.sin(bearings)
+    return np.stack([x, y, 0.0 * ranges], axis=-1)
 
 
 def polar_covariance(ranges, bearings, sigma_range, sigma_bearing):
     """Covariance (..., 3, 3) of polar points in the LRF frame, from independent errors along and across the beam."""
-    ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, np.asarray(sigma_range, float))
-    along = np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], -1) * sigma_range[..., None]
-    across = np.stack([-np.sin(bearings), np.cos(bearings), 0 * bearings], -1) * (ranges * sigma_bearing)[..., None]
-    return along[..., :, None] * along[..., None, :] + across[..., :, None] * across[..., None, :]
+    sigma_range = np.asarray(sigma_range, float)
+    ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, sigma_range)
+    along = polar_to_points(sigma_range, bearings)
+    across = polar_to_points(ranges * sigma_bearing, bearings + np.pi / 2)
+    return _outer(along) + _outer(across)
+
+
+def _outer(v):
+    """``v v^T`` of vectors, shape (..., k) -> (..., k, k)."""
+    return v[..., :, None] * v[..., None, :]
 
 
 def tilt(points, pitch):
@@ -68,10 +78,10 @@ def tilt(points, pitch):
     ndarray, shape (..., 3)
         ``p_platform = Rx(pitch) p_head``.
     """
-    points = np.asarray(points)
-    c, s = np.cos(pitch), np.sin(pitch)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    return np.stack([x + 0 * c, c * y - s * z, s * y + c * z], axis=-1)
+    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
+    cosine = np.cos(pitch)
+    sine = np.sin(pitch)
+    return np.stack([x + 0 * cosine, cosine * y - sine * z, sine * y + cosine * z], axis=-1)
 
 
 def lrf_to_platform(p_lrf, pitch, T_head_lrf):
@@ -110,7 +120,9 @@ def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
         return lrf_to_platform(p_lrf, pitch, T_head_lrf)
     if mount != "head":
         raise ValueError(f"mount is 'head' or 'platform', got '{mount}'")
-    return T_head_lrf.inv().apply(lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf))
+    return T_head_lrf.inv().apply(
+        lrf_to_platform(p_lrf, np.asarray(pitch) - image_pitch, T_head_lrf)
+    )
 
 
 @dataclass(frozen=True)
@@ -129,8 +141,9 @@ class TiltAxis:
     foot: np.ndarray
 
     def __repr__(self):
-        d, f = self.direction, 1000 * self.foot
-        return f"TiltAxis(direction=({d[0]:.5f}, {d[1]:.5f}, {d[2]:.5f}), foot_mm=({f[0]:.1f}, {f[1]:.1f}, {f[2]:.1f}))"
+        direction = ", ".join(f"{value:.5f}" for value in self.direction)
+        foot_mm = ", ".join(f"{1000 * value:.1f}" for value in self.foot)
+        return f"TiltAxis(direction=({direction}), foot_mm=({foot_mm}))"
 
 
 def axis_of(T_head_lrf):
@@ -139,7 +152,8 @@ def axis_of(T_head_lrf):
     Turning about x and sliding along x change nothing.
     """
     lrf_head = T_head_lrf.inv()
-    direction, point = lrf_head.rotation.apply([1.0, 0.0, 0.0]), lrf_head.translation
+    direction = lrf_head.rotation.apply([1.0, 0.0, 0.0])
+    point = lrf_head.translation
     return TiltAxis(direction, point - direction * (direction @ point))
 
 
@@ -148,10 +162,12 @@ def head_from_axis(axis):
 
     It has the smallest rotation that maps the axis' direction to x, and no shift along the axis.
     """
-    d = np.asarray(axis.direction, float)
-    w = np.cross(d, [1.0, 0.0, 0.0])
-    sine, cosine = np.linalg.norm(w), d[0]
-    rotation = Rotation.identity() if sine == 0 else Rotation.from_rotvec(w / sine * np.arctan2(sine, cosine))
+    direction = np.asarray(axis.direction, float)
+    turn = np.cross(direction, [1.0, 0.0, 0.0])
+    sine = np.linalg.norm(turn)
+    rotation = Rotation.identity()
+    if sine > 0:
+        rotation = Rotation.from_rotvec(turn / sine * np.arctan2(sine, direction[0]))
     return RigidTransform.from_components(-rotation.apply(axis.foot), rotation)
 
 
@@ -166,11 +182,14 @@ def paper_parameters(T_head_lrf):
         Metres, never negative. With ``ty = 0`` the axis meets the LRF's origin and phi_x cannot be known (0 is given).
     """
     axis = axis_of(T_head_lrf)
-    d = axis.direction
-    phi_y, phi_z = np.arctan2(d[2], np.hypot(d[0], d[1])), np.arctan2(-d[1], d[0])
-    turned = Rotation.from_euler("YZ", [phi_y, phi_z]).apply(-axis.foot)
-    ty = float(np.hypot(turned[1], turned[2]))
-    phi_x = float(np.arctan2(-turned[2], turned[1])) if ty > 0 else 0.0
+    x, y, z = axis.direction
+    phi_y = np.arctan2(z, np.hypot(x, y))
+    phi_z = np.arctan2(-y, x)
+    _, away_y, away_z = Rotation.from_euler("YZ", [phi_y, phi_z]).apply(-axis.foot)
+    ty = float(np.hypot(away_y, away_z))
+    phi_x = 0.0
+    if ty > 0:
+        phi_x = float(np.arctan2(-away_z, away_y))
     return np.array([phi_x, phi_y, phi_z]), ty
 
 
@@ -181,19 +200,23 @@ def head_from_paper(phi, ty):
 
 def axis_difference(a, b):
     """Angle between two axes (radians) and the distance of their foot points (metres)."""
-    angle = np.arctan2(np.linalg.norm(np.cross(a.direction, b.direction)), a.direction @ b.direction)
-    return float(angle), float(np.linalg.norm(a.foot - b.foot))
+    sine = np.linalg.norm(np.cross(a.direction, b.direction))
+    angle = float(np.arctan2(sine, a.direction @ b.direction))
+    return angle, float(np.linalg.norm(a.foot - b.foot))
 
 
 def transform_difference(a, b):
     """Rotation angle (radians) and translation distance (metres) between two transforms with the same frames."""
-    return float((a.rotation * b.rotation.inv()).magnitude()), float(np.linalg.norm(a.translation - b.translation))
+    turn = a.rotation * b.rotation.inv()
+    return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
 
 
 def _principal(points):
     """Centre of points (n, 3), and variances along their principal axes (columns), the smallest first."""
     centre = np.mean(points, axis=0)
-    return centre, *np.linalg.eigh((points - centre).T @ (points - centre) / len(points))
+    away = points - centre
+    variances, axes = np.linalg.eigh(away.T @ away / len(points))
+    return centre, variances, axes
 
 
 def fit_plane(points):
@@ -208,8 +231,12 @@ def fit_plane(points):
         raise DegenerateGeometry(f"a plane needs three points, got {len(points)}")
     centre, values, vectors = _principal(points)
     if values[1] < 1e-12 * max(values[2], 1e-300):
-        raise DegenerateGeometry("the points lie on one line: the rotation of a plane about it stays unobservable")
-    normal = vectors[:, 0] * (-1.0 if vectors[:, 0] @ centre < 0 else 1.0)
+        raise DegenerateGeometry(
+            "the points lie on one line: the rotation of a plane about it stays unobservable"
+        )
+    normal = vectors[:, 0]
+    if normal @ centre < 0:
+        normal = -normal
     return normal, float(normal @ centre), float(np.sqrt(max(values[0], 0.0)))
 
 
@@ -236,32 +263,43 @@ def pose_array(transform):
 def pose_transform(pose, proper=False):
     """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4); `proper` ones hold exact rotations."""
     whole = np.zeros((*pose.shape[:-2], 4, 4))
-    whole[..., :3, :], whole[..., 3, 3] = pose, 1.0
-    return RigidTransform(whole, normalize=not proper, copy=False)  # much faster than from components
+    whole[..., :3, :] = pose
+    whole[..., 3, 3] = 1.0
+    return RigidTransform(
+        whole, normalize=not proper, copy=False
+    )  # much faster than from components
 
 
 def exp_rotation(w):
     """Rotation matrices of rotation vectors, shape (..., 3) -> (..., 3, 3); Rodrigues' formula."""
-    x, y, z = np.asarray(w, float).T  # by component: numbers are many times faster than small arrays
+    x, y, z = np.asarray(
+        w, float
+    ).T  # by component: numbers are many times faster than small arrays
     half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)
     sine = np.sin(half) / half
-    a, b = sine * np.cos(half), 0.5 * sine * sine  # sin(angle) / angle, (1 - cos(angle)) / angle^2
-    xx, yy, zz, xy, xz, yz = b * x * x, b * y * y, b * z * z, b * x * y, b * x * z, b * y * z
-    x, y, z = a * x, a * y, a * z
-    columns = [1 - yy - zz, xy + z, xz - y], [xy - z, 1 - xx - zz, yz + x], [xz + y, yz - x, 1 - xx - yy]
-    return np.array(columns).T
+    a = sine * np.cos(half)  # sin(angle) / angle
+    b = 0.5 * sine * sine  # (1 - cos(angle)) / angle^2
+    first = [1 - b * y * y - b * z * z, b * x * y + a * z, b * x * z - a * y]
+    second = [b * x * y - a * z, 1 - b * x * x - b * z * z, b * y * z + a * x]
+    third = [b * x * z + a * y, b * y * z - a * x, 1 - b * x * x - b * y * y]
+    return np.array([first, second, third]).T  # they are the columns
 
 
 def log_rotation(R):
     """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be exact."""
     if R.ndim == 2:
         return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
-    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    sine, cosine = np.sqrt(x * x + y * y + z * z), R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1  # twice, both
-    turn = np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12), 0.5)
-    w, half = np.stack([x, y, z], axis=-1) * turn[..., None], cosine < -1.8  # near half a turn the sine says little
-    if half.any():
-        w[half] = Rotation.from_matrix(R[half], assume_valid=True).as_rotvec()
+    x = R[..., 2, 1] - R[..., 1, 2]
+    y = R[..., 0, 2] - R[..., 2, 0]
+    z = R[..., 1, 0] - R[..., 0, 1]
+    twice_sine = np.sqrt(x * x + y * y + z * z)
+    twice_cosine = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1
+    angle_by_sine = np.arctan2(twice_sine, twice_cosine) / np.maximum(twice_sine, 1e-12)
+    turn = np.where(twice_sine > 1e-12, angle_by_sine, 0.5)
+    w = np.stack([x, y, z], axis=-1) * turn[..., None]
+    near_half_turn = twice_cosine < -1.8  # the sine says little there
+    if near_half_turn.any():
+        w[near_half_turn] = Rotation.from_matrix(R[near_half_turn], assume_valid=True).as_rotvec()
     return w
 
 
@@ -304,18 +342,21 @@ def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
     ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``, `shift` (:func:`moved_noise`) the direction in which the
     noise pulls the point, `factor` (..., n) the weighted residual.
     """
-    spun = cross(shift, gradient)
-    if not pinhole:
-        return factor[..., None] * np.concatenate([spun, np.zeros_like(spun)], axis=-1)
-    z = point[..., 2:]
-    change = -gradient * shift[..., 2:] / z
-    change[..., 2] -= np.sum(gradient * shift, axis=-1) / z[..., 0]
-    return factor[..., None] * np.concatenate([spun + cross(rotated, change), change], axis=-1)
+    by_turn = cross(shift, gradient)
+    by_shift = np.zeros_like(by_turn)
+    if pinhole:  # the gradient itself changes with the depth
+        depth = point[..., 2:]
+        by_shift = -gradient * shift[..., 2:] / depth
+        by_shift[..., 2] -= np.vecdot(gradient, shift) / depth[..., 0]
+        by_turn = by_turn + cross(rotated, by_shift)
+    return factor[..., None] * np.concatenate([by_turn, by_shift], axis=-1)
 
 
 def moved_noise(pose, gradient, covariance):
     """``R C R^T a`` of source-frame covariances and gradients by the moved point, shape (..., n, 3)."""
-    return rotate_points(pose, ((gradient @ pose[..., :3])[..., None, :] @ covariance)[..., 0, :])
+    in_source = gradient @ pose[..., :3]
+    pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
+    return rotate_points(pose, pulled)
 
 
 def axis_words(direction):
@@ -330,12 +371,16 @@ def axis_words(direction):
 
 def motion_words(delta, frame):
     """Name a small motion ``[w, v]`` by its direction, e.g. ``translation along x of the left frame``."""
-    w, v = np.asarray(delta[:3], float), np.asarray(delta[3:6], float)
-    turn, shift = np.linalg.norm(w), np.linalg.norm(v)
+    w = np.asarray(delta[:3], float)
+    v = np.asarray(delta[3:6], float)
+    turn = np.linalg.norm(w)
+    shift = np.linalg.norm(v)
     if turn < 0.02 * shift:
         return f"translation along {axis_words(v)} of the {frame} frame"
     words = f"rotation about {axis_words(w)} of the {frame} frame"
-    return words if shift < 0.02 * turn else f"{words} with translation along {axis_words(v)}"
+    if shift < 0.02 * turn:
+        return words
+    return f"{words} with translation along {axis_words(v)}"
 
 
 def point_set(positions, point, distance, tolerance):
@@ -388,5 +433,7 @@ def triangle_angle(ab, ac, bc):
     """Angle at A of a triangle with the given sides, radians (law of cosines)."""
     cosine = (ab**2 + ac**2 - bc**2) / (2 * ab * ac)
     if abs(cosine) > 1:
-        raise ValueError(f"sides {ab}, {ac} and {bc} make no triangle: each must be shorter than the sum of the others")
+        raise ValueError(
+            f"sides {ab}, {ac} and {bc} make no triangle: each must be shorter than the sum of the others"
+        )
     return float(np.arccos(cosine))

@@ -109,7 +109,9 @@ class SourceFrame:
         return np.asarray(pitch) - self.image_pitch
 
 
-def camera_at(T_camera: RigidTransform, mount: str, T_head_lrf: RigidTransform, pitch: ArrayLike) -> RigidTransform:
+def camera_at(
+    T_camera: RigidTransform, mount: str, T_head_lrf: RigidTransform, pitch: ArrayLike
+) -> RigidTransform:
     """``T_camera_platform`` while the head stands at a true pitch, or at several.
 
     Parameters
