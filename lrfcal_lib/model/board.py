@@ -42,8 +42,9 @@ class Board:
     edges : tuple of str
         Names of the straight edges in order around the outline (x to y in the board frame).
     corners : ndarray, shape (n_edges, 2), or None
-        Outline in the board frame, metres: edge i runs from corner i to corner i + 1. None where the outline was
-        never measured; :mod:`lrfcal_lib.preprocess.survey` then measures it in the scale of the pattern.
+        Outline in the board frame, metres: edge i runs from corner i to corner i + 1. None where
+        the outline was never measured; :mod:`lrfcal_lib.preprocess.survey` then measures it in the
+        scale of the pattern.
     pattern : Chessboard or None
     features : tuple of str
         The two edges that equations (7) to (14) call 1 and 2.
@@ -56,7 +57,9 @@ class Board:
     features: tuple[str, str] = ("", "")
 
     def lines(self):
-        """Edges as board-frame lines, see :func:`outline_lines`; ValueError where the outline is not known."""
+        """Edges as board-frame lines, see :func:`outline_lines`; ValueError where the outline is
+        not known.
+        """
         return outline_lines(self.known_corners())
 
     def lengths(self):
@@ -79,7 +82,9 @@ class Board:
 
 
 def outline_lines(corners):
-    """Lines ``a x + b y + c = 0`` (n, 3) of a polygon's sides, unit normals outwards; row i from corner i to i + 1."""
+    """Lines ``a x + b y + c = 0`` (n, 3) of a polygon's sides, unit normals outwards; row i from
+    corner i to i + 1.
+    """
     corners = np.asarray(corners, float)
     following = np.roll(corners, -1, axis=0)
     along = following - corners
@@ -90,17 +95,21 @@ def outline_lines(corners):
 
 
 def corners_of_lines(lines):
-    """Corners (..., n, 2) of a polygon from its sides (..., n, 3): corner i is where side i - 1 meets side i."""
+    """Corners (..., n, 2) of a polygon from its sides (..., n, 3): corner i is where side i - 1
+    meets side i.
+    """
     lines = np.asarray(lines, float)
     points = cross(np.roll(lines, 1, axis=-2), lines)
     return points[..., :2] / points[..., 2:]
 
 
 def triangle_board(ab=0.315, ac=0.380, name="triangle", pattern=None):
-    """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y, metres.
+    """The paper's board: a triangle with its right angle A in the origin, B on +x and C on +y,
+    metres.
 
-    The paper states 315, 380 and 491 mm; a right angle makes the third edge 493.58 mm (the stated one closes at
-    89.4 deg), so the exact right angle is used here. Edges are ``ab``, ``bc``, ``ca``.
+    The paper states 315, 380 and 491 mm; a right angle makes the third edge 493.58 mm (the stated
+    one closes at 89.4 deg), so the exact right angle is used here. Edges are ``ab``, ``bc``,
+    ``ca``.
     """
     corners = np.array([[0.0, 0.0], [ab, 0.0], [0.0, ac]])
     return Board(name, ("ab", "bc", "ca"), corners, pattern, ("ab", "ca"))

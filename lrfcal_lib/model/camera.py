@@ -17,7 +17,8 @@ class CameraModel:
     fx, fy, cx, cy : float
         Focal lengths and principal point, pixels; (0, 0) is the centre of the top-left pixel.
     distortion : ndarray, shape (5,)
-        The paper's (k1, k2, k3, k4, k5), which is OpenCV's (k1, k2, p1, p2, k3): k1, k2, k5 radial, k3, k4 tangential.
+        The paper's (k1, k2, k3, k4, k5), which is OpenCV's (k1, k2, p1, p2, k3): k1, k2, k5 radial,
+        k3, k4 tangential.
     covariance : ndarray, shape (9, 9), or None
         Of (fx, fy, cx, cy, k1..k5), where it is known.
     rms_px : float or None
@@ -61,7 +62,9 @@ class CameraModel:
 
 
 def pinhole(p_camera, model):
-    """Project points (..., 3) to undistorted pixels (..., 2), NaN where z <= 0; equation (19), K without a lens."""
+    """Project points (..., 3) to undistorted pixels (..., 2), NaN where z <= 0; equation (19), K
+    without a lens.
+    """
     x, y, z = np.moveaxis(np.asarray(p_camera, float), -1, 0)
     z = np.where(z > 0, z, np.nan)
     u = model.fx * x / z + model.cx
@@ -144,7 +147,9 @@ def project_jacobians(p_camera, model):
 
 
 def undistort(uv, model):
-    """Undistorted pixels (..., 2) of image points: of a camera with the same K and no lens distortion."""
+    """Undistorted pixels (..., 2) of image points: of a camera with the same K and no lens
+    distortion.
+    """
     uv = np.asarray(uv, float)
     if uv.size == 0:
         return uv.copy()
@@ -155,7 +160,9 @@ def undistort(uv, model):
 
 
 def line_through(a, b):
-    """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels, shape (..., 3)."""
+    """Pixel line ``l0 u + l1 v + l2 = 0`` with ``l0^2 + l1^2 = 1`` through two pixels, shape (...,
+    3).
+    """
     a, b = np.broadcast_arrays(np.asarray(a, float), b)
     along = b - a
     length = np.linalg.norm(along, axis=-1, keepdims=True)

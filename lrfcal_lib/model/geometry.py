@@ -1,4 +1,6 @@
-"""From polar measurements to points, the tilt of the platform, lines and planes, poses as arrays, motions in words."""
+"""From polar measurements to points, the tilt of the platform, lines and planes, poses as arrays,
+motions in words.
+"""
 
 from dataclasses import dataclass
 
@@ -7,7 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 
 class DegenerateGeometry(ValueError):
-    """The data do not determine what was asked for; the message names the motion that stays unobservable."""
+    """The data do not determine what was asked for; the message names the motion that stays
+    unobservable.
+    """
 
 
 def hat(v):
@@ -50,7 +54,9 @@ def polar_to_points(ranges, bearings):
 
 
 def polar_covariance(ranges, bearings, sigma_range, sigma_bearing):
-    """Covariance (..., 3, 3) of polar points in the LRF frame, from independent errors along and across the beam."""
+    """Covariance (..., 3, 3) of polar points in the LRF frame, from independent errors along and
+    across the beam.
+    """
     sigma_range = np.asarray(sigma_range, float)
     ranges, bearings, sigma_range = np.broadcast_arrays(ranges, bearings, sigma_range)
     along = polar_to_points(sigma_range, bearings)
@@ -85,7 +91,8 @@ def tilt(points, pitch):
 
 
 def lrf_to_platform(p_lrf, pitch, T_head_lrf):
-    """Points of scans in the fixed platform frame, ``p_platform = Rx(pitch) (R p_lrf + t)``, equation (6).
+    """Points of scans in the fixed platform frame, ``p_platform = Rx(pitch) (R p_lrf + t)``,
+    equation (6).
 
     Parameters
     ----------
@@ -99,7 +106,8 @@ def lrf_to_platform(p_lrf, pitch, T_head_lrf):
 
 
 def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
-    """Points of a sweep in the frame a camera is fixed to (the *source* frame of a camera calibration).
+    """Points of a sweep in the frame a camera is fixed to (the *source* frame of a camera
+    calibration).
 
     Parameters
     ----------
@@ -113,8 +121,8 @@ def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
     Returns
     -------
     ndarray, shape (..., 3)
-        Platform coordinates for a camera on the base; for a camera on the head, LRF coordinates of a scan that would
-        have been taken at `image_pitch`.
+        Platform coordinates for a camera on the base; for a camera on the head, LRF coordinates of
+        a scan that would have been taken at `image_pitch`.
     """
     if mount == "platform":
         return lrf_to_platform(p_lrf, pitch, T_head_lrf)
@@ -127,7 +135,8 @@ def lrf_to_source(p_lrf, pitch, T_head_lrf, mount, image_pitch=0.0):
 
 @dataclass(frozen=True)
 class TiltAxis:
-    """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4 degrees of freedom).
+    """The tilt axis as a line in the LRF frame: all that the platform calibration can know (4
+    degrees of freedom).
 
     Attributes
     ----------
@@ -179,7 +188,8 @@ def paper_parameters(T_head_lrf):
     phi : ndarray, shape (3,)
         ``(phi_x, phi_y, phi_z)`` of ``R = Rx(phi_x) Ry(phi_y) Rz(phi_z)``, radians.
     ty : float
-        Metres, never negative. With ``ty = 0`` the axis meets the LRF's origin and phi_x cannot be known (0 is given).
+        Metres, never negative. With ``ty = 0`` the axis meets the LRF's origin and phi_x cannot be
+        known (0 is given).
     """
     axis = axis_of(T_head_lrf)
     x, y, z = axis.direction
@@ -194,7 +204,9 @@ def paper_parameters(T_head_lrf):
 
 
 def head_from_paper(phi, ty):
-    """``T_head_lrf`` from phi (radians) and ty (metres), equations (1) to (3) with ``R = Rx Ry Rz`` (x last)."""
+    """``T_head_lrf`` from phi (radians) and ty (metres), equations (1) to (3) with ``R = Rx Ry Rz``
+    (x last).
+    """
     return RigidTransform.from_components([0.0, ty, 0.0], Rotation.from_euler("XYZ", phi))
 
 
@@ -206,13 +218,17 @@ def axis_difference(a, b):
 
 
 def transform_difference(a, b):
-    """Rotation angle (radians) and translation distance (metres) between two transforms with the same frames."""
+    """Rotation angle (radians) and translation distance (metres) between two transforms with the
+    same frames.
+    """
     turn = a.rotation * b.rotation.inv()
     return float(turn.magnitude()), float(np.linalg.norm(a.translation - b.translation))
 
 
 def _principal(points):
-    """Centre of points (n, 3), and variances along their principal axes (columns), the smallest first."""
+    """Centre of points (n, 3), and variances along their principal axes (columns), the smallest
+    first.
+    """
     centre = np.mean(points, axis=0)
     away = points - centre
     variances, axes = np.linalg.eigh(away.T @ away / len(points))
@@ -222,8 +238,9 @@ def _principal(points):
 def fit_plane(points):
     """Total least squares plane ``normal . p = distance`` of points (n, 3), rows with NaN ignored.
 
-    Returns the unit normal, away from the origin, the origin's distance (>= 0), and the root mean square distance of
-    the points. DegenerateGeometry with fewer than three points, or all on one line.
+    Returns the unit normal, away from the origin, the origin's distance (>= 0), and the root mean
+    square distance of the points. DegenerateGeometry with fewer than three points, or all on one
+    line.
     """
     points = np.asarray(points, float)
     points = points[np.isfinite(points).all(axis=1)]
@@ -241,7 +258,8 @@ def fit_plane(points):
 
 
 def fit_line(points):
-    """Total least squares line of points (n, 2 or 3): their centre, the unit direction, their rms distance.
+    """Total least squares line of points (n, 2 or 3): their centre, the unit direction, their rms
+    distance.
 
     DegenerateGeometry with fewer than two distinct points.
     """
@@ -261,7 +279,9 @@ def pose_array(transform):
 
 
 def pose_transform(pose, proper=False):
-    """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4); `proper` ones hold exact rotations."""
+    """The `RigidTransform` (one, or a stack) of a pose array, shape (..., 3, 4); `proper` ones hold
+    exact rotations.
+    """
     whole = np.zeros((*pose.shape[:-2], 4, 4))
     whole[..., :3, :] = pose
     whole[..., 3, 3] = 1.0
@@ -286,7 +306,9 @@ def exp_rotation(w):
 
 
 def log_rotation(R):
-    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be exact."""
+    """Rotation vectors of rotation matrices, shape (..., 3, 3) -> (..., 3); they are taken to be
+    exact.
+    """
     if R.ndim == 2:
         return Rotation.from_matrix(R, assume_valid=True).as_rotvec()
     x = R[..., 2, 1] - R[..., 1, 2]
@@ -309,7 +331,8 @@ def pose_parameters(pose):
 
 
 def move_pose(pose, delta):
-    """Small change of poses (..., 3, 4): ``R <- exp(w) R``, ``t <- t + v`` with ``delta = [w, v]`` (..., 6).
+    """Small change of poses (..., 3, 4): ``R <- exp(w) R``, ``t <- t + v`` with ``delta = [w, v]``
+    (..., 6).
 
     Radians and metres, in the destination frame.
     """
@@ -328,19 +351,22 @@ def apply_pose(pose, points):
 
 
 def gradient_by_pose(rotated, gradient):
-    """Jacobian rows (..., n, 6) by ``[w, v]`` of scalars with gradient ``a`` (..., n, 3) by the moved point.
+    """Jacobian rows (..., n, 6) by ``[w, v]`` of scalars with gradient ``a`` (..., n, 3) by the
+    moved point.
 
-    ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``; `rotated` is ``R p``, without the translation.
+    ``a . (w x R p) + a . v = [R p x a, a] . [w, v]``; `rotated` is ``R p``, without the
+    translation.
     """
     return np.concatenate([cross(rotated, gradient), gradient], axis=-1)
 
 
 def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
-    """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the change of the variance.
+    """What errors in the points take from Jacobian rows by the pose: ``factor`` times half the
+    change of the variance.
 
-    `rotated` and `point` are ``R p`` and ``R p + t``, `gradient` that of a scalar by the moved point,
-    ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``, `shift` (:func:`moved_noise`) the direction in which the
-    noise pulls the point, `factor` (..., n) the weighted residual.
+    `rotated` and `point` are ``R p`` and ``R p + t``, `gradient` that of a scalar by the moved
+    point, ``l . pinhole(q)`` or, with `pinhole` False, ``m . q``, `shift` (:func:`moved_noise`) the
+    direction in which the noise pulls the point, `factor` (..., n) the weighted residual.
     """
     by_turn = cross(shift, gradient)
     by_shift = np.zeros_like(by_turn)
@@ -353,7 +379,9 @@ def noise_correction(rotated, point, gradient, shift, factor, pinhole=True):
 
 
 def moved_noise(pose, gradient, covariance):
-    """``R C R^T a`` of source-frame covariances and gradients by the moved point, shape (..., n, 3)."""
+    """``R C R^T a`` of source-frame covariances and gradients by the moved point, shape (..., n,
+    3).
+    """
     in_source = gradient @ pose[..., :3]
     pulled = (in_source[..., None, :] @ covariance)[..., 0, :]
     return rotate_points(pose, pulled)
@@ -370,7 +398,9 @@ def axis_words(direction):
 
 
 def motion_words(delta, frame):
-    """Name a small motion ``[w, v]`` by its direction, e.g. ``translation along x of the left frame``."""
+    """Name a small motion ``[w, v]`` by its direction, e.g. ``translation along x of the left
+    frame``.
+    """
     w = np.asarray(delta[:3], float)
     v = np.asarray(delta[3:6], float)
     turn = np.linalg.norm(w)
@@ -384,13 +414,16 @@ def motion_words(delta, frame):
 
 
 def point_set(positions, point, distance, tolerance):
-    """Positions (..., 3) that a point at a measured distance allows: a spherical shell around it, figure 3 (a)."""
+    """Positions (..., 3) that a point at a measured distance allows: a spherical shell around it,
+    figure 3 (a).
+    """
     away = np.linalg.norm(np.asarray(positions, float) - point, axis=-1)
     return np.abs(away - distance) <= tolerance
 
 
 def line_set(positions, point, direction, distance, tolerance):
-    """Positions (..., 3) that a line with one hit point at a measured distance allows: a cylinder, figure 3 (b).
+    """Positions (..., 3) that a line with one hit point at a measured distance allows: a cylinder,
+    figure 3 (b).
 
     Which point of the line (through `point`, with unit `direction`) was hit is not known.
     """
@@ -399,7 +432,8 @@ def line_set(positions, point, direction, distance, tolerance):
 
 
 def plane_set(positions, point, normal, distance, tolerance):
-    """Positions (..., 3) that a plane with one hit point at a measured distance allows: a slab, figure 3 (c).
+    """Positions (..., 3) that a plane with one hit point at a measured distance allows: a slab,
+    figure 3 (c).
 
     The unit `normal` points towards the sensor.
     """
@@ -413,7 +447,8 @@ def shell_volume(distance, tolerance):
 
 
 def crossing_volume(radius, angle):
-    """Volume common to two cylinders of equal radius whose axes meet at an angle (radians), cubic metres.
+    """Volume common to two cylinders of equal radius whose axes meet at an angle (radians), cubic
+    metres.
 
     ``16 r^3 / (3 sin angle)``: smallest for perpendicular axes, infinite for parallel ones.
     """
@@ -434,6 +469,7 @@ def triangle_angle(ab, ac, bc):
     cosine = (ab**2 + ac**2 - bc**2) / (2 * ab * ac)
     if abs(cosine) > 1:
         raise ValueError(
-            f"sides {ab}, {ac} and {bc} make no triangle: each must be shorter than the sum of the others"
+            f"sides {ab}, {ac} and {bc} make no triangle: "
+            "each must be shorter than the sum of the others"
         )
     return float(np.arccos(cosine))

@@ -1,4 +1,6 @@
-"""The way of a beam: from the LRF over the head and the platform to a camera, equations (3) to (6) and (16)."""
+"""The way of a beam: from the LRF over the head and the platform to a camera, equations (3) to (6)
+and (16).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +16,8 @@ TILT_AXIS = np.array([1.0, 0.0, 0.0])  # of the head and of the platform
 
 @dataclass(frozen=True)
 class SweepPitch:
-    """How the recorded pitch of one sweep errs: ``offset + stretch * (pitch - middle)`` has to be added to it.
+    """How the recorded pitch of one sweep errs: ``offset + stretch * (pitch - middle)`` has to be
+    added to it.
 
     `offset` and `middle` are in radians, `stretch` is a fraction.
     """
@@ -82,7 +85,9 @@ class SourceFrame:
     image_pitch: float = 0.0
 
     def apply(self, p_lrf: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of scans at some true pitch (...), moved from the LRF frame to this one, metres."""
+        """Points (..., 3) of scans at some true pitch (...), moved from the LRF frame to this one,
+        metres.
+        """
         return lrf_to_source(p_lrf, pitch, self.T_head_lrf, self.mount, self.image_pitch)
 
     def rotation(self, pitch: np.ndarray) -> np.ndarray:
