@@ -73,7 +73,9 @@ class Board:
         return np.pad(self.known_corners(), ((0, 0), (0, 1)))
 
     def known_corners(self):
-        """Corners of the outline, metres, shape (n, 2); ValueError where nobody has measured them."""
+        """Corners of the outline, metres, shape (n, 2); ValueError where nobody has
+        measured them.
+        """
         if self.corners is None:
             raise ValueError(
                 f"the outline of board '{self.name}' is not known: measure it from images first"

@@ -274,7 +274,9 @@ POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
 def pose_array(transform):
-    """Top three rows of a transform's matrix, shape (..., 3, 4): the form the solvers move about."""
+    """Top three rows of a transform's matrix, shape (..., 3, 4): the form the solvers
+    move about.
+    """
     return transform.as_matrix()[..., :3, :].copy()
 
 
@@ -326,7 +328,9 @@ def log_rotation(R):
 
 
 def pose_parameters(pose):
-    """Rotation vector and translation of pose arrays, shape (..., 6), in the order of `POSE_NAMES`."""
+    """Rotation vector and translation of pose arrays, shape (..., 6), in the order of
+    `POSE_NAMES`.
+    """
     return np.concatenate([log_rotation(pose[..., :3]), pose[..., 3]], axis=-1)
 
 

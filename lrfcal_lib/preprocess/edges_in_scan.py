@@ -191,7 +191,9 @@ class ScanSide:
     ends: np.ndarray
 
     def is_same(self, other):
-        """Whether two sides are one: the same direction, and no farther apart than two centimetres."""
+        """Whether two sides are one: the same direction, and no farther apart than two
+        centimetres.
+        """
         apart = np.cross(other.ends.mean(axis=0) - self.ends.mean(axis=0), self.direction)
         parallel = abs(self.direction @ other.direction) > np.cos(LEAST_TURN)
         return parallel and np.linalg.norm(apart) < SAME_SIDE
@@ -470,7 +472,9 @@ def _points_on_lines(scan, line, bearing, shift):
 
 
 def _fitted_range(scan, line, rays):
-    """Range along rays to the fitted scan lines ``u . p = 1``, and its standard deviation, metres."""
+    """Range along rays to the fitted scan lines ``u . p = 1``, and its standard
+    deviation, metres.
+    """
     flat = rays[:, :2]
     r = 1 / np.sum(scan.lines[line] * flat, axis=1)
     variance = np.einsum("ni,nij,nj->n", flat, scan.lines_covariance[line], flat)
@@ -574,7 +578,9 @@ def _beam_spacing(scan):
 
 
 def _side(scan, flat, pitch, hand):
-    """The ScanSide (without a number) through points (n, 2) of the board's plane, about some pitch."""
+    """The ScanSide (without a number) through points (n, 2) of the board's plane, about
+    some pitch.
+    """
     axes = plane_axes(scan.normal)
     fitted = line_of(flat)
     reach = np.array([fitted.along.min(), fitted.along.max()])
