@@ -1,4 +1,6 @@
-"""The board in the range image of a sweep: pieces without a jump, planes, a median filter, lines."""
+"""The board in the range image of a sweep: pieces without a jump, planes, a median
+filter, lines.
+"""
 
 from dataclasses import dataclass
 
@@ -10,177 +12,286 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_covariance, polar_to_points, tilt
+from lrfcal_lib.model.geometry import (
+    fit_plane,
+    lrf_to_platform,
+    polar_covariance,
+    polar_to_points,
+    tilt,
+)
 from lrfcal_lib.session.read import Sweep
 
-STEEPEST = np.tan(np.radians(80))  # a face seen at a flatter angle than 10 deg is taken for a depth jump
-DEPTH_NOISE = 0.03  # metres; what noise and dark print change between neighbouring beams of one face
+# a face seen at a flatter angle than 10 deg is taken for a depth jump
+STEEPEST = np.tan(np.radians(80))
+# metres; what noise and dark print change between neighbouring beams of one face
+DEPTH_NOISE = 0.03
 PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
 LONGEST_HOLE = 0.15  # metres; a gap without returns that does not end a surface (print, gloss)
-LARGEST_NOISE = 0.04  # metres; the farthest from its plane that a return of a noisy device still counts
+# metres; the farthest from its plane that a return of a noisy device still counts
+LARGEST_NOISE = 0.04
 FEWEST_POINTS = 12
-LEAST_FILL = 0.5  # share of its convex hull that a board fills; what clutter leaves on a plane is patchy
-FEWEST_LINES = 4  # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
-CLEAR, MOST_MARGIN = 2.0, 1 / 3  # spot radii from the last beam on the board that see its face alone; share of a row
-RIGID_SIZES = (0.02, 4.0, 4.0)  # m2, m2, m: what may be a board when nothing is known about it
+# share of its convex hull that a board fills; what clutter leaves on a plane is patchy
+LEAST_FILL = 0.5
+# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
+FEWEST_LINES = 4
+CLEAR = 2.0  # spot radii from the last beam on the board that see its face alone
+MOST_MARGIN = 1 / 3  # share of a row that is left out for that, at most
+STILL = 1e-4  # radians; scan lines that differ by less are at one pitch
+MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+TUKEY = 4.7  # robust standard deviations from where an outlier has no weight
 
 
 class BoardNotFound(ValueError):
     """No board in a sweep; the message says what was seen instead."""
 
 
+@dataclass(frozen=True)
+class Plane:
+    """``normal . p = distance``: unit normal, shape (3,), and metres."""
+
+    normal: np.ndarray
+    distance: float
+
+    def misses(self, points):
+        """Distances (...) of points (..., 3) from the plane, metres; NaN where a point is."""
+        return np.abs(points @ self.normal - self.distance)
+
+
+@dataclass(frozen=True)
+class Size:
+    """Area (m2; 0 for a single line) and greatest length (m) of a surface."""
+
+    area: float
+    length: float
+
+
+@dataclass(frozen=True)
+class SizeLimits:
+    """Least and largest area (m2) and greatest length (m) of what may be a board."""
+
+    least: float
+    most: float
+    longest: float
+
+    def hold(self, size):
+        """Whether a Size lies within them."""
+        return self.least < size.area < self.most and size.length < self.longest
+
+
+ANY_BOARD = SizeLimits(0.02, 4.0, 4.0)  # where nothing is known about the board
+
+
 def depth_jump(ranges, step):
-    """Change of range between neighbours (an angle `step` apart) that no face of a board makes, metres."""
+    """Change of range between neighbours (an angle `step` apart) that no face of a board makes,
+    metres.
+    """
     return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
 
 
 def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
     """Cut scan lines at depth discontinuities; step (i) of the paper's preprocessing.
 
-    A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams. Returns the number
-    by beam, ascending along the lines, -1 where there is no return.
+    A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams.
+    Returns the number by beam, ascending along the lines, -1 where there is no return.
     """
-    seen = np.isfinite(ranges)
-    line, beam = np.nonzero(seen)
-    r, jump, bridge = (np.broadcast_to(v, ranges.shape)[seen] for v in (ranges, jump, bridge))
+    measured = np.isfinite(ranges)
+    line, beam = np.nonzero(measured)
+    r = ranges[measured]
+    jump = np.broadcast_to(jump, ranges.shape)[measured][1:]
+    bridge = np.broadcast_to(bridge, ranges.shape)[measured][1:]
     gap = np.diff(beam)
-    broken = (np.diff(line) != 0) | (gap - 1 > bridge[1:]) | (np.abs(np.diff(r)) > gap * jump[1:])
+    broken = (np.diff(line) != 0) | (gap - 1 > bridge) | (np.abs(np.diff(r)) > gap * jump)
     labels = np.full(ranges.shape, -1)
-    labels[seen] = np.cumsum(np.r_[True, broken])[: len(r)] - 1
+    labels[measured] = np.cumsum(np.r_[True, broken])[: len(r)] - 1
     return labels
 
 
 def surfaces(ranges, bearings, pitch):
-    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1 without a return, (L, B)."""
-    step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
+    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1 without a
+    return, (L, B).
+    """
+    step = 0.0
+    if len(bearings) > 1:
+        step = np.median(np.diff(bearings))
     near = np.where(np.isfinite(ranges), ranges, 1.0)
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
     close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], np.diff(pitch)[:, None])
-    n = pieces.max(initial=-1) + 1
-    graph = coo_array((np.ones(close.sum()), (pieces[:-1][close], pieces[1:][close])), shape=(n, n))
-    joined = connected_components(graph, directed=False)[1] if n else np.zeros(0, int)
-    return np.where(pieces >= 0, np.append(joined, -1)[pieces], -1)
+    count = pieces.max(initial=-1) + 1
+    if count == 0:
+        return pieces
+    neighbours = pieces[:-1][close], pieces[1:][close]
+    graph = coo_array((np.ones(close.sum()), neighbours), shape=(count, count))
+    _, surface = connected_components(graph, directed=False)
+    return np.where(pieces >= 0, surface[pieces], -1)
 
 
 def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
-    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance in the platform frame.
+    """The nearest flat connected surface of a board's size: mask (L, B) and Plane in the platform
+    frame.
 
-    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its radius all around.
+    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its
+    radius all around.
 
-    With all scan lines at one pitch they do not determine the plane; the one at right angles to the scan plane is taken
-    then. BoardNotFound says what was seen instead.
+    With all scan lines at one pitch they do not determine the plane; the one at right angles to the
+    scan plane is taken then. BoardNotFound says what was seen instead.
     """
     if not np.isfinite(sweep.ranges).any():
-        raise BoardNotFound(f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines")
-    points = lrf_to_platform(polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], T_head_lrf)
-    single = len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= 1e-4
-    upright = tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0])) if single else None
-    labels, seen, best = surfaces(sweep.ranges, sweep.bearings, sweep.pitch), [], (np.inf,)
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines"
+        )
+    p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
+    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
+    upright = None
+    if len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= STILL:
+        upright = tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0]))
+    best = None
+    best_reach = np.inf
+    others = []
+    for surface in _nearest_first(sweep):
+        if sweep.ranges[surface].min() > best_reach:
+            break
+        for mask, plane in _planes(sweep, points, surface, upright, rng):
+            if sweep.ranges[mask].min() > best_reach:
+                continue
+            reach = float(np.median(sweep.ranges[mask]))
+            limits = _size_limits(board, _spot_radius(lrf, reach))
+            mask, size, fits = _trimmed(points, mask, plane.normal, limits, upright)
+            fault = ""
+            if upright is None:
+                fault = _fault(sweep, T_head_lrf, points, mask, plane.normal)
+            others.append(f"{size.area:.2f} m2, {size.length:.2f} m long at {reach:.2f} m{fault}")
+            if fits and not fault and reach < best_reach:
+                best = mask, plane
+                best_reach = reach
+    if best is None:
+        words = "; ".join(others[:4]) or "no flat surface"
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no flat surface of the board's size; seen: {words}"
+        )
+    mask, plane = best
+    # with the returns in and beside it that only the noise of its own points takes off its plane
+    miss = plane.misses(points)
+    noise = np.clip(3 * MAD * np.median(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
+    beside = ndimage.binary_dilation(mask, np.ones((3, 3)))
+    return mask | (beside & (miss < noise)), plane
+
+
+def _nearest_first(sweep):
+    """Masks (L, B) of the connected surfaces of a sweep that are large enough, the nearest one
+    first.
+    """
+    labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
     numbers, counts = np.unique(labels[labels >= 0], return_counts=True)
     nearest = ndimage.minimum(sweep.ranges, labels, numbers)
     enough = np.flatnonzero(counts >= FEWEST_POINTS)
     for k in enough[np.argsort(nearest[enough])]:
-        if nearest[k] > best[0]:
-            break
-        for mask, plane in _planes(sweep, points, labels == numbers[k], upright, rng):
-            if sweep.ranges[mask].min() > best[0]:
-                continue
-            reach = float(np.median(sweep.ranges[mask]))
-            limits = _size_limits(board, 0.0 if lrf is None else float(lrf.spot_radius(reach)))
-            mask, size, fits = _trimmed(points, mask, plane[0], limits, upright)
-            fault = "" if single else _fault(sweep, T_head_lrf, points, mask, plane[0])
-            seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m{fault}")
-            if fits and not fault and reach < best[0]:
-                best = (reach, mask, *plane)
-    if len(best) == 1:
-        found = "; ".join(seen[:4]) or "no flat surface"
-        raise BoardNotFound(f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}")
-    _, mask, normal, distance = best
-    # with the returns in and beside it that only the noise of its own points takes off its plane
-    miss = np.abs(points @ normal - distance)
-    reach = np.clip(3 * 1.4826 * np.median(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
-    return mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)), normal, distance
+        yield labels == numbers[k]
+
+
+def _spot_radius(lrf, reach):
+    """Radius of the spot at a distance, metres; 0 where nothing states it."""
+    if lrf is None or lrf.spot_exit is None:
+        return 0.0
+    return float(lrf.spot_radius(reach))
 
 
 def _planes(sweep, points, surface, upright, rng, most=25):
-    """Flat connected parts of a surface: the largest plane first, then what is left."""
-    left = surface.copy()
+    """Flat connected parts of a surface: the largest Plane first, then what is left."""
+    remaining = surface.copy()
     for _ in range(most):
-        plane = best_plane(points[left], upright, rng) if left.sum() >= FEWEST_POINTS else None
+        if remaining.sum() < FEWEST_POINTS:
+            return
+        plane = best_plane(points[remaining], upright, rng)
         if plane is None:
             return
-        on = left & (np.abs(np.nan_to_num(points, nan=1e9) @ plane[0] - plane[1]) < PLANE_NOISE)
-        labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
+        on_plane = remaining & (np.nan_to_num(plane.misses(points), nan=np.inf) < PLANE_NOISE)
+        labels = surfaces(np.where(on_plane, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
         count = np.bincount(labels[labels >= 0])
         for label in np.flatnonzero(count >= max(FEWEST_POINTS, 0.2 * count.max())):
             yield labels == label, plane
-        left &= ~on
+        remaining &= ~on_plane
 
 
 def best_plane(points, upright, rng, trials=200, sample=1500):
-    """Random sample consensus over neighbouring points, then total least squares over all that agree; None if none."""
+    """Random sample consensus over neighbouring points, then total least squares over all that
+    agree; None if none.
+    """
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
-    near = cdist(seeds, few)
-    near = np.where((near < 0.3) & (near > 1e-6), rng.random(near.shape), -1.0)
-    others = few[np.argpartition(-near, 1, axis=1)[:, :2]]
-    normals = np.cross(others[:, 0] - seeds, others[:, 1] - seeds if upright is None else upright)
+    apart = cdist(seeds, few)
+    preference = np.where((apart < 0.3) & (apart > 1e-6), rng.random(apart.shape), -1.0)
+    others = few[np.argpartition(-preference, 1, axis=1)[:, :2]]
+    second = upright
+    if upright is None:
+        second = others[:, 1] - seeds
+    normals = np.cross(others[:, 0] - seeds, second)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     good = length[:, 0] > 1e-9
+    if not good.any():
+        return None
     normals = normals[good] / length[good]
     offsets = np.sum(normals * seeds[good], axis=1)
-    if len(normals) == 0:
-        return None
     best = np.sum(np.abs(normals @ few.T - offsets[:, None]) < PLANE_NOISE, axis=1).argmax()
-    plane = normals[best], offsets[best]
+    plane = Plane(normals[best], offsets[best])
     for _ in range(3):
-        on = points[np.abs(points @ plane[0] - plane[1]) < PLANE_NOISE]
+        inliers = points[plane.misses(points) < PLANE_NOISE]
         if upright is not None:
-            on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
+            inliers = np.concatenate([inliers + 0.1 * upright, inliers - 0.1 * upright])
         try:
-            plane = fit_plane(on)[:2]
+            plane = Plane(*fit_plane(inliers)[:2])
         except ValueError:  # too few points, or all on one line
             return None
     return plane
 
 
 def _trimmed(points, mask, normal, limits, upright):
-    """A flat surface, if need be without thin strips of floor or wall; its size, and whether it may be the board."""
-    (least, most, longest), size = limits, plane_size(points[mask], normal, upright)
+    """A flat surface, if need be without thin strips of floor or wall; its Size, and whether it may
+    be the board.
+    """
+    size = plane_size(points[mask], normal, upright)
     if upright is not None:
-        return mask, size, 0.3 * np.sqrt(least) < size[1] < longest
-    area, length = size
-    if not (least < area < most and length < longest):
-        core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
-        labels, count = ndimage.label(core)
-        if count == 0:
-            return mask, size, False
-        core = labels == np.bincount(labels[labels > 0]).argmax()
-        mask = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
-        area, length = plane_size(points[mask], normal)
-    return mask, size, least < area < most and length < longest
+        return mask, size, 0.3 * np.sqrt(limits.least) < size.length < limits.longest
+    if limits.hold(size):
+        return mask, size, True
+    core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
+    labels, count = ndimage.label(core)
+    if count == 0:
+        return mask, size, False
+    core = labels == np.bincount(labels[labels > 0]).argmax()
+    trimmed = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
+    return trimmed, size, limits.hold(plane_size(points[trimmed], normal))
 
 
 def _size_limits(board, grown):
-    """Least and largest area (m2) and greatest length (m) of what may be seen of a board with its outline grown (m)."""
+    """SizeLimits of what may be seen of a board with its outline grown (m)."""
     if board is not None and board.corners is not None:
-        hull, length = ConvexHull(board.corners), pdist(board.corners).max()
-        return 0.25 * hull.volume, 1.35 * hull.volume + grown * hull.area, 1.2 * length + 2 * grown
+        hull = ConvexHull(board.corners)
+        longest = pdist(board.corners).max()
+        return SizeLimits(
+            least=0.25 * hull.volume,
+            most=1.35 * hull.volume + grown * hull.area,
+            longest=1.2 * longest + 2 * grown,
+        )
     if board is not None and board.pattern is not None:
-        sides = board.pattern.square * np.array([board.pattern.columns + 1, board.pattern.rows + 1])
-        return 0.3 * np.prod(sides), 4 * np.prod(sides), 2.5 * np.linalg.norm(sides)
-    return RIGID_SIZES
+        columns, rows = board.pattern.columns + 1, board.pattern.rows + 1
+        area = columns * rows * board.pattern.square**2
+        diagonal = board.pattern.square * np.hypot(columns, rows)
+        return SizeLimits(0.3 * area, 4 * area, 2.5 * diagonal)
+    return ANY_BOARD
 
 
 def _fault(sweep, T_head_lrf, points, mask, normal):
-    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself, patchy. '' if it may be."""
+    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself, patchy. ''
+    if it may be.
+    """
     lines = int(mask.any(axis=1).sum())
     if lines < min(FEWEST_LINES, len(sweep.pitch)):
         return f" on {lines} of {len(sweep.pitch)} scan lines"
     cells = np.argwhere(mask)
     rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
-    if np.median(np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)) * STEEPEST < 1:
+    cosines = np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)
+    if np.median(cosines) * STEEPEST < 1:
         return " seen along itself"
     try:
         hull = ConvexHull(cells)
@@ -188,27 +299,33 @@ def _fault(sweep, T_head_lrf, points, mask, normal):
         return ""
     corners = cells[hull.vertices]
     rim = np.gcd(*np.abs(np.roll(corners, -1, axis=0) - corners).T).sum()
-    fill = len(cells) / (hull.volume + rim / 2 + 1)  # of the cells within the hull, by Pick's theorem
-    return f" filled to {100 * fill:.0f} %" if fill < LEAST_FILL else ""
+    # of the cells within the hull, by Pick's theorem
+    fill = len(cells) / (hull.volume + rim / 2 + 1)
+    if fill < LEAST_FILL:
+        return f" filled to {100 * fill:.0f} %"
+    return ""
 
 
 def plane_axes(normal):
     """Two unit vectors in a plane, shape (2, 3): the first as level as the second is steep."""
-    across = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0])
+    level = [1.0, 0.0, 0.0]
+    if abs(normal[0]) >= 0.9:
+        level = [0.0, 1.0, 0.0]
+    across = np.cross(normal, level)
     across /= np.linalg.norm(across)
     return np.stack([np.cross(across, normal), across])
 
 
 def plane_size(points, normal, upright=None):
-    """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
+    """Size of points in a plane."""
     if upright is not None:
-        return 0.0, float(np.ptp(points @ np.cross(normal, upright)))
+        return Size(0.0, float(np.ptp(points @ np.cross(normal, upright))))
     flat = points @ plane_axes(normal).T
     try:
         hull = ConvexHull(flat)
     except QhullError:
-        return 0.0, float(np.linalg.norm(np.ptp(flat, axis=0)))
-    return float(hull.volume), float(pdist(flat[hull.vertices]).max())
+        return Size(0.0, float(np.linalg.norm(np.ptp(flat, axis=0))))
+    return Size(float(hull.volume), float(pdist(flat[hull.vertices]).max()))
 
 
 MEDIAN_WIDTH = 5  # beams
@@ -230,17 +347,19 @@ class BoardScan:
     filtered : ndarray, shape (L, B)
         Median-filtered ranges on the board, metres; NaN elsewhere.
     fitted : ndarray, shape (L, B)
-        Ranges of the straight line fitted to each scan line, for every beam from the first to the last on the board
-        (holes included), metres; NaN elsewhere.
+        Ranges of the straight line fitted to each scan line, for every beam from the first to the
+        last on the board (holes included), metres; NaN elsewhere.
     lines : ndarray, shape (L, 2)
-        The fitted lines ``u . p = 1`` in the scan plane, 1/metre; NaN for a line with too few beams.
+        The fitted lines ``u . p = 1`` in the scan plane, 1/metre; NaN for a line with too few
+        beams.
     lines_covariance : ndarray, shape (L, 2, 2)
     normal : ndarray, shape (3,)
         Of the board's plane in the nominal platform frame.
     distance : float
         ``normal . p_platform = distance``, metres.
     sigma_range : float
-        Standard deviation of a range about the fitted lines, metres (noise, print and warp together).
+        Standard deviation of a range about the fitted lines, metres (noise, print and warp
+        together).
     n_jump_points : int
         Returns within or next to the board that were rejected: mixed pixels and outliers.
     spot : float
@@ -286,41 +405,58 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
     BoardNotFound
         If no flat surface has the board's size.
     """
-    T_head_lrf = RigidTransform.identity() if T_head_lrf is None else T_head_lrf
-    mask, *plane = planar_surface(sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng, lrf)
+    if T_head_lrf is None:
+        T_head_lrf = RigidTransform.identity()
+    if rng is None:
+        rng = np.random.default_rng(0)
+    mask, plane = planar_surface(sweep, T_head_lrf, board, rng, lrf)
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals[np.abs(residuals) > PLANE_NOISE * 2] = np.nan
     if not np.isfinite(residuals).any():
-        raise BoardNotFound(f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board")
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board"
+        )
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
-    covariance, jumps = np.linalg.inv(information) * sigma**2, int(jump_points(sweep.ranges, fitted, sigma).sum())
-    images = mask, filtered, fitted, lines, covariance
     reach = float(np.nanmedian(fitted))
-    spot = 0.0 if lrf is None or lrf.spot_exit is None else float(lrf.spot_radius(reach)) / reach
-    return BoardScan(sweep.placement, sweep, T_head_lrf, *images, *plane, sigma, jumps, spot)
+    return BoardScan(
+        placement=sweep.placement,
+        sweep=sweep,
+        T_head_lrf=T_head_lrf,
+        mask=mask,
+        filtered=filtered,
+        fitted=fitted,
+        lines=lines,
+        lines_covariance=np.linalg.inv(information) * sigma**2,
+        normal=plane.normal,
+        distance=plane.distance,
+        sigma_range=sigma,
+        n_jump_points=int(jump_points(sweep.ranges, fitted, sigma).sum()),
+        spot=_spot_radius(lrf, reach) / reach,
+    )
 
 
 def median_filter(ranges, mask, width=MEDIAN_WIDTH):
     """Running median along the scan lines; step (ii) of the paper's preprocessing.
 
-    `mask` (L, B) tells which returns take part, `width` is an odd number of beams; near an end or a hole only the beams
-    that exist count. NaN outside the mask and where there is no return.
+    `mask` (L, B) tells which returns take part, `width` is an odd number of beams; near an end or a
+    hole only the beams that exist count. NaN outside the mask and where there is no return.
     """
     if width < 1 or width % 2 == 0:
         raise ValueError(f"the width of a median filter is odd and positive, got {width}")
-    taken = np.where(np.isfinite(ranges) & mask, ranges, np.nan)
-    out = np.full(taken.shape, np.nan)
-    line, beam = np.nonzero(np.isfinite(taken))
-    padded = np.pad(taken, ((0, 0), (width // 2, width // 2)), constant_values=np.nan)
-    out[line, beam] = row_median(padded[line[:, None], beam[:, None] + np.arange(width)])
-    return out
+    on_board = np.where(mask & np.isfinite(ranges), ranges, np.nan)
+    filtered = np.full(on_board.shape, np.nan)
+    line, beam = np.nonzero(np.isfinite(on_board))
+    padded = np.pad(on_board, ((0, 0), (width // 2, width // 2)), constant_values=np.nan)
+    filtered[line, beam] = row_median(padded[line[:, None], beam[:, None] + np.arange(width)])
+    return filtered
 
 
 def fit_lines(ranges, bearings, rounds=4):
-    """A straight line to every scan line at once, robust against outliers (Tukey's weights, 4.7 robust sigma).
+    """A straight line to every scan line at once, robust against outliers (Tukey's weights, 4.7
+    robust sigma).
 
     Parameters
     ----------
@@ -332,26 +468,30 @@ def fit_lines(ranges, bearings, rounds=4):
     Returns
     -------
     lines : ndarray, shape (L, 2)
-        ``u`` with ``u . (x, y) = 1``; NaN with fewer than four beams. In polar form ``1 / r = u . (cos b, sin b)`` is
-        linear in u, with weights r^4 because of 1 / r.
+        ``u`` with ``u . (x, y) = 1``; NaN with fewer than four beams. In polar form ``1 / r = u .
+        (cos b, sin b)`` is linear in u, with weights r^4 because of 1 / r.
     information : ndarray, shape (L, 2, 2)
-        Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four beams.
+        Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four
+        beams.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     products = rays[:, :, None] * rays[:, None, :]
-    seen = np.isfinite(ranges)
-    r = np.where(seen, ranges, 1.0)
-    enough = seen.sum(axis=1) >= FEWEST_BEAMS
-    base = weights = np.where(seen & enough[:, None], r**4, 0.0)
+    measured = np.isfinite(ranges)
+    r = np.where(measured, ranges, 1.0)
+    enough = measured.sum(axis=1) >= FEWEST_BEAMS
+    base = np.where(measured & enough[:, None], r**4, 0.0)
+    weights = base
     for _ in range(rounds):
         information = np.einsum("lb,bij->lij", weights, products)
+        information[~enough] = np.eye(2)
         right = (weights / r) @ rays
-        information[~enough], right[~enough] = np.eye(2), np.nan
+        right[~enough] = np.nan
         lines = np.linalg.solve(information, right[..., None])[..., 0]
-        misses = np.where(seen, np.abs(r - _line_ranges(lines, bearings)), np.nan)
+        misses = np.where(measured, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         with np.errstate(invalid="ignore"):
-            scale = np.maximum(1.4826 * row_median(misses), 1e-4)[:, None]
-            weights = np.nan_to_num(base * np.clip(1 - (misses / (4.7 * scale)) ** 2, 0, None) ** 2)
+            scale = np.maximum(MAD * row_median(misses), 1e-4)[:, None]
+            tukey = np.clip(1 - (misses / (TUKEY * scale)) ** 2, 0, None) ** 2
+            weights = np.nan_to_num(base * tukey)
     information[~enough] = np.nan
     return lines, information
 
@@ -360,53 +500,64 @@ def row_median(values):
     """Median of each row without its NaN; NaN for an empty row."""
     ordered = np.sort(values, axis=1)
     count = np.isfinite(ordered).sum(axis=1)
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, values.shape[1] - 1)
     rows = np.arange(len(values))
     return (ordered[rows, low] + ordered[rows, high]) / 2
 
 
 def _line_ranges(lines, bearings):
-    """Ranges of the fitted lines: every line in every direction (lines (L, 2), bearings (B,)), shape (L, B)."""
+    """Ranges of the fitted lines: every line in every direction (lines (L, 2), bearings (B,)),
+    shape (L, B).
+    """
     along = lines @ np.stack([np.cos(bearings), np.sin(bearings)])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(along > 0, 1 / along, np.nan)
 
 
 def row_ends(mask):
-    """First and last True of each row; rows without one are left out. Returns (rows, first, last)."""
+    """First and last True of each row; rows without one are left out. Returns (rows,
+    first, last).
+    """
     rows = np.flatnonzero(mask.any(axis=1))
     return rows, mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
 
 
 def _span(mask, trim=0):
-    """True from the first to the last True of each row, without `trim` beams (a number, or one a row) at both ends."""
+    """True from the first to the last True of each row, without `trim` beams (a number, or one a
+    row) at both ends.
+    """
     rows, first, last = row_ends(mask)
     beam = np.arange(mask.shape[1])
-    out = np.zeros(mask.shape, bool)
-    out[rows] = (beam >= (first + trim)[:, None]) & (beam <= (last - trim)[:, None])
-    return out
+    span = np.zeros(mask.shape, bool)
+    span[rows] = (beam >= (first + trim)[:, None]) & (beam <= (last - trim)[:, None])
+    return span
 
 
 def jump_points(ranges, fitted, sigma_range):
-    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and outliers.
+    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and
+    outliers.
 
-    Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres at least), and
-    pieces of at most two beams (cut at jumps of that size) directly beside it.
+    Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres
+    at least), and pieces of at most two beams (cut at jumps of that size) directly beside it.
     """
-    on, threshold = np.isfinite(fitted), max(4 * sigma_range, PLANE_NOISE)
+    on_board = np.isfinite(fitted)
+    threshold = max(4 * sigma_range, PLANE_NOISE)
     with np.errstate(invalid="ignore"):
-        inside = on & (np.abs(ranges - fitted) > threshold)
+        inside = on_board & (np.abs(ranges - fitted) > threshold)
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     single = (pieces >= 0) & (size[pieces] <= 2)
-    return inside | (single & _span(on, -2) & ~on)
+    beside = _span(on_board, -2) & ~on_board
+    return inside | (single & beside)
 
 
 def count_jump_points(scan):
-    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of the paper.
+    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of
+    the paper.
 
-    The filter runs over the board's returns and the jump points among and beside them, without the background: what
-    step (i) of the paper leaves.
+    The filter runs over the board's returns and the jump points among and beside them, without the
+    background: what step (i) of the paper leaves.
     """
     jumps = jump_points(scan.sweep.ranges, scan.fitted, scan.sigma_range)
     filtered = median_filter(scan.sweep.ranges, scan.mask | jumps)
@@ -422,35 +573,48 @@ def face_points(scan, count=1000, margin=0.06):
     count : int
         At most.
     margin : float
-        What is left out at either end of a scan line and of a column, as a fraction of it; never less than two beams,
-        nor than a spot that reaches over the edge: it reads the mean of its part on the board, and a slanted board
-        would seem less so.
+        What is left out at either end of a scan line and of a column, as a fraction of it; never
+        less than two beams, nor than a spot that reaches over the edge: it reads the mean of its
+        part on the board, and a slanted board would seem less so.
 
     Returns
     -------
     points : ndarray, shape (m, 3)
-        LRF frame at the pitch of the point, metres, at the recorded range. Without outliers: mixed pixels inside the
-        board, four standard deviations off the fitted scan line.
+        LRF frame at the pitch of the point, metres, at the recorded range. Without outliers: mixed
+        pixels inside the board, four standard deviations off the fitted scan line.
     pitch : ndarray, shape (m,)
         Radians.
     covariance : ndarray, shape (m, 3, 3)
     """
     with np.errstate(invalid="ignore"):
         good = scan.mask & (np.abs(scan.sweep.ranges - scan.fitted) < 4 * scan.sigma_range)
-    steps = (np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (scan.sweep.bearings, scan.sweep.pitch))
-    along, down = (CLEAR * scan.spot / max(step, 1e-6) for step in steps)
-    line, beam = np.nonzero(good & _interior(scan.mask, margin, along) & _interior(scan.mask.T, margin, down).T)
+    clear = CLEAR * scan.spot
+    along = _interior(scan.mask, margin, clear / median_step(scan.sweep.bearings))
+    down = _interior(scan.mask.T, margin, clear / median_step(scan.sweep.pitch)).T
+    line, beam = np.nonzero(good & along & down)
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
         line, beam = line[keep], beam[keep]
-    ranges, bearings = scan.sweep.ranges[line, beam], scan.sweep.bearings[beam]
-    spread = 0.1 * np.median(np.diff(scan.sweep.bearings))  # keeps the covariance regular; bearings are all but exact
+    ranges = scan.sweep.ranges[line, beam]
+    bearings = scan.sweep.bearings[beam]
+    # keeps the covariance regular; bearings are all but exact
+    spread = 0.1 * np.median(np.diff(scan.sweep.bearings))
     covariance = polar_covariance(ranges, bearings, scan.sigma_range, spread)
     return polar_to_points(ranges, bearings), scan.sweep.pitch[line], covariance
 
 
+def median_step(angles):
+    """Median step between neighbouring angles, radians; infinite for one angle, a microradian at
+    least.
+    """
+    if len(angles) == 1:
+        return np.inf
+    return max(np.median(np.abs(np.diff(angles))), 1e-6)
+
+
 def _interior(mask, margin, spot):
-    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves half of the row.
+    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves
+    half of the row.
 
     A row too short for that (a sweep of one line, seen by columns) stays.
     """

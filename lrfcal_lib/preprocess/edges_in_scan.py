@@ -10,7 +10,9 @@ from scipy import ndimage
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import (
     DEPTH_NOISE,
+    STILL,
     depth_jump,
+    median_step,
     plane_axes,
     row_ends,
     row_median,
@@ -38,7 +40,6 @@ REACH = 2  # beams (or scan lines) on either side of a boundary
 CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it
 SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
 MEDIAN_CHI2 = 0.455  # of chi-square with one degree of freedom
-STILL = 1e-4  # radians; scan lines that differ by less are at one pitch
 WIDEST_SPOT = (
     30  # beams or lines that a spot reaches over, at most, in the search for surfaces beside it
 )
@@ -692,16 +693,9 @@ class _Border:
         else:
             background = background_odds(here, behind)
             usable = np.flatnonzero(measured & ~mixed)
-        gaps = _gap(scan.sweep.pitch), _gap(scan.sweep.bearings)
+        gaps = median_step(scan.sweep.pitch), median_step(scan.sweep.bearings)
         radius = lrf.spot_radius(board)
         return cls(line, beam, step, side, board, cosine, radius, background, usable, close, gaps)
-
-
-def _gap(angles):
-    """Median step between neighbouring angles, radians; infinite for one angle."""
-    if len(angles) == 1:
-        return np.inf
-    return np.median(np.abs(np.diff(angles)))
 
 
 def _read_the_board(scan, border, line, beam, k):
@@ -725,7 +719,7 @@ def _read_the_board(scan, border, line, beam, k):
         # length away
         beside = ndimage.binary_opening((np.abs(miss) > near) & (miss < MIXING), np.ones((2, 2)))
     size = np.nanmedian((border.radius / border.board)[scan.mask])
-    steps = [min(int(np.ceil(size / max(gap, 1e-6))), WIDEST_SPOT) for gap in border.gaps]
+    steps = [min(int(np.ceil(size / gap)), WIDEST_SPOT) for gap in border.gaps]
     spot = np.ones([2 * count + 1 for count in steps])
     keep &= ~ndimage.binary_dilation(beside, spot)[line, beam]
     return hit, keep
