@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
 
 GREY = 128  # colour of points that no camera sees
@@ -118,17 +118,6 @@ class View:
     def lens(self):
         """Intrinsics, and the squared distance from the axis at which the lens folds, for the compiled loops."""
         return _single(np.r_[self.model.parameters, fold(self.model)])
-
-
-def fold(model):
-    """Squared distance ``(x^2 + y^2) / z^2`` at which radial distortion turns back: points beyond are not in the image.
-
-    Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of equation (18).
-    """
-    k1, k2, _, _, k5 = model.distortion
-    roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return float(min(real[real > 0], default=np.inf))
 
 
 class Painter:

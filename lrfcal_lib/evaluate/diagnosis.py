@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.calibrate.observe import board_maps, rough_poses
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import fold, lens_terms, project
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.intrinsics import raised_points
 from lrfcal_lib.solvers.pitch import PitchErrors
@@ -65,7 +65,7 @@ def lens_words(prepared):
     What corners miss by on the average over parts of the image is of the lens: noise and waves of the sheet differ from
     view to view. And radii that the model folds back inside the image.
     """
-    out, r = {}, np.linspace(0.0, 10.0, 5001)
+    out = {}
     for camera, views in prepared.views.items() if prepared.board.pattern else ():
         model, seen = prepared.models[camera], [v for v in views.values() if v.pixels is not None and not v.reason]
         if not seen:
@@ -78,13 +78,15 @@ def lens_words(prepared):
             if len(mine) >= LENS_CORNERS:
                 parts.append(np.sum(mine.mean(axis=0) ** 2) - mine.var(axis=0).sum() / len(mine))
         alike = np.sqrt(max(np.mean(parts), 0.0)) if parts else 0.0
-        k1, k2, _, _, k5 = model.distortion
-        bent = r * (1 + k1 * r**2 + k2 * r**4 + k5 * r**6)
         ends = np.array([[0, 0], [0, model.height], [model.width, 0], [model.width, model.height]])
         corner = np.linalg.norm((ends - [model.cx, model.cy]) / [model.fx, model.fy], axis=1).max()
-        fold = np.append(bent[1:][np.diff(bent) < 0], np.inf)[0] / corner
+        r = np.sqrt(fold(model))
+        reach = np.inf
+        if np.isfinite(r):
+            k1, k2, _, _, k5 = model.distortion
+            reach = r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner  # recorded radius of the fold
         words = [f"corners of the chessboard miss by {alike:.2f} px alike"] * int(alike > LENS_MISS)
-        words += [f"the model folds back at {100 * fold:.0f} % of the way to the image's corners"] * int(fold < 1)
+        words += [f"the model folds back at {100 * reach:.0f} % of the way to the image's corners"] * int(reach < 1)
         if np.abs(np.array([model.cx / model.width, model.cy / model.height]) - 0.5).max() > OFF_MIDDLE:
             words.append(f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, {OTHER_SIZE}")
         if words:

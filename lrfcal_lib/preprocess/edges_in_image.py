@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from lrfcal_lib.model.camera import line_through, pinhole
+from lrfcal_lib.model.camera import fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -77,7 +77,7 @@ def sample(image, model, uv):
     """
     image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
     out = np.empty((uv.size // 2, image.shape[2]), np.float32)
-    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, out)
+    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, fold(model), out)
     return out.reshape(uv.shape[:-1] + (-1,))
 
 
