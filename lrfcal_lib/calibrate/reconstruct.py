@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
@@ -196,7 +197,8 @@ class Painter:
             J, y = both[:, :-1], both[:, -1]
             found = np.linalg.solve(J.T @ J + 1e-3 * np.eye(len(found)), J.T @ y)  # zero for what no point compares
             miss = y - J @ found
-            use[use] = np.abs(miss) < 3 * max(1.4826 * np.median(np.abs(miss)), 1e-3) if len(miss) else True
+            if len(miss):
+                use[use] = np.abs(miss) < TUKEY * robust_sigma(miss, least=1e-3)
         self.exposures[:, 0] = found[: len(self.views)] - found[: len(self.views)].mean()
         self.exposures[:, 1] = np.minimum(found[len(self.views) :], 0.0)[which]
 

@@ -19,7 +19,7 @@ from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift, p
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
@@ -29,7 +29,6 @@ from lrfcal_lib.solvers.joint_noise import on_board
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
-INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 ALL = 10**9  # crossings
 ENDS = {"combined": ("image", "scan")}  # what decides ends of edges: images, beams, the pitch
 UNITS = {  # of parameters, and the factor from radians and metres
@@ -363,7 +362,7 @@ def intrinsics_table(models):
     """
     unknown = np.full((9, 9), np.nan)
     sigmas = {c: np.sqrt(np.diag(unknown if m.covariance is None else m.covariance)) for c, m in models.items()}
-    return _parameter_table(["camera"], {(c,): (INTRINSICS, m.parameters, sigmas[c]) for c, m in models.items()})
+    return _parameter_table(["camera"], {(c,): (INTRINSIC_NAMES, m.parameters, sigmas[c]) for c, m in models.items()})
 
 
 def outline_table(outline):

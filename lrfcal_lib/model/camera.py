@@ -6,6 +6,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")  # in the order of CameraModel.parameters
+
 
 @dataclass(frozen=True)
 class CameraModel:

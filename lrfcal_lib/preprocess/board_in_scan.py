@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.robust import NORMAL, biweight, robust_sigma
 from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_covariance, polar_to_points, tilt
 from lrfcal_lib.session.read import Sweep
 
@@ -99,7 +100,7 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
     _, mask, normal, distance = best
     # with the returns in and beside it that only the noise of its own points takes off its plane
     miss = np.abs(points @ normal - distance)
-    reach = np.clip(3 * 1.4826 * np.median(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
+    reach = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
     return mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)), normal, distance
 
 
@@ -320,7 +321,7 @@ def median_filter(ranges, mask, width=MEDIAN_WIDTH):
 
 
 def fit_lines(ranges, bearings, rounds=4):
-    """A straight line to every scan line at once, robust against outliers (Tukey's weights, 4.7 robust sigma).
+    """A straight line to every scan line at once, robust against outliers (Tukey's weights).
 
     Parameters
     ----------
@@ -350,8 +351,8 @@ def fit_lines(ranges, bearings, rounds=4):
         lines = np.linalg.solve(information, right[..., None])[..., 0]
         misses = np.where(seen, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         with np.errstate(invalid="ignore"):
-            scale = np.maximum(1.4826 * row_median(misses), 1e-4)[:, None]
-            weights = np.nan_to_num(base * np.clip(1 - (misses / (4.7 * scale)) ** 2, 0, None) ** 2)
+            sigma = np.maximum(NORMAL * row_median(misses), 1e-4)[:, None]
+            weights = np.nan_to_num(base * biweight(misses, sigma))
     information[~enough] = np.nan
     return lines, information
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
+from lrfcal_lib.fit.robust import biweight, robust_sigma
 from lrfcal_lib.model.camera import fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
@@ -118,8 +119,7 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
         near = np.abs(residual) < tolerance
         if near.sum() < 3:
             return np.array([offset, slope]), np.full((2, 2), np.inf), near, np.inf
-        scale = max(1.4826 * np.median(np.abs(residual[near])), 0.02)
-        weight = np.where(near, np.clip(1 - (residual / (4.685 * scale)) ** 2, 0, None) ** 2, 0)
+        weight = np.where(near, biweight(residual, robust_sigma(residual[near], least=0.02)), 0)
         new = np.linalg.solve(design.T @ (design * weight[:, None]), design.T @ (weight * place))
         done = np.allclose(new, [offset, slope], rtol=0, atol=1e-7)
         offset, slope = new
