@@ -74,7 +74,7 @@ def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_bo
     table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint)
     own = table[(table.source != "paper") & table.measured_mm.notna()].set_index("variant")
     error = own.error_mm.abs().groupby("variant").mean()
-    assert error["combined"] < 1.0 and error["combined"] < error.drop(["combined", "fused"]).min() / 10
+    assert error["combined"] < 1.0 and error["combined"] < error.drop("combined").min() / 10
     assert (own.loc["combined"].error_mm / own.loc["combined"].sigma_mm).abs().max() < 3.5
     assert own.sigma_mm.notna().all() and set(own.loc["combined"].ends) <= {"image", "scan"}
     larger = replace(joint.prepared.board, corners=joint.prepared.board.corners * 1.1)

@@ -12,7 +12,7 @@ from shared import DATA
 from lrfcal_lib.calibrate import reconstruct as rec
 from lrfcal_lib.evaluate.export import write_mesh, write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
-from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.session.read import Sweep, open_session
 from lrfcal_lib.session.stated import LrfInfo
@@ -55,7 +55,7 @@ def plainly(points, normals, seen_from, step, noise):
     model, p = seen_from.model, seen_from.T_camera_platform.apply(points)
     uv, distance, cell = project(p, model), np.linalg.norm(p, axis=1), max(2.0, 2 * step * model.fx)
     inside = np.all((uv >= -0.5) & (uv < [model.width - 0.5, model.height - 0.5]), axis=1)
-    inside &= (p[:, :2] ** 2).sum(axis=1) < rec.fold(model) * p[:, 2] ** 2
+    inside &= (p[:, :2] ** 2).sum(axis=1) < fold(model) * p[:, 2] ** 2
     index = (np.where(inside[:, None], uv + 0.5, 0) // cell).astype(int) @ [1, 1000]
     nearest = np.full(100_000, np.inf)
     np.minimum.at(nearest, index[inside], distance[inside])

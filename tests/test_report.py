@@ -43,7 +43,7 @@ said = ["this can be trusted", "expected error at 2 m: 3 mm", "handed over: 'joi
 notebook.verdict("Can it be trusted?", said, record)
 notebook.table(pd.DataFrame({"placement": range(3), "used": True}), "placements")
 lengths = {"source": ["wall"] * 4 + ["paper"], "placement": [1, 1, 2, 2, None],
-           "error_mm": [1.0, -3.0, 3.0, -5.0, 8.84], "variant": ["fused"] * 4 + ["last_beam"]}
+           "error_mm": [1.0, -3.0, 3.0, -5.0, 8.84], "variant": ["half_step"] * 4 + ["last_beam"]}
 notebook.table(pd.DataFrame(lengths), "edge_lengths")
 wide = pd.DataFrame({f"a_rather_long_heading_{n}_mm": [1234.5678] for n in range(14)})
 display(wide)

@@ -9,9 +9,13 @@ import math
 import numpy as np
 from numba import njit
 
+from lrfcal_lib.model import camera
+
 COMPILED = {"cache": True, "fastmath": {"nsz", "arcp", "contract"}, "error_model": "numpy", "nogil": True}
 TILE = 1024
 LEAST_COSINE = 0.1  # of incidence
+
+lens_terms = njit(**COMPILED)(camera.lens_terms)
 
 
 @njit(**COMPILED)
@@ -35,12 +39,11 @@ def _locate(points, pose, lens, size, cell, rows, at):
         c = r20 * x[i] + r21 * y[i] + r22 * z[i] + t2
         far[i] = math.sqrt(a * a + b * b + c * c)
         a, b = a / c, b / c
-        r2, ab = a * a + b * b, a * b
-        radial = one + r2 * (k1 + r2 * (k2 + r2 * k5))
-        u[i] = fx * (a * radial + p1 * (ab + ab) + p2 * (r2 + a * a + a * a)) + cx
-        v[i] = fy * (b * radial + p2 * (ab + ab) + p1 * (r2 + b * b + b * b)) + cy
+        growth, shift_a, shift_b = lens_terms(a, b, k1, k2, p1, p2, k5)
+        u[i] = fx * (a * (one + growth) + shift_a) + cx
+        v[i] = fy * (b * (one + growth) + shift_b) + cy
         column, row = u[i] + half, v[i] + half
-        inside = (c > zero) & (r2 < fold) & (column >= zero) & (column < right) & (row >= zero) & (row < low)
+        inside = (c > zero) & (a * a + b * b < fold) & (column >= zero) & (column < right) & (row >= zero) & (row < low)
         column, row = (column if inside else zero), (row if inside else zero)
         cell_of_it = np.int32(row * share) * columns + np.int32(column * share)
         at[i] = cell_of_it if inside else np.int32(-1)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, project
+from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
 
 GREY = 128  # colour of points that no camera sees
@@ -120,17 +121,6 @@ class View:
         return _single(np.r_[self.model.parameters, fold(self.model)])
 
 
-def fold(model):
-    """Squared distance ``(x^2 + y^2) / z^2`` at which radial distortion turns back: points beyond are not in the image.
-
-    Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of equation (18).
-    """
-    k1, k2, _, _, k5 = model.distortion
-    roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return float(min(real[real > 0], default=np.inf))
-
-
 class Painter:
     """Colours points from images: first everything that may hide something goes through :meth:`hide`.
 
@@ -207,7 +197,8 @@ class Painter:
             J, y = both[:, :-1], both[:, -1]
             found = np.linalg.solve(J.T @ J + 1e-3 * np.eye(len(found)), J.T @ y)  # zero for what no point compares
             miss = y - J @ found
-            use[use] = np.abs(miss) < 3 * max(1.4826 * np.median(np.abs(miss)), 1e-3) if len(miss) else True
+            if len(miss):
+                use[use] = np.abs(miss) < TUKEY * robust_sigma(miss, least=1e-3)
         self.exposures[:, 0] = found[: len(self.views)] - found[: len(self.views)].mean()
         self.exposures[:, 1] = np.minimum(found[len(self.views) :], 0.0)[which]
 

@@ -1,4 +1,4 @@
-"""What is wrong with a recording, as tables and in words: cameras that moved, boards that bend, a pitch that is off."""
+"""What is wrong with a recording, as tables and in words: boards that bend, a pitch that is off."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 
 from lrfcal_lib.calibrate.observe import board_maps, rough_poses
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import fold, lens_terms, project
 from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.intrinsics import raised_points
-from lrfcal_lib.preprocess.steadiness import camera_steadiness
 from lrfcal_lib.solvers.pitch import PitchErrors
 
 SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
@@ -18,30 +17,27 @@ LENS_PARTS, LENS_CORNERS, LENS_MISS = np.array([6, 4]), 20, 0.15  # of an image;
 OFF_MIDDLE = 0.2  # of the image's size
 OTHER_SIZE = "as with intrinsics of another image size"
 REMEDY = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
-SAME_TURN = 0.5  # two cameras whose turns differ by less than this share of the larger one moved together
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """What a recording says about itself before anything is calibrated.
 
-    `steadiness` has a Steadiness by camera; `problems` of the prepared session: what cannot be used and why.
+    `problems` are those of the prepared session: what cannot be used and why.
     """
 
-    steadiness: dict
     bends: BoardBends
     pitch_errors: PitchErrors | None
     problems: dict
 
 
 def diagnose(prepared, pitch_errors=None):
-    """Ask a recording (Prepared) whether its cameras stood still and its boards were flat: a :class:`Diagnosis`.
+    """Ask a recording (Prepared) whether its boards were flat: a :class:`Diagnosis`.
 
     `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
     """
-    steadiness = {camera: camera_steadiness(prepared, camera) for camera in prepared.views}
     maps = board_maps(prepared, rough_poses(prepared)[0])  # whose findings are in the problems already
-    return Diagnosis(steadiness, board_bends(prepared, maps), pitch_errors, dict(prepared.problems))
+    return Diagnosis(board_bends(prepared, maps), pitch_errors, dict(prepared.problems))
 
 
 def bends_table(bends):
@@ -60,8 +56,7 @@ def bends_table(bends):
 
 def findings_in_words(diagnosis):
     """What a recording says about itself, one sentence a finding; none for a recording without fault."""
-    found = pitch_words(diagnosis.pitch_errors) + motion_words(diagnosis.steadiness)
-    return found + bend_words(diagnosis.bends) + problem_words(diagnosis.problems)
+    return pitch_words(diagnosis.pitch_errors) + bend_words(diagnosis.bends) + problem_words(diagnosis.problems)
 
 
 def lens_words(prepared):
@@ -70,7 +65,7 @@ def lens_words(prepared):
     What corners miss by on the average over parts of the image is of the lens: noise and waves of the sheet differ from
     view to view. And radii that the model folds back inside the image.
     """
-    out, r = {}, np.linspace(0.0, 10.0, 5001)
+    out = {}
     for camera, views in prepared.views.items() if prepared.board.pattern else ():
         model, seen = prepared.models[camera], [v for v in views.values() if v.pixels is not None and not v.reason]
         if not seen:
@@ -83,13 +78,15 @@ def lens_words(prepared):
             if len(mine) >= LENS_CORNERS:
                 parts.append(np.sum(mine.mean(axis=0) ** 2) - mine.var(axis=0).sum() / len(mine))
         alike = np.sqrt(max(np.mean(parts), 0.0)) if parts else 0.0
-        k1, k2, _, _, k5 = model.distortion
-        bent = r * (1 + k1 * r**2 + k2 * r**4 + k5 * r**6)
         ends = np.array([[0, 0], [0, model.height], [model.width, 0], [model.width, model.height]])
         corner = np.linalg.norm((ends - [model.cx, model.cy]) / [model.fx, model.fy], axis=1).max()
-        fold = np.append(bent[1:][np.diff(bent) < 0], np.inf)[0] / corner
+        r = np.sqrt(fold(model))
+        reach = np.inf
+        if np.isfinite(r):
+            k1, k2, _, _, k5 = model.distortion
+            reach = r * (1 + lens_terms(r, 0.0, k1, k2, 0.0, 0.0, k5)[0]) / corner  # recorded radius of the fold
         words = [f"corners of the chessboard miss by {alike:.2f} px alike"] * int(alike > LENS_MISS)
-        words += [f"the model folds back at {100 * fold:.0f} % of the way to the image's corners"] * int(fold < 1)
+        words += [f"the model folds back at {100 * reach:.0f} % of the way to the image's corners"] * int(reach < 1)
         if np.abs(np.array([model.cx / model.width, model.cy / model.height]) - 0.5).max() > OFF_MIDDLE:
             words.append(f"its middle ({model.cx:.0f}, {model.cy:.0f}) is far from the image's, {OTHER_SIZE}")
         if words:
@@ -114,33 +111,6 @@ def pitch_words(errors):
         low, high = 100 * each.stretch.min(), 100 * each.stretch.max()
         out.append(f"every sweep is stretched by an amount of its own: {low:+.1f} to {high:+.1f} % of the pitch")
     return out
-
-
-def motion_words(steadiness):
-    """Sentences about cameras fixed to the base that moved, or whose image scale drifts.
-
-    Cameras that turned alike between the same placements make one sentence about the rig.
-    """
-    judged, out = [s for s in steadiness.values() if not s.reason], []
-    for place in sorted({(step.before, step.after) for s in judged for step in s.steps}):
-        moved = {f"camera {s.camera}": [p] for s in judged for p in s.steps if (p.before, p.after) == place}
-        turns = np.array([step.rotvec for (step,) in moved.values()])
-        apart = np.linalg.norm(turns[:, None] - turns, axis=2).max()
-        if 1 < len(moved) == len(judged) and apart < SAME_TURN * np.linalg.norm(turns, axis=1).max():
-            moved = {"the rig": [step for (step,) in moved.values()]}
-        for who, steps in moved.items():
-            angle, sigma = (np.rad2deg(np.mean([getattr(s, key) for s in steps])) for key in ("angle", "angle_sigma"))
-            out.append(
-                f"{who} moved by {angle:.3f} +- {sigma:.3f} deg between placements {place[0]} and {place[1]}: "
-                f"the background moves by {np.mean([s.size_px for s in steps]):.1f} px"
-            )
-    for found in (s for s in judged if s.scale_drifts):
-        low, high = found.placements[[found.scale.argmin(), found.scale.argmax()]]
-        out.append(
-            f"the image scale of camera {found.camera} changes by {100 * np.ptp(found.scale):.2f} % between placements "
-            f"{low} and {high}, {np.ptp(found.corner_px):.1f} px at a corner: a lens that warms up, or other settings"
-        )
-    return out + [why for s in judged for why in s.problems.values()]
 
 
 def bend_words(bends):

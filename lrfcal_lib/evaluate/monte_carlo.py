@@ -14,6 +14,7 @@ from lrfcal_lib.fit.residuals import AXIS_COLUMNS, JointState, disc_share, gathe
 from lrfcal_lib.model.geometry import DegenerateGeometry, polar_to_points, pose_array, pose_transform
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
+from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
 from lrfcal_lib.solvers.lines import edge_bias
@@ -29,7 +30,6 @@ GROUPS = {  # unknowns by name: what they are together, the unit of that and the
     r"pitch_scale": ("pitch scale", "%", 100.0), r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
     r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)), r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
 }  # fmt: skip
-UNIFORM = 1 / np.sqrt(12.0)
 FACE = 24  # face points a placement
 
 

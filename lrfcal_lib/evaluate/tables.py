@@ -13,13 +13,13 @@ from scipy.spatial.transform import RigidTransform
 from scipy.special import ndtri
 
 from lrfcal_lib.calibrate.combined import combined_outlines
-from lrfcal_lib.calibrate.outline import fused_outline_of, likely_outline_of, outline_of
+from lrfcal_lib.calibrate.outline import outline_of
 from lrfcal_lib.evaluate.next_placement import outline
 from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
@@ -29,9 +29,8 @@ from lrfcal_lib.solvers.joint_noise import on_board
 
 # Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
 PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
-INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 ALL = 10**9  # crossings
-ENDS = {"fused": ("image", ""), "combined": ("image", "scan")}  # what decides ends of edges: images, beams, the pitch
+ENDS = {"combined": ("image", "scan")}  # what decides ends of edges: images, beams, the pitch
 UNITS = {  # of parameters, and the factor from radians and metres
     r"axis_.*|phi_[xyz]|(.*_)?r[xyz]|pitch_by_direction": ("deg", np.rad2deg(1.0)),
     r"offset_.*|t_y|(.*_)?t[xyz]|range_offset": ("mm", 1000.0), r"pitch_scale": ("%", 100.0),
@@ -363,7 +362,7 @@ def intrinsics_table(models):
     """
     unknown = np.full((9, 9), np.nan)
     sigmas = {c: np.sqrt(np.diag(unknown if m.covariance is None else m.covariance)) for c, m in models.items()}
-    return _parameter_table(["camera"], {(c,): (INTRINSICS, m.parameters, sigmas[c]) for c, m in models.items()})
+    return _parameter_table(["camera"], {(c,): (INTRINSIC_NAMES, m.parameters, sigmas[c]) for c, m in models.items()})
 
 
 def outline_table(outline):
@@ -434,8 +433,7 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         For the least-squares variants; the session's own platform when left out.
     joint : JointCalibration, optional
         With its estimates without each placement. Adds 'combined', the one answer: all that is known, each weighted by
-        what it is worth; and to compare with it 'fused', image edges on the plane of the cloud, and 'likelihood', beams
-        about the edges. None knows the board's size, and their calibrations have not seen the placement.
+        what it is worth. It does not know the board's size, and its calibration has not seen the placement.
 
     Returns
     -------
@@ -443,8 +441,8 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
         source, placement, edge, ends, variant, true_mm, measured_mm, sigma_mm, error_mm. One row for every edge that
         some camera sees at a placement; NaN where the cloud does not show both its ends. `ends` is 'scan' where beams
         decide both ends of the edge, 'pitch' where one hangs on the recorded pitch (the edge runs across the scan
-        lines), 'image' where images show both ('fused', 'combined'). `sigma_mm` holds all that is known to be
-        uncertain for 'combined' and 'likelihood', and only the scatter of points about the sides for the others.
+        lines), 'image' where images show both ('combined'). `sigma_mm` holds all that is known to be uncertain for
+        'combined', and only the scatter of points about the sides for the others.
     """
 
     measure = {v: lambda p, v=v: outline_of(prepared, p, v, T_head_lrf) for v in VARIANTS}
@@ -452,8 +450,6 @@ def edge_lengths(prepared, T_head_lrf=None, joint=None):
     if joint is not None and known:
         combined = combined_outlines(joint)
         measure["combined"] = lambda placement: combined.get(placement, (None, None))
-        measure["fused"] = lambda placement: fused_outline_of(joint, placement)
-        measure["likelihood"] = lambda p: likely_outline_of(prepared, p, joint.without.get(p, joint.solution))
     edges, rows = prepared.board.edges, []
     for variant, placement in product(measure, prepared.session.board_placements):
         measured, weak = None, None

@@ -1,9 +1,13 @@
 """Pinhole camera with lens distortion: projection, undistortion, straight lines in pixels."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import cv2
 import numpy as np
+
+# in the order of CameraModel.parameters
+INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 
 
 @dataclass(frozen=True)
@@ -84,19 +88,51 @@ def pinhole_jacobian(p_camera, model):
     return J
 
 
-def distort(normalized, distortion):
-    """Lens distortion of normalised image coordinates (x / z, y / z), shape (..., 2).
+def lens_terms(x, y, k1, k2, k3, k4, k5):
+    """Equation (18) at normalised coordinates: by how much the radius grows, and the tangential
+    shifts of x and y.
 
-    Equation (18), its radial part read as 1 + k1 r^2 + k2 r^4 + k5 r^6.
+    The radial part is read as 1 + k1 r^2 + k2 r^4 + k5 r^6; the growth is what it has beyond 1. For
+    numbers, for arrays, and to be compiled by numba: a literal in it would turn single precision
+    into double.
+    """
+    r2 = x * x + y * y
+    growth = r2 * (k1 + r2 * (k2 + r2 * k5))
+    shift_x = (k3 + k3) * x * y + k4 * (r2 + (x + x) * x)
+    shift_y = k3 * (r2 + (y + y) * y) + (k4 + k4) * x * y
+    return growth, shift_x, shift_y
+
+
+def distort(normalized, distortion):
+    """Lens distortion of normalised image coordinates (x / z, y / z), shape (..., 2), equation
+    (18).
     """
     normalized = np.asarray(normalized, float)
-    k1, k2, k3, k4, k5 = distortion
-    x, y = normalized[..., 0], normalized[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
-    tangential_x = 2 * k3 * x * y + k4 * (r2 + 2 * x * x)
-    tangential_y = k3 * (r2 + 2 * y * y) + 2 * k4 * x * y
-    return np.stack([x * radial + tangential_x, y * radial + tangential_y], axis=-1)
+    x = normalized[..., 0]
+    y = normalized[..., 1]
+    growth, shift_x, shift_y = lens_terms(x, y, *distortion)
+    return np.stack([x * (1 + growth) + shift_x, y * (1 + growth) + shift_y], axis=-1)
+
+
+def fold(model):
+    """Squared distance ``(x^2 + y^2) / z^2`` at which radial distortion turns back: points beyond
+    are not in the image.
+
+    Infinite for a lens that never does: ``1 + 3 k1 r^2 + 5 k2 r^4 + 7 k5 r^6`` is the slope of
+    equation (18).
+    """
+    k1, k2, _, _, k5 = model.distortion
+    return _fold(float(k1), float(k2), float(k5))
+
+
+@lru_cache
+def _fold(k1, k2, k5):
+    """The same by the radial terms; asked for each of the thousands of strips that images are
+    sampled in.
+    """
+    roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    return float(min(real[real > 0], default=np.inf))
 
 
 def project(p_camera, model):
@@ -122,7 +158,8 @@ def project_jacobians(p_camera, model):
     x = p_camera[..., 0] / z
     y = p_camera[..., 1] / z
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
+    growth, shift_x, shift_y = lens_terms(x, y, *model.distortion)
+    radial = 1 + growth
     slope = 2 * (k1 + r2 * (2 * k2 + 3 * k5 * r2))  # of radial by r2, twice
 
     xx = radial + slope * x * x + 2 * k3 * y + 6 * k4 * x  # distorted x by x
@@ -131,13 +168,12 @@ def project_jacobians(p_camera, model):
     u_by_point = np.stack([xx / z, xy / z, -(xx * x + xy * y) / z], axis=-1) * model.fx
     v_by_point = np.stack([xy / z, yy / z, -(xy * x + yy * y) / z], axis=-1) * model.fy
 
-    lens_x, lens_y = np.moveaxis(distort(np.stack([x, y], axis=-1), model.distortion), -1, 0)
     zero = np.zeros_like(x)
     one = np.ones_like(x)
     x_by_k = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=-1)
     y_by_k = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=-1)
-    u_by_matrix = np.stack([lens_x, zero, one, zero], axis=-1)  # fx, fy, cx, cy
-    v_by_matrix = np.stack([zero, lens_y, zero, one], axis=-1)
+    u_by_matrix = np.stack([x * radial + shift_x, zero, one, zero], axis=-1)  # fx, fy, cx, cy
+    v_by_matrix = np.stack([zero, y * radial + shift_y, zero, one], axis=-1)
     u_by_intrinsics = np.concatenate([u_by_matrix, model.fx * x_by_k], axis=-1)
     v_by_intrinsics = np.concatenate([v_by_matrix, model.fy * y_by_k], axis=-1)
 

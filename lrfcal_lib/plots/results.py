@@ -194,39 +194,6 @@ def residuals_by_region(ax, uv, shift, model, name):
     ax.set_aspect("equal")
 
 
-def background_motion(ax, steadiness):
-    """How far the background moved in the images of cameras fixed to the base, by placement; steps are marked.
-
-    `steadiness` has a Steadiness by camera; those on the head are left out. A ValueError if none could be judged.
-    """
-    judged = {camera: found for camera, found in steadiness.items() if not found.reason}
-    if not judged:
-        reasons = "; ".join(found.reason for found in steadiness.values()) or "there are no cameras"
-        raise ValueError(f"no motion of the background to draw: {reasons}")
-    lists = sorted((found.placements.tolist() for found in judged.values()), key=len, reverse=True)
-    names = list(dict.fromkeys(lists[0] + sorted(sum(lists[1:], []))))  # in the order of the longest list
-    for index, (camera, found) in enumerate(judged.items()):
-        at, color = [names.index(p) for p in found.placements], color_of(camera, index)
-        # the standard deviation of the turn's largest component, in pixels as the size is
-        angle = np.linalg.norm(found.rotvec, axis=1)
-        px = np.median(found.size_px[angle > 0] / angle[angle > 0]) if (angle > 0).any() else 0.0
-        sigma = px * np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3].max(axis=1))
-        looks = {"color": color, "markersize": 4, "linewidth": 1, "capsize": 2}
-        ax.errorbar(at, found.size_px, yerr=sigma, fmt="o-", label=f"turn, {camera}", **looks)
-        words = f"image scale, {camera} (outwards at a corner)"
-        ax.plot(at, found.corner_px, "--", color=color, linewidth=1, alpha=0.6, label=words)
-    by_placement(ax, names, "motion of the background [px]")
-    steps = [step for found in judged.values() for step in found.steps]
-    places = sorted({(step.before, step.after) for step in steps})
-    for before, after in places:
-        ax.axvline((names.index(before) + names.index(after)) / 2, color=COLORS["outlier"], linewidth=1.2)
-    where = ", ".join(f"{before} and {after}" for before, after in places)
-    still = "the background stood still" + " in all cameras" * (len(judged) > 1)
-    turn = np.rad2deg(np.mean([step.angle for step in steps])) if steps else 0.0
-    ax.set_title(f"moved by {turn:.3f} deg between placements {where}" if steps else still)
-    ax.legend(ncols=2, fontsize=8, loc="lower right")
-
-
 def board_bend(ax, bends):
     """How bent each board looks in the scan, beside the printed sheet in the images (BoardBends).
 

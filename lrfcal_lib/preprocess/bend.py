@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtrc
 
+from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model.geometry import lrf_to_platform
 from lrfcal_lib.preprocess.board_in_scan import face_points, plane_axes
 from lrfcal_lib.preprocess.intrinsics import adjust, raised_points
@@ -21,7 +22,6 @@ MOST_POINTS = 12000  # a placement; more of them only cost time, since parts of 
 MARGIN = 0.02  # of a scan line and of a column, left out at either end: mixed pixels
 PARTS = 6  # along and across the board; a sixth is wider than a square of a usual pattern
 FEWEST_PARTS = 18  # for a surface of six numbers with a covariance from the scatter over parts
-OUTLIER = 4.0  # robust standard deviations
 LEVEL = 0.001  # false alarms a placement
 # Metres; as much as edge points are allowed to scatter about a straight edge (scan.EDGE_SCATTER): a board bent less is
 # not what limits a calibration. Chosen with the LMS400 recording in view: its bends are below 5.6 mm or above 6.9 mm,
@@ -176,8 +176,9 @@ def common_level(faces):
             levels.append(_robust_fit(columns[known], face.height[known])[0][-1])
     if len(levels) < FEWEST_SHEETS:
         return np.nan, np.nan
-    spread = 1.4826 * np.median(np.abs(levels - np.median(levels)))
-    return float(np.median(levels)), float(1.2533 * spread / np.sqrt(len(levels)))
+    middle = float(np.median(levels))
+    of_mean = robust_sigma(np.array(levels) - middle) / np.sqrt(len(levels))
+    return middle, np.sqrt(np.pi / 2) * of_mean  # a median scatters that much more than a mean
 
 
 def _robust_fit(columns, values, rounds=3):
@@ -186,8 +187,8 @@ def _robust_fit(columns, values, rounds=3):
     for _ in range(rounds):
         found = np.linalg.lstsq(columns[used], values[used], rcond=None)[0]
         miss = values - columns @ found
-        middle = np.median(miss[used])
-        used = np.abs(miss - middle) <= OUTLIER * 1.4826 * np.median(np.abs(miss[used] - middle)) + 1e-12
+        miss_of_middle = miss - np.median(miss[used])
+        used = np.abs(miss_of_middle) <= TUKEY * robust_sigma(miss_of_middle[used], least=1e-12)
     return found, miss, used
 
 

@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.fit.robust import NORMAL, biweight, robust_sigma
 from lrfcal_lib.model.geometry import (
     fit_plane,
     lrf_to_platform,
@@ -37,8 +38,6 @@ FEWEST_LINES = 4
 CLEAR = 2.0  # spot radii from the last beam on the board that see its face alone
 MOST_MARGIN = 1 / 3  # share of a row that is left out for that, at most
 STILL = 1e-4  # radians; scan lines that differ by less are at one pitch
-MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-TUKEY = 4.7  # robust standard deviations from where an outlier has no weight
 
 
 class BoardNotFound(ValueError):
@@ -172,7 +171,7 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
     mask, plane = best
     # with the returns in and beside it that only the noise of its own points takes off its plane
     miss = plane.misses(points)
-    noise = np.clip(3 * MAD * np.median(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
+    noise = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
     beside = ndimage.binary_dilation(mask, np.ones((3, 3)))
     return mask | (beside & (miss < noise)), plane
 
@@ -455,8 +454,7 @@ def median_filter(ranges, mask, width=MEDIAN_WIDTH):
 
 
 def fit_lines(ranges, bearings, rounds=4):
-    """A straight line to every scan line at once, robust against outliers (Tukey's weights, 4.7
-    robust sigma).
+    """A straight line to every scan line at once, robust against outliers (Tukey's weights).
 
     Parameters
     ----------
@@ -489,9 +487,8 @@ def fit_lines(ranges, bearings, rounds=4):
         lines = np.linalg.solve(information, right[..., None])[..., 0]
         misses = np.where(measured, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         with np.errstate(invalid="ignore"):
-            scale = np.maximum(MAD * row_median(misses), 1e-4)[:, None]
-            tukey = np.clip(1 - (misses / (TUKEY * scale)) ** 2, 0, None) ** 2
-            weights = np.nan_to_num(base * tukey)
+            sigma = np.maximum(NORMAL * row_median(misses), 1e-4)[:, None]
+            weights = np.nan_to_num(base * biweight(misses, sigma))
     information[~enough] = np.nan
     return lines, information
 

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from lrfcal_lib.model.camera import line_through, pinhole
+from lrfcal_lib.fit.robust import biweight, robust_sigma
+from lrfcal_lib.model.camera import fold, line_through, pinhole
 
 ACROSS_STEP_PX = 0.5  # sampling of a profile
 AVERAGED_PROFILES = 5  # along the edge
@@ -77,7 +78,7 @@ def sample(image, model, uv):
     """
     image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
     out = np.empty((uv.size // 2, image.shape[2]), np.float32)
-    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, out)
+    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, fold(model), out)
     return out.reshape(uv.shape[:-1] + (-1,))
 
 
@@ -118,8 +119,7 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
         near = np.abs(residual) < tolerance
         if near.sum() < 3:
             return np.array([offset, slope]), np.full((2, 2), np.inf), near, np.inf
-        scale = max(1.4826 * np.median(np.abs(residual[near])), 0.02)
-        weight = np.where(near, np.clip(1 - (residual / (4.685 * scale)) ** 2, 0, None) ** 2, 0)
+        weight = np.where(near, biweight(residual, robust_sigma(residual[near], least=0.02)), 0)
         new = np.linalg.solve(design.T @ (design * weight[:, None]), design.T @ (weight * place))
         done = np.allclose(new, [offset, slope], rtol=0, atol=1e-7)
         offset, slope = new

@@ -3,26 +3,29 @@
 import numpy as np
 from numba import njit
 
+from lrfcal_lib.model import camera
+
 COMPILED = {"cache": True, "error_model": "numpy", "nogil": True}
+
+lens_terms = njit(**COMPILED)(camera.lens_terms)
 
 
 @njit(**COMPILED)
-def bilinear(image, uv, lens, out):
+def bilinear(image, uv, lens, fold, out):
     """Colours (n, channels) of a recorded image at undistorted pixels (n, 2); NaN outside of it.
 
-    `lens` is :attr:`lrfcal_lib.model.camera.CameraModel.parameters`. Far outside, where the radial distortion no longer
-    grows, it would fold points back into the image.
+    `lens` is :attr:`lrfcal_lib.model.camera.CameraModel.parameters`, `fold` where its radial distortion no longer grows
+    (:func:`lrfcal_lib.model.camera.fold`): it would fold points beyond back into the image.
     """
     height, width, channels = image.shape
     fx, fy, cx, cy, k1, k2, k3, k4, k5 = lens
     for i in range(len(uv)):
-        x, y = (uv[i, 0] - cx) / fx, (uv[i, 1] - cy) / fy
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k5))
-        u = (x * radial + (2 * k3 * x * y + k4 * (r2 + 2 * x * x))) * fx + cx
-        v = (y * radial + (k3 * (r2 + 2 * y * y) + 2 * k4 * x * y)) * fy + cy
-        grows = 1 + r2 * (3 * k1 + r2 * (5 * k2 + 7 * r2 * k5)) > 0
-        if not (grows and 0 <= u < width - 1 and 0 <= v < height - 1):
+        x = (uv[i, 0] - cx) / fx
+        y = (uv[i, 1] - cy) / fy
+        growth, shift_x, shift_y = lens_terms(x, y, k1, k2, k3, k4, k5)
+        u = (x * (1 + growth) + shift_x) * fx + cx
+        v = (y * (1 + growth) + shift_y) * fy + cy
+        if not (x * x + y * y < fold and 0 <= u < width - 1 and 0 <= v < height - 1):
             out[i] = np.nan
             continue
         column, row = int(u), int(v)

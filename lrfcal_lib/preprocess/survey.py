@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from lrfcal_lib.fit.robust import robust_sigma
 from lrfcal_lib.model.board import Board, corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
@@ -410,7 +411,7 @@ def measure_outline(views, board, models):
 
 
 def _spread(values):
-    return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) > 1 else float("nan")
+    return robust_sigma(values - np.median(values)) if len(values) > 1 else float("nan")
 
 
 def _median_line(lines, ends):

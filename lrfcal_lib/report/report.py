@@ -42,7 +42,7 @@ PART = ".report-"  # begins the names of folders in which a report is being writ
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
 _CLIENTS = set()  # of the notebooks that are being executed
-MEASURED = ("combined", "fused", "likelihood", "half_step", "last_beam")  # edge lengths, the best way first
+MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
 
 
 @dataclass(frozen=True)

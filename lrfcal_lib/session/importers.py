@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
-from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import image_size
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, read_bytes, reading, transform_to_json
@@ -185,7 +185,7 @@ def read_bouguet(file):
         if (number := re.fullmatch(r"omc_(\d+)", key)) and f"Tc_{number[1]}" in values:
             rotation, shift = Rotation.from_rotvec(values[key]), values[f"Tc_{number[1]}"] / 1000
             poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
     both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
-    reference = {k: dict(zip(names, v.tolist(), strict=True)) for k, v in both.items()} | {"T_camera_board": poses}
+    reference = {k: dict(zip(INTRINSIC_NAMES, v.tolist(), strict=True)) for k, v in both.items()}
+    reference["T_camera_board"] = poses
     return {"model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)), "reference": reference}

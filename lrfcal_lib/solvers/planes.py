@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, pad, plane_residuals_m, read_pose
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import project, project_jacobians
+from lrfcal_lib.model.camera import INTRINSIC_NAMES, project, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, apply_pose, move_pose, pose_transform
 
 
@@ -149,7 +149,6 @@ SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200
 FLAT = 1e-3  # of its extent: what leaves a common plane less is a set of single scan lines
 TILT_LEVER = 0.3  # metres, about half a board: turns an offset into the tilt that bends as much
-INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5")
 INTRINSIC_SCALES = (1e3, 1e3, 1e3, 1e3, 10.0, 10.0, 10.0, 10.0, 100.0)
 
 
