@@ -86,13 +86,12 @@ def case_of(joint, observations, placement):
     obs, edges = observations.with_cameras(solution.observations.cameras).select([placement]), prepared.board.edges
     face, sides = outline.edges_in_cloud(solution, prepared, placement)
     shown, told = set(sides), [edges.index(name) for name in sides]
-    for name, found, side, across in outline.named_sides(prepared, placement, stretch=outline.LEAST_STRETCH):
-        rows = found.side == side
-        if name not in shown and not across:  # where a sweep begins and ends may be where a cloud was cut
-            told.append(edges.index(name))
-            points = solution.corrections.points(found.points[rows])
-            pitch = solution.corrections.pitch(placement, found.pitch[rows])
-            sides[name] = geometry.lrf_to_platform(points, pitch, solution.T_head_lrf)
+    for side in outline.named_sides(prepared, placement, stretch=outline.LEAST_STRETCH):
+        if side.name not in shown and not side.across:  # where a sweep begins and ends may be where a cloud was cut
+            told.append(edges.index(side.name))
+            points = solution.corrections.points(side.edges.points[side.rows])
+            pitch = solution.corrections.pitch(placement, side.edges.pitch[side.rows])
+            sides[side.name] = geometry.lrf_to_platform(points, pitch, solution.T_head_lrf)
     rough = outline.measure_board(face, sides, edges)
     lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])
     lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle

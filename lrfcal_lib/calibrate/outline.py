@@ -9,7 +9,7 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import fit_line, lrf_to_platform
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_scan import edge_cells
+from lrfcal_lib.preprocess.edges_in_scan import ScanEdges, edge_cells
 
 LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
 FEWEST_CELLS = 8
@@ -109,15 +109,42 @@ def _flat_line(points):
     return np.array([y, -x, x * middle[1] - y * middle[0]]), middle
 
 
+@dataclass(frozen=True)
+class NamedSide:
+    """A side of the scan that has the name of an edge.
+
+    Attributes
+    ----------
+    name : str
+        Of the board's edge.
+    edges : ScanEdges
+        That hold its points.
+    rows : ndarray of int
+        Which of them.
+    across : bool
+        Whether it was found across the scan lines.
+    """
+
+    name: str
+    edges: ScanEdges
+    rows: np.ndarray
+    across: bool
+
+
 def named_sides(prepared, placement, variant="half_step", stretch=0.0):
-    """Named sides of a placement of which some share is seen: edge, points, side number, whether across the lines."""
-    along, swept = prepared.edges[variant][placement], prepared.swept[variant].get(placement)
-    numbers, length = np.unique(along.side), prepared.board.lengths() if stretch else {}
-    for side, name in prepared.names.get(placement, {}).items():
-        found = along if side in numbers else swept
-        seen = next((s.length for s in found.sides if s.side == side), 0.0)
-        if seen >= stretch * length.get(name, 0.0):
-            yield name, found, side, found is not along
+    """Named sides of a placement of which the sweep shows at least some share: NamedSide one by one."""
+    along = prepared.edges[variant][placement]
+    swept = prepared.swept[variant].get(placement)
+    numbers = np.unique(along.side)
+    lengths = {}
+    if stretch > 0:
+        lengths = prepared.board.lengths()
+    for number, name in prepared.names.get(placement, {}).items():
+        edges = along if number in numbers else swept
+        length = next((s.length for s in edges.sides if s.side == number), 0.0)
+        if length >= stretch * lengths.get(name, 0.0):
+            rows = np.flatnonzero(edges.side == number)
+            yield NamedSide(name, edges, rows, across=edges is not along)
 
 
 def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
@@ -131,10 +158,11 @@ def outline_of(prepared, placement, variant="half_step", T_head_lrf=None):
     T_head_lrf = platform_of(prepared, T_head_lrf)
     points, pitch, _ = face_points(prepared.scans[placement])
     sides, across = {}, set()
-    for name, found, side, swept in named_sides(prepared, placement, variant, LEAST_STRETCH):
-        rows = found.side == side
-        sides[name] = lrf_to_platform(found.points[rows], found.pitch[rows], T_head_lrf)
-        across |= {name} if swept else set()
+    for side in named_sides(prepared, placement, variant, LEAST_STRETCH):
+        p_lrf = side.edges.points[side.rows]
+        sides[side.name] = lrf_to_platform(p_lrf, side.edges.pitch[side.rows], T_head_lrf)
+        if side.across:
+            across.add(side.name)
     return measure_board(lrf_to_platform(points, pitch, T_head_lrf), sides, prepared.board.edges), frozenset(across)
 
 

@@ -350,8 +350,9 @@ def with_joint(calibration, joint):
     platform = calibration.platform
     if isinstance(joint, str):
         return replace(calibration, problems=calibration.problems | {("rig", "joint"): joint})
-    cameras, made = joint.observations.cameras, {}
-    seen = {(camera, "joint"): joint.seen_by(camera, made=made) for camera in cameras}
+    cameras = joint.observations.cameras
+    outlines = {}
+    seen = {(camera, "joint"): joint.seen_by(camera, outlines=outlines) for camera in cameras}
     solved = {(camera, "joint"): joint.solution.camera(camera) for camera in cameras}
     covariance = stated_covariance(platform.stated_sigma)  # scan lines of one pitch say nothing about it
     covariance = joint.solution.covariance("axis_", "offset_") if joint.settings["axis"] else covariance
