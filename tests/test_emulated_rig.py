@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
@@ -84,21 +85,44 @@ def test_the_board_is_moved_by_who_records(world):
     assert driver.move_board(1) is False and driver.hold_close("left", 0) is False  # there it is a person
     server = CameraServer(world)
     server.start()
-    data["devices"]["control"] = server.url
+    data["devices"]["control"] = server.control
     driver = make_rig(data)
     assert driver.move_board(2) and world.place.key == ("placement", 2)
     assert driver.hold_close("left", 3) and world.place.key == ("close", "left", 3)
     for call, message in (
-        (lambda: driver.move_board(9), "control http:.*: no placement 9; there are 1, 2, 3, 4, and none"),
+        (lambda: driver.move_board(9), "control http:.* 400 'no placement 9; there are 1, 2, 3, 4, and none'"),
         (lambda: driver.move_board("x"), "invalid literal"),
         (lambda: driver.hold_close("left", 99), "no view 99 of camera 'left'"),
-        (lambda: driver.hold_close("a/b", 0), "there are left.mjpg, right.mjpg, place/NUMBER"),
+        (lambda: driver.hold_close("a/b", 0), "answers 404 'there are place/NUMBER"),
     ):
         with pytest.raises(DeviceError, match=message):
             call()
     server.close()
     with pytest.raises(DeviceError, match="is 'python -m lrfcal_lib emulate' still running"):
         driver.move_board(3)
+
+
+STRANGE = {  # what a web page could send: method, address, Host
+    "read": ("GET", "{control}/place/1", "{host}"),
+    "no token": ("POST", "{url}/place/1", "{host}"),
+    "another token": ("POST", "{url}/x/place/1", "{host}"),
+    "another name": ("POST", "{control}/place/1", "example.org"),
+    "another port": ("POST", "{control}/place/1", "127.0.0.1:80"),
+    "images by another name": ("GET", "{url}/left.mjpg", "example.org"),
+}
+
+
+@pytest.mark.parametrize("order", STRANGE)
+def test_no_web_page_moves_the_board(world, order):
+    server = CameraServer(world)
+    server.start()
+    names = {"url": server.url, "control": server.control, "host": server.host}
+    method, url, host = (text.format(**names) for text in STRANGE[order])
+    request = urllib.request.Request(url, method=method, headers={"Host": host})
+    with pytest.raises(urllib.error.HTTPError, match="40[34]"):
+        urllib.request.urlopen(request, timeout=DEADLINE)
+    assert world.place.key == ("placement", None)
+    server.close()
 
 
 def test_an_image_begun_before_a_move_is_not_sent(small):
@@ -133,7 +157,8 @@ def test_the_command_line_cleans_up(tmp_path):
     port = serial.Serial(devices["lrf"]["port"], 9600, timeout=DEADLINE)
     port.write(bytes.fromhex("02 00 01 00 3A 1E 12"))
     assert port.read(30)[5:6] == b"\xba"
-    assert urllib.request.urlopen(f"{devices['control']}/place/1", timeout=DEADLINE).status == 204
+    order = urllib.request.Request(f"{devices['control']}/place/1", method="POST")
+    assert urllib.request.urlopen(order, timeout=DEADLINE).status == 204
     run.send_signal(signal.SIGTERM)
     assert "the emulated rig is gone" in run.communicate(timeout=DEADLINE)[0] and run.returncode == 0
     assert not file.exists() and not folder.exists()

@@ -52,7 +52,9 @@ TYPE_REPLY = "BA 4C 4D 53 32 32 31 3B 33 30 32 30 36 33 3B 58 30 31 2E 32 37 20 
         *((requests, REFUSED, {}) for requests in (
             [WRITE_TL], [INSTALL, encode_telegram(0x77, bytes(31))], [INSTALL, encode_telegram(0x77, bytes(35))],
             [encode_telegram(0x55)], [encode_telegram(0x20, b"\x99")], [encode_telegram(0x20)],
-            [encode_telegram(0x20, b"\x26\5")],
+            [encode_telegram(0x20, b"\x26\1")], [encode_telegram(0x20, b"\x27\5\0\4\0")],
+            [encode_telegram(0x20, b"\x27\0\0\4\0")], [encode_telegram(0x20, b"\x27\5\0\x92\1")],
+            [encode_telegram(0x20, b"\x2b\1\0\1\0")], [encode_telegram(0x20, b"\x2a\0")],
             [encode_telegram(0x30, b"\x55")], [encode_telegram(0x3B, b"\xb4\0")])),
     ],
 )  # fmt: skip

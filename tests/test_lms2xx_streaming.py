@@ -46,3 +46,29 @@ def test_interlaced_scans_carry_the_instants_of_the_mirror():
     begun = {record.telegram: record.time_s for record in device.scans}
     assert [r.time_s for r in readings] == pytest.approx([begun[r.telegrams[0]] for r in readings], abs=5e-4)
     assert all(len(r.ranges) == 721 for r in readings) and driver.variant == (100, 0.25)
+
+
+def read_late(device, rng):
+    """Bytes of a device get to the host at once for 5 to 120 ms of the line, as a busy machine reads them."""
+    held, put = [], device.port.put
+
+    def hand_over(instant):
+        put(b"".join(held))
+        held.clear()
+        device.at(instant + rng.uniform(0.005, 0.12), hand_over)
+
+    device.port.put = held.append
+    hand_over(device.host.now())
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_no_set_of_interlaced_scans_is_lost_where_its_parts_are_read_late(indexed):
+    device = lms(baudrate=500000, configuration=INDEXED.changed(realtime_indices=indexed))
+    read_late(device, np.random.default_rng(7))
+    with LMS2xx(device.path, host=device.host) as driver:
+        driver.start(interlaced=True)
+        readings = driver.take(100)
+        driver.stop()
+    number = {record.telegram: record.number for record in device.scans}
+    parts = [number[raw] for reading in readings for raw in reading.telegrams]
+    assert parts == [*range(parts[0], parts[0] + 400)]

@@ -346,6 +346,21 @@ def test_what_was_stated_and_does_not_come(habits, changes, error, message):
         PanTilt("nowhere", FAST, host=device.host)
 
 
+@pytest.mark.parametrize("changes", [{"feedback": True}, {"feedback": True, "reply_s": 1.0}, {"feedback": "auto"}])
+def test_what_to_state_for_a_head_that_answers_late(changes):
+    device = emulated()
+    reply = device.reply
+    device.reply = lambda raw, at: reply(raw, at + 0.6)
+    settings = replace(FAST, **changes)
+    if changes == {"feedback": True}:
+        with pytest.raises(NoReply, match='longer reply_s than 0.1 s if it answers late, or feedback "auto"'):
+            driven(device, settings)
+    else:
+        with driven(device, settings) as head:
+            assert head.has_feedback == (settings.reply_s == 1.0)
+            assert head.move_to(10 * DEGREE) == near(10, 0.6 if head.has_feedback else 5)
+
+
 @pytest.mark.parametrize("kind", HEAD)
 def test_no_fault_ends_in_a_wrong_pitch(opened, kind):
     device, head = opened(replace(FAST, retries=3, reconnect_s=3.0), settle=0.05)

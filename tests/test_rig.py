@@ -4,6 +4,8 @@ import contextlib
 import json
 import math
 import os
+import socket
+import threading
 from dataclasses import replace
 from functools import partial, reduce
 
@@ -232,6 +234,42 @@ def test_a_device_that_cannot_be_opened_closes_the_others(monkeypatch, options, 
     with pytest.raises(error, match=message):
         Rig.open(rig_of(rig_data()))
     assert made == []
+
+
+ENDLESS = 1 << 26  # bytes
+ANSWERS = {  # first line of an answer, bytes after it, what is said (None: it counts)
+    "done": ("204 No Content", 0, None),
+    "elsewhere": ("302 Found\r\nLocation: /", 0, "it answers 302 'Found'; is 'python"),
+    "a page": ("200 OK", 100, "it answers 200 'OK'"),
+    "without end": ("200 OK", ENDLESS, "it answers 200 'OK'"),
+    "escape codes": ("500 \x1b[2J" + 1000 * "x", 0, r"it answers 500 '\\x1b\[2Jx{196}';"),
+    "nothing": (None, 0, "is 'python -m lrfcal_lib emulate' still running"),
+}
+
+
+@pytest.mark.parametrize("case", ANSWERS)
+def test_only_204_of_a_control_counts_and_its_answer_is_not_read(case):
+    line, length, message = ANSWERS[case]
+    sent = []
+
+    def answer(listener):
+        link, _ = listener.accept()
+        with link, contextlib.suppress(OSError):
+            assert link.recv(4096).startswith(b"POST /token/place/3 HTTP/1.1\r\n")
+            if line is not None:
+                link.sendall(f"HTTP/1.1 {line}\r\n\r\n".encode())
+            while sum(sent) < length:
+                sent.append(link.send(bytes(min(length, 1 << 20))))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=answer, args=(listener,), daemon=True)
+        thread.start()
+        address = f"http://127.0.0.1:{listener.getsockname()[1]}/token"
+        rig = make_rig(changed("devices.control", address))
+        with contextlib.nullcontext() if message is None else pytest.raises(DeviceError, match=message):
+            assert rig.move_board(3) is True
+        thread.join()
+    assert sum(sent) < ENDLESS
 
 
 def test_what_the_device_says_about_itself_counts():

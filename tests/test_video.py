@@ -112,10 +112,13 @@ def test_newest_frame_of_a_stream(server, camera):
         camera.newest(after=time.time())
 
 
-def test_stream_lost_and_found(server, camera, caplog):
+def test_stream_lost_and_found(server, camera, caplog, capfd):
     before = camera.newest()
     server.stop()
     until(lambda: camera.lost)
+    with pytest.raises(PortError, match="gives no video"):  # what the camera tries again and again
+        video.open_source(server.url, 1.0)
+    assert capfd.readouterr() == ("", "")  # FFmpeg and OpenCV write there
     for after in (None, time.time() + 0.5):
         with pytest.raises(LineLost, match="camera left is lost: open http"):
             camera.newest(after=after, timeout=0.05)

@@ -363,8 +363,11 @@ class PanTilt(port.Closed):
 
     def _silence(self):
         echo = "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
-        return (f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the wires A and B, "
-                f"address {self.settings.address} and {self.settings.baudrate} Bd, or state feedback false")
+        return (
+            f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the wires A and B, "
+            f"address {self.settings.address} and {self.settings.baudrate} Bd; state a longer reply_s than "
+            f"{self.settings.reply_s:g} s if it answers late, or feedback \"auto\" to go on without its tilt"
+        )
 
     def close(self):
         """Stop the head and close the port; a second call does nothing."""

@@ -335,12 +335,16 @@ class Assembler:
         return self._merged(partial, one) if self.interlaced else one
 
     def _merged(self, partial, part):
-        """The set of four that a part completes, or None; a missing telegram ends a set."""
+        """The set of four that a part completes, or None; a missing telegram ends a set.
+
+        The device's own counting tells which parts belong together: the number of the partial scan,
+        and the telegram index where it is sent (without it, four that are missing in a row are not
+        seen). The instant of arrival tells nothing: a busy machine reads late.
+        """
+        missing = partial != len(self._parts)
         if self._parts and part.telegram_index is not None:
-            follows = (part.telegram_index - self._parts[-1].telegram_index) % 256 == 1
-        else:
-            follows = not self._parts or part.time_s - self._parts[-1].time_s < 1.5 * self.interval_s
-        if partial != len(self._parts) or not follows:
+            missing |= (part.telegram_index - self._parts[-1].telegram_index) % 256 != 1
+        if missing:
             self._parts = []
         if partial == len(self._parts):
             self._parts.append(part)

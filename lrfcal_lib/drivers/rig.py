@@ -68,6 +68,8 @@ LOG = logging.getLogger(__name__)
 SCAN_S = 5.0  # wait for one fresh scan: at 9600 Bd one takes 0.9 s, an interlaced one 1.6 s
 IMAGE_S = 30.0  # wait for one fresh image, a camera that comes back included
 BATCH_S = 0.25  # of a continuous sweep; its scans are handed out this often
+OBEYED = 204  # answer of a control; a redirection or a page moved nothing
+LONGEST_REASON = 200  # characters of another answer that are told
 GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
 FEWEST_SCANS, LEAST_SWEEP = 8, math.radians(10)  # of which can be told whether the view changed, even of a bare wall
@@ -149,16 +151,21 @@ class Rig(Closed):
         if (control := self.stated.devices.control) is None:
             return False
         try:
-            answer = urllib3.request("GET", f"{control}/{command}", timeout=10, retries=False)
-            wrong = answer.reason if answer.status >= 400 else None
+            # what it sends is not read: an answer without end fills no memory
+            answer = urllib3.request(
+                "POST", f"{control}/{command}", timeout=10, retries=False, preload_content=False
+            )
+            answer.close()
         except urllib3.exceptions.HTTPError as error:
             wrong = error
-        if wrong:
-            raise DeviceError(
-                f"control {control}: {wrong}; is 'python -m lrfcal_lib emulate' still running? "
-                "Remove devices.control from the rig file to move a real board by hand"
-            )
-        return True
+        else:
+            if answer.status == OBEYED:
+                return True
+            wrong = f"it answers {answer.status} {str(answer.reason)[:LONGEST_REASON]!r}"
+        raise DeviceError(
+            f"control {control}: {wrong}; is 'python -m lrfcal_lib emulate' still running? "
+            "Remove devices.control from the rig file to move a real board by hand"
+        )
 
     # ---------------------------------------------------------------------------------------------- recording
 

@@ -27,6 +27,10 @@ WIDTH, HEIGHT, FPS = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CA
 IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
+# A camera that is lost is told once, by us: FFmpeg and OpenCV would say so at every attempt to find it.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet
+if "OPENCV_LOG_LEVEL" not in os.environ:
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 class Images:

@@ -1,7 +1,11 @@
-"""A SICK LMS2xx: the commands that our driver, sicktoolbox and CARMEN send, their times, its mirror and its streams."""
+"""A SICK LMS2xx: the commands that our driver, sicktoolbox and CARMEN send, their times, its mirror and its streams.
+
+The orders of commands of those two programs are in ``tests/test_lms2xx_clients.py``.
+"""
 
 import logging
 import math
+import struct
 from collections import deque
 from dataclasses import dataclass, field, replace
 
@@ -10,7 +14,7 @@ import numpy as np
 from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN, UNITS, Configuration, encode_telegram
+from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN, MODES, UNITS, Configuration, encode_telegram
 from lrfcal_lib.simulate.beam import VARIANTS
 
 LOG = logging.getLogger(__name__)
@@ -28,8 +32,39 @@ POWERED_S = 60.0  # how long ago it was switched on
 KEPT = 20000  # scans and requests on record
 BAUD_WORD = {9600: 0x8067, 19200: 0x8033, 38400: 0x8019, 500000: 0x8001}
 BAUD_COMMAND = {0x40: 38400, 0x41: 19200, 0x42: 9600, 0x48: 500000}
-INSTALLATION, DIAGNOSIS, STREAM, REQUEST, INTERLACED = 0x00, 0x10, 0x24, 0x25, 0x2A  # operating modes
+# operating modes
+INSTALLATION, DIAGNOSIS, STREAM, REQUEST, MEAN, PART, INTERLACED, REFLECTIVITY = (
+    0x00, 0x10, 0x24, 0x25, 0x26, 0x27, 0x2A, 0x2B,
+)  # fmt: skip
+# layout of their parameters (manual, 7.2): password; scans; first and last value; parts and these two
+LAYOUTS = {
+    INSTALLATION: "<8s",
+    DIAGNOSIS: "<",
+    STREAM: "<",
+    REQUEST: "<",
+    MEAN: "<B",
+    PART: "<HH",
+    INTERLACED: "<",
+    REFLECTIVITY: "<HHH",
+}
+# code of the telegrams that they send
+STREAMED = {STREAM: 0xB0, MEAN: 0xB6, PART: 0xB7, INTERLACED: 0xB0, REFLECTIVITY: 0xF5}
+SCANS = range(2, 251)  # of a mean
+LAST = 401  # value that can be asked for; there may be fewer
+# as which mode a measuring mode encodes ranges; 13 and 14, remission, are those that CARMEN sets
+ENCODED = dict(zip(MODES, MODES, strict=True)) | {13: 0, 14: 0}
+WHITE = 100  # reflectivity of all that answers: the simulated world states none
 DONE, WRONG, FAULT = b"\0", b"\1", b"\2"  # results of command 0x20
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a mode tells of the scans; by default all."""
+
+    head: bytes = b""  # of its telegrams: the parameters of the mode
+    first: int = 1  # value that is told, counted from 1
+    last: int = LAST
+    scans: int = 1  # whose mean is told
 
 
 @dataclass(frozen=True)
@@ -68,7 +103,7 @@ class Memory:
     def write_configuration(self, block):
         """Take a configuration of 32 to 34 bytes; whether its values are possible."""
         block = bytes(block) + self.configuration.block[len(block) : codec.CONFIGURATION_BYTES]
-        if block[5] not in codec.MODES or block[6] >= len(UNITS):
+        if block[5] not in ENCODED or block[6] >= len(UNITS):
             return False
         self.configuration, self.flash_writes = Configuration(block), self.flash_writes + 1
         return True
@@ -118,7 +153,7 @@ class EmulatedLms(SerialDevice):
     """
 
     baudrate = property(lambda self: self.memory.baudrate, doc="Of the device now.")
-    streaming = property(lambda self: self.memory.mode in (STREAM, INTERLACED), doc="Whether scans come by themselves.")
+    streaming = property(lambda self: self.memory.mode in STREAMED, doc="Whether scans come by themselves.")
 
     def __init__(self, source, *, path, seed=0, host=REAL, boot_s=2.0, baudrates=(*BAUD_WORD,), **settings):
         super().__init__(path, host, seed)
@@ -127,6 +162,7 @@ class EmulatedLms(SerialDevice):
         self.scans, self.requests, self.telegrams, self.left_out = deque(maxlen=KEPT), deque(maxlen=KEPT), 0, 0
         self._buffer, self._turn, self._partial, self._number, self._effect = b"", 0, 0, 0, None
         self._zero, self._booting = host.now() - POWERED_S, False
+        self._told = Told()
 
     # ------------------------------------------------------------------------------------------- bytes from the host
 
@@ -163,7 +199,8 @@ class EmulatedLms(SerialDevice):
                 self.answer(at, 0x91, effect=lambda end: self.at(end + RESET_S, self.restart), delay=ACK_S + 0.001)
             case 0x20, data:
                 self.set_mode(data, at)
-            case 0x30, b"\x01":  # one scan: the one that is being measured when the ACK is out
+            case 0x30, b"\x01" if not self._told.head:
+                # one scan: the one that is being measured when the ACK is out
                 first = self._turn_of(at + ACK_S + 2 * self.byte_s, 100 // memory.variant[1], math.floor)
                 self._measure(first, -1, lambda scan, instant: self.emit(scan, instant, self._finish), "reply")
             case 0x31, _:
@@ -192,12 +229,24 @@ class EmulatedLms(SerialDevice):
             if BAUD_COMMAND[mode] not in self.baudrates:
                 return self.answer(at, 0xA0, FAULT)
             return self.answer(at, 0xA0, DONE, lambda _: setattr(memory, "baudrate", BAUD_COMMAND[mode]))
-        if len(data) != {INSTALLATION: 9, DIAGNOSIS: 1, STREAM: 1, REQUEST: 1, INTERLACED: 1}.get(mode):
+        parameters = data[1:]
+        layout = LAYOUTS.get(mode)
+        if layout is None or len(parameters) != struct.calcsize(layout):
             return self.answer(at, 0x92)
-        if mode == INSTALLATION and data[1:] != memory.password:
+        if mode == INSTALLATION and parameters != memory.password:
             return self.answer(at, 0xA0, WRONG)
+        numbers = struct.unpack(layout, parameters)
+        first, last = numbers[-2:] if len(numbers) > 1 else (1, LAST)
+        if not 1 <= first <= last <= LAST or mode == MEAN and numbers[0] not in SCANS:
+            return self.answer(at, 0x92)
         delay = REPLY_S + rng.uniform(0, 0.02) + (rng.uniform(0, STOP_S) if self.streaming else 0)
         memory.mode = mode
+        self._told = Told(
+            head=parameters if mode in STREAMED else b"",
+            first=first,
+            last=last,
+            scans=numbers[0] if mode == MEAN else 1,
+        )
         return self.answer(at, 0xA0, DONE, delay=delay)
 
     # ------------------------------------------------------------------------------------------- replies
@@ -233,6 +282,7 @@ class EmulatedLms(SerialDevice):
         self.cancel("reply", "stream")
         self.abort()
         self._booting, self._effect, memory = True, None, self.memory
+        self._told = Told()
         memory.mode, memory.baudrate = REQUEST, 9600
         memory.variant = (100, 50) if memory.model.startswith("LMS211") else (180, 50)
         self.at(at + self.boot_s, self._ready)
@@ -249,35 +299,66 @@ class EmulatedLms(SerialDevice):
 
     def _measure(self, turn, partial, send, tag):
         """Send the scan that begins at a turn at its end; it is cast a little ahead, which may take a while."""
-        angle, step = self.memory.variant
+        memory = self.memory
+        angle, step = memory.variant
         turns = 1 if partial >= 0 else 100 // step
-        end = self._zero + (turn + turns) * MIRROR_TURN
+        values = 181 - (partial > 0) if partial >= 0 else angle * 100 // step + 1
+        end = self._zero + (turn + turns * self._told.scans) * MIRROR_TURN
 
         def ahead(_):
-            """Cast the scan, and send it at its end."""
-            quarters = codec.scan_quarters(181 - (partial > 0) if partial >= 0 else angle * 100 // step + 1, partial)
+            """Cast the scan, or those of a mean, and send it at its end."""
+            quarters = codec.scan_quarters(values, partial)
             times = self._zero + (turn + np.arange(len(quarters)) % turns + quarters / 1440) * MIRROR_TURN
-            ranges, reasons, pitch = self.source.scan(turn, quarters, times)
-            c, times = self.memory.configuration, times + self.host.time() - self.host.now()
-            words = codec.encode_values(ranges, unit=c.unit, mode=c.measuring_mode, reasons=reasons)
-            scan = ScanRecord(-1, turn, -1, float(times[0]), times, pitch, partial, words, b"")
+            later = range(0, turns * self._told.scans, turns)
+            cast = [self.source.scan(turn + n, quarters, times + n * MIRROR_TURN) for n in later]
+            ranges, reasons, pitch = map(np.array, zip(*cast, strict=True))
+            configuration = memory.configuration
+            words = codec.encode_values(
+                ranges.mean(axis=0),
+                unit=configuration.unit,
+                mode=ENCODED[configuration.measuring_mode],
+                reasons=reasons.max(axis=0),  # of a mean, too: one scan without a range leaves none
+            )
+            times += self.host.time() - self.host.now()
+            ends = pitch[[0, -1], [0, 1]]
+            scan = ScanRecord(-1, turn, -1, float(times[0]), times, ends, partial, words, b"")
             self.at(end, lambda instant: send(scan, instant), tag)
 
         self.at(end - AHEAD_S, ahead, tag)
 
     def emit(self, scan, at, then=None):
         """Send a scan, which is then on record."""
-        c, indices = self.memory.configuration, (scan.turn, self.telegrams)
-        raw = codec.encode_words(scan.words, unit=c.unit, partial=scan.partial, address=0x80 | self.memory.address,
-                           indices=indices if c.realtime_indices else None)  # fmt: skip
-        self.scans.append(replace(scan, number=self._number, telegram_index=self.telegrams % 256, telegram=raw))
-        self.telegrams, self._number = self.telegrams + 1, self._number + 1
+        raw = self._telegram(scan)
+        index = self.telegrams % 256
+        self.scans.append(replace(scan, number=self._number, telegram_index=index, telegram=raw))
+        self.telegrams += 1
+        self._number += 1
         self.reply(raw, at, then)
+
+    def _telegram(self, scan):
+        """What the mode tells of a scan."""
+        memory = self.memory
+        c = memory.configuration
+        words = scan.words[self._told.first - 1 : self._told.last]
+        if memory.mode == REFLECTIVITY:  # behind every range
+            answered = words <= MODES[ENCODED[c.measuring_mode]].largest
+            words = np.stack([words, WHITE * answered], axis=1)
+        return codec.encode_words(
+            words,
+            unit=c.unit,
+            partial=scan.partial,
+            indices=(scan.turn, self.telegrams) if c.realtime_indices else None,
+            address=0x80 | memory.address,
+            code=STREAMED.get(memory.mode, codec.SCAN),
+            head=self._told.head,
+        )
 
     @property
     def _turns(self):
-        """Turns of the mirror for a scan of the stream."""
-        return 1 if self.memory.mode == INTERLACED else 100 // self.memory.variant[1]
+        """Turns of the mirror for a telegram of the stream."""
+        if self.memory.mode == INTERLACED:
+            return 1
+        return self._told.scans * 100 // self.memory.variant[1]
 
     def _plan(self):
         """Measure the next scan of the stream; of one that lags, some are left out: the indices show the gap."""
@@ -303,6 +384,6 @@ class EmulatedLms(SerialDevice):
             self.telegrams += 1
         else:
             self.emit(scan, at)
-        size = 2 * len(scan.words) + 10 + 2 * self.memory.configuration.realtime_indices
+        size = len(self._telegram(scan))
         self._turn += math.ceil(size * self.byte_s / (self._turns * MIRROR_TURN)) * self._turns
         self._plan()

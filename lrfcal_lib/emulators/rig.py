@@ -118,7 +118,7 @@ class EmulatedRig:
                          "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist()},
                 "cameras": {name: {"source": self.camera_urls[name], "silence_s": SILENCE_S,
                                    "size": [c.width, c.height]} for name, c in cameras.items()},
-                "control": self.camera_server.url,
+                "control": self.camera_server.control,
             },
             "plan": self.plan(),
         }  # fmt: skip
@@ -188,13 +188,14 @@ def main(name, rig_file=None, *, seed=0, feedback="full"):
 
 def summary(rig, file):
     """What other programs need to know of an emulated rig, as text."""
-    head, control = rig.pan_tilt, rig.camera_server.url
+    head, control = rig.pan_tilt, rig.camera_server.control
+    places = ", ".join(map(str, rig.world.placements))
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",
         f"  lrf      {rig.lrf.path}   {rig.lrf.baudrate} Bd, SICK LMS2xx",
         f"  head     {head.path}   {head.baudrate} Bd, Pelco-D, address {head.address}",
         *(f"  {name:8s} {url}" for name, url in rig.camera_urls.items()),
-        f"  board    {control}/place/NUMBER puts it at {', '.join(map(str, rig.world.placements))}, or none",
+        f"  board    curl -X POST {control}/place/NUMBER puts it at {places}, or none",
     ]
     if file is not None:
         lines.append(f"  rig file {file}   python -m lrfcal_lib record --help")

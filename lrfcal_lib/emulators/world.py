@@ -5,6 +5,7 @@ No image shows a head that moves: while it does none is sent, and one that was b
 
 import contextlib
 import itertools
+import secrets
 import threading
 import time
 from dataclasses import dataclass, field, replace
@@ -99,7 +100,8 @@ def scaled(rig, width):
 class CameraServer:
     """The cameras of a world, and who puts its board elsewhere, over HTTP.
 
-    `url` has ``NAME.mjpg`` of all `cameras`, and obeys ``place/NUMBER`` (or none) and ``close/CAMERA/VIEW``.
+    `url` has ``NAME.mjpg`` of all `cameras`; `control` obeys POST of ``place/NUMBER`` (or none) and
+    ``close/CAMERA/VIEW``. A web page cannot know the token in that address.
 
     Parameters
     ----------
@@ -117,7 +119,10 @@ class CameraServer:
         self._scene = lru_cache(2)(lambda place: world_of(world.setup, place.T_platform_board, stand=place.stand))
         self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"server_of": self}))
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self.host = f"127.0.0.1:{self._server.server_port}"
+        self.url = f"http://{self.host}"
+        self.token = secrets.token_urlsafe()
+        self.control = f"{self.url}/{self.token}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self.start = self._thread.start
 
@@ -160,22 +165,38 @@ class CameraServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Sends the images of a camera as a stream, or moves the board."""
+    """Sends the images of a camera as a stream, or moves the board; see :mod:`http.server`."""
+
+    def parse_request(self):
+        """Refuse what was sent to another name, as by a web page whose name leads to this machine."""
+        if not super().parse_request():
+            return False
+        known = self.headers["Host"] == self.server_of.host
+        if not known:
+            self.send_error(403, f"this is {self.server_of.url} only")
+        return known
 
     def do_GET(self):
-        """Answer a request, see :mod:`http.server`."""
-        cameras, world = self.server_of.cameras, self.server_of.world
+        """Send the images of a camera."""
+        name = self.path.strip("/").removesuffix(".mjpg")
+        if name in self.server_of.cameras:
+            return self._stream(name)
+        known = ", ".join(f"{name}.mjpg" for name in self.server_of.cameras)
+        return self.send_error(404, f"there are {known}")
+
+    def do_POST(self):
+        """Move the board."""
+        world = self.server_of.world
         try:
-            match self.path.removesuffix(".mjpg").strip("/").split("/"):
-                case [name] if name in cameras:
-                    return self._stream(name)
-                case ["place", number]:
+            match self.path.strip("/").split("/"):
+                case [token, *_] if token != self.server_of.token:
+                    return self.send_error(403, "the address of devices.control in the rig file is needed")
+                case [_, "place", number]:
                     world.put(None if number == "none" else int(number))
-                case ["close", camera, view]:
+                case [_, "close", camera, view]:
                     world.hold_close(camera, int(view))
                 case _:
-                    known = ", ".join(f"{name}.mjpg" for name in cameras)
-                    return self.send_error(404, f"there are {known}, place/NUMBER and close/CAMERA/VIEW")
+                    return self.send_error(404, "there are place/NUMBER and close/CAMERA/VIEW")
         except ValueError as error:
             return self.send_error(400, str(error))
         self.send_response(204)

@@ -280,12 +280,12 @@ def encode_values(ranges, *, unit="mm", mode=0, reasons=None):
     return np.where(reasons > 0, mode.top - BELOW_TOP[reasons], counts).astype(np.uint16)
 
 
-def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE):
-    """Telegram 0xB0 of values that are encoded already.
+def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE, code=SCAN, head=b""):
+    """Telegram 0xB0 of values that are encoded already, or one of another code, with bytes before the values.
 
     Parameters
     ----------
-    words : array_like of uint16, shape (B,)
+    words : array_like of uint16, shape (B,) or (B, 2)
     unit : {'cm', 'mm'}
     partial : int
         0 to 3 for the quarters of a degree of an interlaced scan, -1 for a whole scan.
@@ -294,8 +294,8 @@ def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, add
     """
     count = len(words) | UNITS.index(unit) << 14 | (0 if partial < 0 else 1 << 13 | partial << 11)
     tail = b"" if indices is None else bytes(i % 256 for i in indices)
-    data = count.to_bytes(2, "little") + np.asarray(words, "<u2").tobytes() + tail
-    return encode_telegram(SCAN, data, status=status, address=address)
+    data = head + count.to_bytes(2, "little") + np.asarray(words, "<u2").tobytes() + tail
+    return encode_telegram(code, data, status=status, address=address)
 
 
 def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, **options):
