@@ -87,7 +87,7 @@ def parser():
     record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
-    emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
+    emulate.add_argument("--rig-file", help="write a new file for 'record', removed at the end unless changed")
     emulate.add_argument("--seed", type=int, default=0, help="of noise")
     told = {"choices": ("full", "partial", "none"), "default": "full"}
     emulate.add_argument("--feedback", **told, help="what the head tells of its position")
