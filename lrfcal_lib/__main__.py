@@ -30,7 +30,7 @@ def run(args):
             from lrfcal_lib.session.cache import all_processors
 
             with all_processors():
-                return calibrate_session(args.session)
+                return calibrate_session(args.session, args.out)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -79,6 +79,7 @@ def parser():
     simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
+    calibrate.add_argument("--out", help="folder of its files (default reports/<session> under this folder)")
     record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
     record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
     record.add_argument("session", help="folder of the new session")
