@@ -30,7 +30,7 @@ def run(args):
             from lrfcal_lib.session.cache import all_processors
 
             with all_processors():
-                return calibrate_session(args.session)
+                return calibrate_session(args.session, args.out)
         case "simulate":
             from lrfcal_lib.simulate.record import simulate
             from lrfcal_lib.simulate.rig import load_setup
@@ -79,6 +79,7 @@ def parser():
     simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
+    calibrate.add_argument("--out", help="folder of its files (default reports/<session> under this folder)")
     record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
     record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
     record.add_argument("session", help="folder of the new session")
@@ -87,7 +88,7 @@ def parser():
     record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
     emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
-    emulate.add_argument("--rig-file", help="write a file for 'record' (it is removed at the end)")
+    emulate.add_argument("--rig-file", help="write a new file for 'record', removed at the end unless changed")
     emulate.add_argument("--seed", type=int, default=0, help="of noise")
     told = {"choices": ("full", "partial", "none"), "default": "full"}
     emulate.add_argument("--feedback", **told, help="what the head tells of its position")

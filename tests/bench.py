@@ -83,7 +83,7 @@ def cameras(size):
     rng = np.random.default_rng(0)
     rig = random_rig(rng)
     obs = camera_observations(rng, rig, random_board_poses(rng, 20, rig), noise=1.0)
-    start = solve_camera(obs).transform
+    start = solve_camera(obs, "line").transform
     x0 = np.r_[start.rotation.as_rotvec(), start.translation] + 0.02
     T0 = RigidTransform.from_components(x0[3:], Rotation.from_rotvec(x0[:3]))
     points = obs.crossing_points + rng.normal(0, 0.002, (size["trials"], *obs.crossing_points.shape))

@@ -1,10 +1,11 @@
 """Fixtures shared by all tests."""
 
 import os
+import resource
 import shutil
 import signal
 import sys
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -30,6 +31,22 @@ def pytest_configure(config):
 def pytest_unconfigure(config):
     if not hasattr(config, "workerinput"):
         shutil.rmtree(os.environ.pop(FOLDER), ignore_errors=True)
+
+
+@pytest.fixture
+def little_space():
+    """Lets files grow to so many bytes only, as a disk that is nearly full does; a context manager."""
+
+    @contextmanager
+    def little_space(most):
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return little_space
 
 
 @pytest.fixture(scope="session")

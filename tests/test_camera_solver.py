@@ -13,7 +13,7 @@ from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
 from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
-from lrfcal_lib.solvers import METHODS, solve_camera, starting_transform
+from lrfcal_lib.solvers import METHODS, best_method, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -84,6 +84,48 @@ def test_too_few_rows_and_unknown_methods_are_refused(name, prefix, count, words
         solve_camera(rows_of(camera_case(6)[1], prefix, slice(count)), name)
 
 
+def bent_lines(obs):
+    """Every edge of the board seems to lie 20 px outside, as a wide spot of the laser makes it."""
+    return replace(obs, crossing_lines=obs.crossing_lines - [0.0, 0.0, 20.0])
+
+
+def crooked_planes(obs):
+    """Every face of the board seems to lie elsewhere, as a wrong pattern makes it."""
+    poses = obs.board_poses.copy()
+    poses[:, :3, 3] += np.random.default_rng(2).normal(0, 0.05, (len(poses), 3))
+    return replace(obs, board_poses=poses)
+
+
+HANDED_OVER = {  # what a session shows, and which method is then the default
+    "bent lines": (bent_lines, "zhang_pless"),
+    "crooked planes": (crooked_planes, "line"),
+    "no planes": (lambda obs: rows_of(obs, "plane_", slice(0)), "line"),
+    "no edges": (lambda obs: rows_of(obs, "crossing_", slice(0)), "zhang_pless"),
+    "too few to leave one out": (lambda obs: obs.select(obs.placements[:3]), "zhang_pless"),
+}
+
+
+@pytest.mark.parametrize("case", HANDED_OVER)
+def test_the_default_is_the_method_that_errs_less_on_placements_left_out(case):
+    change, best = HANDED_OVER[case]
+    _, obs = camera_case(7, 14, noise=1.0)
+    obs = change(obs)
+    found = solve_camera(obs)
+    assert found.method == best
+    np.testing.assert_array_equal(pose_array(found.transform), pose_array(solve_camera(obs, best).transform))
+    if case != "too few to leave one out":
+        assert best_method({"left": obs}, {("left", best): found}) == best
+
+
+def test_without_a_method_that_determines_the_pose_or_for_many_trials_there_is_no_default():
+    _, obs = camera_case(7)
+    with pytest.raises(DegenerateGeometry, match="at least 3 needed"):
+        solve_camera(obs.select([]))
+    with pytest.raises(ValueError, match="many trials at once: name the method, one of line_printed"):
+        solve_camera(replace(obs, crossing_points=np.stack([obs.crossing_points] * 2)))
+    assert best_method({"left": obs}, {}) is None
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_errors_agree_with_the_covariance(name):
     rig, obs = camera_case(5, 12)
@@ -125,7 +167,7 @@ def test_robust_loss_resists_wrong_edges():
     lines = obs.crossing_lines.copy()
     lines[::10, 2] += 60.0
     spoiled = replace(obs, crossing_lines=lines)
-    plain, robust = (miss(solve_camera(spoiled, loss=loss), rig)[1] for loss in (None, "cauchy"))
+    plain, robust = (miss(solve_camera(spoiled, "line", loss=loss), rig)[1] for loss in (None, "cauchy"))
     assert robust < 0.03 and robust < 0.5 * plain
 
 

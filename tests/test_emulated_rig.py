@@ -16,9 +16,10 @@ import serial
 from fake_rig import make_rig, rig_data
 from shared import until
 
+from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.drivers.port import DeviceError
 from lrfcal_lib.emulators.head import Head
-from lrfcal_lib.emulators.rig import EmulatedRig, main
+from lrfcal_lib.emulators.rig import EmulatedRig, main, written_rig_file
 from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.simulate import beam as lrf
 from lrfcal_lib.simulate.record import world_of
@@ -143,6 +144,62 @@ def test_an_image_begun_before_a_move_is_not_sent(small):
 def test_a_setup_that_is_not_there():
     with pytest.raises(ValueError, match="no set-up 'x'; there are sim_lms221, sim_quick"):
         main("x")
+
+
+class Quiet:
+    """An emulated rig without devices."""
+
+    def rig_file(self):
+        return {"plan": {}}
+
+
+TAKEN = {  # what is there already, and what is said of it
+    "a file": (lambda file: file.write_text("mine"), "exists already, and is not written over: name another file"),
+    "a folder": (lambda file: file.mkdir(), "exists already, and is not written over: name another file"),
+    "a dangling link": (lambda file: file.symlink_to("nowhere"), "exists already"),
+    "no folder": (lambda file: file.parent.rmdir(), "No such file or directory.*a folder that exists"),
+}
+
+
+@pytest.mark.parametrize("case", TAKEN)
+def test_a_rig_file_takes_no_other_file_s_place(tmp_path, case):
+    make, words = TAKEN[case]
+    file = tmp_path / "rigs" / "rig.json"
+    file.parent.mkdir()
+    make(file)
+    before = file.read_text() if file.is_file() else sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=f"{file}: .*{words}"), written_rig_file(Quiet(), file):
+        pytest.fail("it was written")
+    assert (file.read_text() if file.is_file() else sorted(tmp_path.rglob("*"))) == before
+
+
+def replace_by_another(file):
+    file.unlink()
+    file.write_text("another")
+
+
+@pytest.mark.parametrize("change", [lambda file: file.write_text("mine"), replace_by_another])
+def test_a_rig_file_that_somebody_changed_stays(tmp_path, change, capsys):
+    file = tmp_path / "rig.json"
+    with written_rig_file(Quiet(), file):
+        assert json.loads(file.read_text()) == {"plan": {}}
+        change(file)
+        changed = file.read_bytes()
+    assert file.read_bytes() == changed and f"{file}: was changed, so it stays" in capsys.readouterr().out
+
+
+def test_a_rig_file_on_a_full_disk_leaves_nothing(tmp_path, little_space):
+    with little_space(5), pytest.raises(ValueError, match="rig.json: cannot be written .File too large.: name another"):
+        with written_rig_file(Quiet(), tmp_path / "rig.json"):
+            pytest.fail("it was written")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_rig_file_ends_the_command_line_at_once(tmp_path, capsys):
+    file = tmp_path / "rig.json"
+    file.write_text("mine")
+    assert command_line.main(["emulate", "--rig-file", str(file)]) == 1
+    assert f"error: {file}: exists already" in capsys.readouterr().err and file.read_text() == "mine"
 
 
 def test_the_command_line_cleans_up(tmp_path):

@@ -2,10 +2,10 @@
 
 
 import numpy as np
-import pandas as pd
 import pytest
 from synthetic import camera_observations, random_board_poses, random_rig
 
+from lrfcal_lib import solvers
 from lrfcal_lib.evaluate import tables
 from lrfcal_lib.solvers import solve_camera
 
@@ -20,7 +20,7 @@ def observed():
 
 def left_out(obs, method, full=None):
     """Residuals of every placement under a calibration from the others: crossings and face points."""
-    return tables.left_out_residuals(tables.left_out(obs, obs, method, full or solve_camera(obs, method)))
+    return tables.left_out_residuals(solvers.left_out(obs, obs, method, full or solve_camera(obs, method)))
 
 
 def test_left_out_errors_vanish_without_noise(observed):
@@ -34,11 +34,3 @@ def test_placements_without_which_too_little_is_left_do_not_count(observed):
     assert [len(found) for found in left_out(some, "zhang_pless", solve_camera(obs, "zhang_pless"))] == [0, 0]
 
 
-def test_the_method_handed_over_does_well_on_both_features():
-    columns = ["method", "left_out_edge_rms_px", "left_out_plane_rms_mm"]
-    rows = [("line", 4.7, 42.0), ("zhang_pless", 6.0, 8.9), ("bauermann", 0.1, 0.1)]
-    assert tables.best_method(pd.DataFrame(rows, columns=columns)) == "zhang_pless"
-    # a sheet on a wall shows no edges: planes judge alone
-    assert tables.best_method(pd.DataFrame([("zhang_pless", np.nan, 1.0)], columns=columns)) == "zhang_pless"
-    with pytest.raises(ValueError, match="left-out placements"):
-        tables.best_method(pd.DataFrame([("line", np.nan, np.nan)], columns=columns))

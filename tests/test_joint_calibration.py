@@ -53,7 +53,7 @@ def test_corrections_undo_what_the_estimate_found(joint):
 
 
 def test_it_is_handed_over_with_its_platform_and_sensor(quick):
-    assert tables.handed_over(quick) == "joint"
+    assert pipeline.handed_over(quick) == "joint"
     record = calibration_record(quick, "joint")
     np.testing.assert_allclose(record["platform"]["matrix"], quick.joint.solution.T_head_lrf.as_matrix())
     assert set(record["cameras"]) == set(quick.joint.observations.cameras)
@@ -64,10 +64,19 @@ def test_it_is_handed_over_with_its_platform_and_sensor(quick):
     assert "sensor" not in calibration_record(quick, "line")
 
 
+def test_a_cloud_is_coloured_by_what_is_handed_over(quick):
+    default, joint, line = (pipeline.color_cloud(quick, *method).points for method in ((), ("joint",), ("line",)))
+    np.testing.assert_array_equal(default, joint)
+    assert np.linalg.norm(joint - line, axis=1).min() > 0
+    nothing = replace(quick, joint=None, solutions={})
+    with pytest.raises(ValueError, match="no camera was calibrated that could colour a cloud"):
+        pipeline.color_cloud(nothing)
+
+
 @campaign
 def test_what_did_not_converge_is_not_handed_over(quick):
     bad = replace(quick.joint.solution, solution=replace(quick.joint.solution.solution, converged=False))
-    assert tables.handed_over(replace(quick, joint=replace(quick.joint, solution=bad))) in ("line", "zhang_pless")
+    assert pipeline.handed_over(replace(quick, joint=replace(quick.joint, solution=bad))) in ("line", "zhang_pless")
 
 
 def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_board(joint):

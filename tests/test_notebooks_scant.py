@@ -21,9 +21,12 @@ SCANT = {  # besides, none has images at several pitches
     "edges": {"pattern": False, "cameras": ["left"], "placements": 4, "platform": None},  # a plain board, one camera
     "blind": {"cameras": [], "placements": 4},  # no camera
     "parallel": {"still": ("turn",), "placements": 3},  # nothing to answer from
+    "scenes": {"purpose": "scene", "placements": 2},  # no board at all
 }
 FEW = ("as recorded", "all sizes 5 % too large")  # the whole table is made of three other sessions
 SAYS = {
+    ("scenes", "01"): "no sweep shows a board, so none is drawn below",
+    ("scenes", "02"): "no sweep shows a board",
     ("lines", "01"): "a single scan line",
     ("lines", "03"): "no sweeps with a straight side",
     ("lines", "07"): "whether it bends",

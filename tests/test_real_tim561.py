@@ -38,5 +38,5 @@ def rms_px(obs, solution):
 @pytest.mark.parametrize("frames, expected", [(20, 3.528), (23, 3.845)])
 def test_line_constraint_reaches_the_reference(obs, frames, expected):
     some = obs.select(range(frames))
-    found = solve_camera(some, weighted=False)
+    found = solve_camera(some, "line", weighted=False)
     assert found.converged and rms_px(some, found) == pytest.approx(expected, abs=1e-3)

@@ -48,7 +48,8 @@ WRONG = {
     r"devices\.head\.pitch_limits_deg is \[10, -10\]: .*comes first": ("devices.head.pitch_limits_deg", [10, -10]),
     r"devices\.lrf\.unit is 'inch': 'mm' or 'cm'": ("devices.lrf.unit", "inch"),
     r"devices\.lrf\.variant is 180: a valid tuple": ("devices.lrf.variant", 180),
-    r"devices\.lrf\.baudrate is 300: 9600, 19200, 38400 or 500000": ("devices.lrf.baudrate", 300),
+    r"lrf\.baudrate is 300: one of 9600, 19200, 38400, 500000": ("devices.lrf.baudrate", 300),
+    "230400: .*no other range finder is driven here; .*SessionWriter": ("devices.lrf.baudrate", 230400),  # an LD19
     r"devices\.cameras\.left\.size is \[640, 480\], rig\.cameras\.left states \[32, 24\]":
         ("devices.cameras.left.size", [640, 480]),
     r"devices\.cameras are none, rig\.cameras left": ("devices.cameras", {}),

@@ -93,6 +93,13 @@ def test_sweeps_keep_order_gaps_and_times(path):
     assert np.isnan(first.time_s).all() and second.time_s.tolist() == [0.5, 1.0, 1.5]
 
 
+def test_a_table_that_pandas_wrote_is_the_same(path):
+    before = open_session(path).image_records
+    written_by_pandas(index=False)(path)
+    assert ",1.0," in (path / IMAGES).read_text()
+    assert repr(open_session(path).image_records) == repr(before) and validate(path) == []
+
+
 def test_picks_override_by_camera_file_and_edge(path):
     pick("left,images/left/0001.png,ab,1,2,20,3.5")(path)
     session = open_session(path)
@@ -173,7 +180,9 @@ CHANGES = [  # place in session.json, what stands there instead ("gone": nothing
     ("board.edges", ["ab", "ab", "ca"], "the edges need different names"),
     ("board.edges", ["ab", "ca"], "board.edges is .*at least 3 items"),
     ("board.edges", ["$x$", "ab", "ca"], "board.edges.0 is .*names of edges stand in figures"),
-    ("board.features", ["ab", "xy"], "features are two of the edges ab, bc, ca, got ab, xy"),
+    ("board.features", ["ab", "xy"], "features must be two different edges of ab, bc, ca, .*; got 'ab', 'xy'"),
+    ("board.features", ["", ""], "two different edges of ab, bc, ca, at a right angle; got none"),
+    ("board.features", ["ab", "ab"], "two different edges of ab, bc, ca, at a right angle; got 'ab', 'ab'"),
     ("board.pattern", CHESSBOARD | {"square_m": 77.5}, "square_m is 77.5: .*millimetres"),
     ("board.pattern", CHESSBOARD | {"columns": 1}, "pattern.columns is 1: greater than or equal to 3"),
     ("board.pattern", CHESSBOARD | {"columns": 500}, "up to 1000 inner corners in all"),
@@ -237,6 +246,15 @@ def cell(column, value):
     return edit
 
 
+def written_by_pandas(index):
+    """The table of images as pandas writes it when it is asked nothing else: whole numbers as 1.0, and row numbers."""
+
+    def edit(path):
+        pd.read_csv(path / IMAGES).to_csv(path / IMAGES, index=index)
+
+    return edit
+
+
 def pick(row):
     return written("edges.csv", f"camera,file,edge,u1,v1,u2,v2\n{row}\n".encode())
 
@@ -270,6 +288,8 @@ DAMAGE = [
     (cell("camera", "up"), "no camera 'up' in session.json, which has left, right"),
     (cell("purpose", "fun"), "purpose is one of intrinsics, board, scene, got 'fun'"),
     (cell("placement", "12"), "placement 12 is not in session.json"),
+    (cell("placement", "1.5"), "images.csv line 2: placement is '1.5': a whole number is needed"),
+    (written_by_pandas(index=True), "columns must be t_s, .*; got a first column without a name: .*index=False in"),
     (cell("pitch_deg", "up"), "line 2: could not convert string to float: 'up'"),
     (written("images/left/0002.png", cv2.imencode(".png", pixels()[:20])[1]), r"0002\.png: 32 x 20 pixels, but camera"),
     (gone(IMAGES), r"images\.csv: No such file"),

@@ -89,7 +89,12 @@ def test_setup_keeps_the_environment_until_environment_txt_changes(run_setup, tm
 
 OLD = 'case "$*" in *version_info*) exit 1 ;; -V) echo Python 3.9.2 ;; esac'
 NO_VENV = 'case "$*" in *ensurepip*) exit 1 ;; *python%d*) echo python3.12-venv ;; esac'
+PIP_SAYS = f"""{FAKE_PYTHON}
+case "$*" in *environment.txt*) echo "%s" >&2; exit 1 ;; esac"""
+OFFLINE = "WARNING: connection broken by 'NewConnectionError'\nERROR: No matching distribution found for numba"
 TOLD = {
+    "offline": ({"python3": PIP_SAYS % OFFLINE}, 1, "packages cannot be fetched: is there a network? Connect"),
+    "pip fails": ({"python3": PIP_SAYS % "ERROR: numba needs another Python"}, 1, "numba needs another Python"),
     "read-only": ({"touch": "exit 1"}, 1, "{} cannot be written: copy the repository to a folder"),
     "old python": ({"python3": OLD}, 1, "Python 3.11 or newer is needed, Python 3.9.2 was found"),
     "no venv": ({"python3": NO_VENV, "id": "echo 1000"}, 1, "sudo apt-get install -y python3.12-venv"),
@@ -103,3 +108,4 @@ def test_setup_says_what_to_do(run_setup, tmp_path, case):
     done = run_setup(**commands)
     assert done.returncode == status and words.format(tmp_path) in done.stderr
     assert status == 0 or not (tmp_path / ".venv").exists()
+    assert case != "offline" or "numba" not in done.stderr

@@ -3,6 +3,7 @@
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lrfcal_lib.model.board import triangle_board
@@ -195,12 +196,23 @@ def no_rows(path):
     (path / "lrf" / "index.csv").write_text("t_s,offset,length,placement,pitch_deg\n")
 
 
+def test_an_index_that_pandas_wrote_is_the_same(path):
+    """Its placements have a point where one of them is empty."""
+    before = open_session(path).scans
+    file = path / "lrf" / "index.csv"
+    pd.read_csv(file).to_csv(file, index=False)
+    assert ",1.0," in file.read_text()
+    for key, values in open_session(path).scans.items():
+        np.testing.assert_array_equal(values, before[key])
+
+
 HALF = np.ones((4, 361))
 DAMAGE = [
     (cell(3, 1, "853"), r"index\.csv: line 4, offset 853, length 812: .*one after the other; restore"),
     (cell(2, 2, "6"), r"index\.csv: line 3, offset 42, length 6: telegrams of 7 to 65541 bytes"),
     (cell(2, 4, ""), r"index\.csv: line 3, offset 42, length 812, placement 1: pitch_deg is missing"),
-    (cell(2, 1, "x"), r"index\.csv: .*invalid literal.*'x'"),
+    (cell(2, 1, "x"), r"index\.csv: line 3: offset is 'x': a whole number is needed"),
+    (cell(3, 3, "1.5"), r"index\.csv: line 4: placement is '1\.5': a whole number is needed"),
     (no_rows, r"index\.csv: no telegram in the index, 6538 bytes"),
     (cell(2, 4, "400"), r"a pitch is .* rad: degrees"),
     (data(lambda raw: raw[:2000]), "line 5, offset 1666, .* telegrams.bin has 2000 bytes: restore it, or remove"),

@@ -45,7 +45,7 @@ def rectangle(shift=0.0, columns=9, rows=5, square=0.036, size=(0.46, 0.34)):
 
 def record(
     path, board, seed=0, *, placements=4, pitch_deg=None, on_wall=False, image_pitch_deg=(0.0,), cameras=CAMERAS,
-    platform=STATED, still=(),
+    platform=STATED, still=(), purpose="board",
 ):  # fmt: skip
     """Write a simulated session with its truth.
 
@@ -66,6 +66,8 @@ def record(
         As it is stated.
     still : sequence of str
         What does not change from placement to placement: 'turn', 'place'.
+    purpose : str
+        Of the images: 'scene' where nobody is to look for the board.
     """
     rng, pitch = np.random.default_rng(seed), np.radians(np.arange(-14, 14.1, 1.0) if pitch_deg is None else pitch_deg)
     info = LrfInfo("pinpoint", (BEARINGS[0], BEARINGS[-1]), np.radians(0.5), SIGMA_RANGE)
@@ -86,7 +88,7 @@ def record(
                 for at in np.radians(image_pitch_deg):
                     back = RigidTransform.from_rotation(Rotation.from_rotvec([-at, 0, 0]))
                     seen = CAMERAS[name] * HEAD.inv() * back * pose
-                    writer.add_image(name, _image(seen, board, on_wall, rng), number, pitch=float(at))
+                    writer.add_image(name, _image(seen, board, on_wall, rng), number, pitch=float(at), purpose=purpose)
                     file = f"images/{name}/{writer.shots[name]:04d}.png"
                     truth["images"][file] = {"pitch_rad": float(at), "T_camera_board": transform_to_json(seen)}
     (path / "truth.json").write_text(json.dumps(truth))

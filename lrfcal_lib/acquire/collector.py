@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.acquire.record import Recording, RecordingError
-from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, prepare
+from lrfcal_lib.calibrate.pipeline import calibrate, calibrate_jointly, handed_over, prepare
 from lrfcal_lib.drivers.port import Closed, DeviceError, LineLost
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned
 from lrfcal_lib.drivers.rig_file import RigFileError, read_rig_file, rig_of
 from lrfcal_lib.evaluate.export import calibration_record, write_calibration
-from lrfcal_lib.evaluate.tables import handed_over
 from lrfcal_lib.evaluate.verdict import YES, judge, sight_of, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
+from lrfcal_lib.solvers import CANDIDATES
 
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
@@ -58,9 +58,6 @@ def next_task(recording, advice=""):
     return Task(f"Placement {done + 1} of {max(len(recording.plan), left[0].number)}", guidance, left[0])
 
 
-METHOD = "line"  # the paper's, beside the joint estimate
-
-
 @dataclass(frozen=True)
 class Result:
     """A calibration."""
@@ -78,7 +75,7 @@ def calibrate_recording(path):
 
     ValueError if the session cannot be used.
     """
-    found = calibrate(open_session(path), [METHOD])
+    found = calibrate(open_session(path), CANDIDATES)
     judged, poses = judge(found), {}
     if not judged.errors:
         return Result(judged.answer, (*judged.sentences(), "Nothing is written."), "", {}, None, found)

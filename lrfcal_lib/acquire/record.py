@@ -1,7 +1,6 @@
 """A recording: the events of a rig written to a session; ``python -m lrfcal_lib record`` asks for the board."""
 
 import contextlib
-import errno
 import logging
 import math
 import signal
@@ -17,7 +16,7 @@ from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder
+from lrfcal_lib.session.write import SessionRecorder, not_written
 
 FAILED, INTERRUPTED = 2, 130  # exit codes
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
@@ -177,10 +176,8 @@ class Recording(Closed):
         try:
             yield
         except OSError as error:
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-            remedy = "free some space" if full else "check the disk and its permissions"
             safe = self.safe(resume=True) if hasattr(self, "writer") else "then record again"
-            raise RecordingError(f"{self.path}: cannot be written ({error.strerror}): {remedy}; {safe}") from error
+            raise RecordingError(f"{self.path}: {not_written(error)}; {safe}") from error
 
 
 def ask(text):

@@ -18,7 +18,7 @@ from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP, PitchNoise, Prepared, prepare_images, prepare_scans
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.session.cache import cached, spread
-from lrfcal_lib.solvers import METHODS, solve_camera
+from lrfcal_lib.solvers import METHODS, SHIPPED, best_method, row_of, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
 from lrfcal_lib.solvers.platform import solve_platform, solve_projected
@@ -144,20 +144,33 @@ class Calibration:
         return T_head_lrf, AS_RECORDED
 
 
-@cached
-def calibrate(session, methods=tuple(METHODS)):
+def calibrate(session, methods=None):
     """All stages: preprocessing, platform, cameras, and the joint estimate of everything.
 
     Parameters
     ----------
     session : Session
-    methods : sequence of str
-        Of :data:`lrfcal_lib.solvers.METHODS`.
+    methods : sequence of str, optional
+        Of :data:`lrfcal_lib.solvers.METHODS`; all rows that are there when this is called by default.
 
     Returns
     -------
     Calibration
+
+    Raises
+    ------
+    ValueError
+        For a method that is not there.
     """
+    methods = tuple(METHODS if methods is None else methods)
+    if any(row_of(name) is not SHIPPED.get(name) for name in methods):
+        return _calibrate.__wrapped__(session, methods)  # a row may change without its name
+    return _calibrate(session, methods)
+
+
+@cached
+def _calibrate(session, methods):
+    """As :func:`calibrate`, by methods that do not change."""
     prepared = prepare(session)
     stages = [partial(joint_or_words, prepared, all_views(prepared))] if prepared.views else []
     *joint, found = spread(lambda stage: stage(), [*stages, partial(_by_themselves, prepared, methods)])
@@ -281,16 +294,16 @@ def axis_from_chart(parameters):
     return geometry.TiltAxis(direction, np.array([-(direction[1] * y + direction[2] * z) / direction[0], y, z]))
 
 
-def calibrate_cameras(observations, methods=METHODS):
-    """Calibrate every camera by some methods of :data:`lrfcal_lib.solvers.METHODS`.
+def calibrate_cameras(observations, methods=None):
+    """Calibrate every camera by methods of :data:`lrfcal_lib.solvers.METHODS`, all by default.
 
     Returns a Solution, or in words why there is none, by camera and method.
     """
     solutions, problems = {}, {}
     for camera in dict.fromkeys(camera for camera, _ in observations):
-        for name in methods:
+        for name in METHODS if methods is None else methods:
             try:
-                solutions[camera, name] = solve_camera(observations[camera, METHODS[name].variant], name)
+                solutions[camera, name] = solve_camera(observations[camera, row_of(name).variant], name)
             except DegenerateGeometry as error:
                 problems[camera, name] = str(error)
     return solutions, problems
@@ -403,19 +416,32 @@ def stereo_reference(prepared):
     return pair, found.mounting[1], found.mounting_covariance[0]
 
 
-def color_cloud(calibration, method="line", scene=False):
+def handed_over(calibration):
+    """The method of a Calibration whose result goes into ``calibration.json`` and colours the cloud.
+
+    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says. None where no
+    camera was calibrated, or none could be judged.
+    """
+    joint = calibration.joint
+    if joint is not None and joint.solution.converged and not joint.solution.unobservable:
+        return "joint"
+    halfway = {c: obs for (c, variant), obs in calibration.observations.items() if variant == "half_step"}
+    return best_method(halfway, calibration.solutions)
+
+
+def color_cloud(calibration, method=None, scene=False):
     """Sweeps of a session as one coloured Cloud in the platform frame, see :func:`cloud_blocks`."""
     return reconstruct.join(cloud_blocks(calibration, method, scene))
 
 
-def cloud_blocks(calibration, method="line", scene=False):
+def cloud_blocks(calibration, method=None, scene=False):
     """Coloured points of a session, block by block.
 
     Parameters
     ----------
     calibration : Calibration
-    method : str
-        Whose camera poses and axis make the cloud.
+    method : str, optional
+        Whose camera poses and axis make the cloud; what is handed over by default.
     scene : bool
         The sweeps of scenes, with all their returns, instead of the boards.
 
@@ -427,8 +453,11 @@ def cloud_blocks(calibration, method="line", scene=False):
     Raises
     ------
     ValueError
-        If there is no such sweep.
+        If there is no such sweep, or no method.
     """
+    method = method or handed_over(calibration)
+    if method is None:
+        raise ValueError("no camera was calibrated that could colour a cloud: see `problems` of the calibration")
     session, masks = calibration.prepared.session, {p: scan.mask for p, scan in calibration.prepared.scans.items()}
     if scene:
         masks = dict.fromkeys(session.scene_placements)

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -14,6 +13,7 @@ from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
+from lrfcal_lib.session.write import whole
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once
@@ -501,10 +501,9 @@ KINDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 def write_ply(path, clouds, comments=()):
     """Write a cloud, or blocks of one as they come, as binary PLY with all attributes; frame and units are comments.
 
-    Returns the number of points; OSError if the file cannot be written.
+    Returns the number of points. ValueError if the file cannot be written; it is whole, or as it was before.
     """
-    clouds, path, count = [clouds] if isinstance(clouds, Cloud) else clouds, Path(path), 0
-    path.parent.mkdir(parents=True, exist_ok=True)
+    clouds, count = [clouds] if isinstance(clouds, Cloud) else clouds, 0
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in (FRAME, UNITS, *comments))]
     body = [f"property {KINDS[kind]} {name}" for kind, names in COLUMNS.values() for name in names.split()]
     table = np.dtype([(field, kind, (len(names.split()),)) for field, (kind, names) in COLUMNS.items()])
@@ -513,13 +512,13 @@ def write_ply(path, clouds, comments=()):
         """The same length for every number of points."""
         return "\n".join([*head, f"element vertex {number:<12d}", *body, "end_header", ""]).encode()
 
-    with open(path, "wb") as file:
+    with whole(path) as draft, open(draft, "wb") as file:
         file.write(header(0))
         for cloud in clouds:
             rows = np.empty(len(cloud.points), table)
             for field in COLUMNS:
                 rows[field] = getattr(cloud, field).reshape(len(rows), -1)
-            rows.tofile(file)
+            file.write(rows.tobytes())
             count += len(rows)
         file.seek(0)
         file.write(header(count))

@@ -59,11 +59,18 @@ Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01,
 ORDER = "the lower one comes first"
 
 
+RATES = (9600, 19200, 38400, 500000)  # of an LMS2xx
+OTHER_RATE = (
+    "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range finder is driven here; "
+    "record it by a program of your own that writes a session (lrfcal_lib.session.write.SessionWriter)"
+)
+
+
 class LrfDevice(Stated):
     """Where the laser range finder is, and how it is to be set."""
 
     port: Text
-    baudrate: Literal[9600, 19200, 38400, 500000] = None
+    baudrate: Annotated[Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)] = None
     address: whole(0, 127) = None
     password: Annotated[
         Text, AfterValidator(str.encode), refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed")

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import signal
 import tempfile
 import threading
@@ -167,7 +168,8 @@ def quick_file(rig):
 def main(name, rig_file=None, *, seed=0, feedback="full"):
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
 
-    Its rig file is written where it is asked for, and removed at the end. ValueError for a set-up that there is not.
+    Its rig file is written where it is asked for, see :func:`written_rig_file`. ValueError for a set-up that there is
+    not, and for a rig file that cannot be written.
     """
     quit_ = threading.Event()
     with contextlib.ExitStack() as stack:
@@ -176,14 +178,45 @@ def main(name, rig_file=None, *, seed=0, feedback="full"):
                 stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
         rig = stack.enter_context(EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback}))
         if rig_file is not None:
-            stack.callback(Path(rig_file).unlink, missing_ok=True)
-            Path(rig_file).write_text(json.dumps(rig.rig_file(), indent=1) + "\n")
+            stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
         while not quit_.wait(LOOK_S) and rig.error() is None:
             pass
         error = rig.error()
     print(f"a device ended: {error!r}" if error else "the emulated rig is gone", flush=True)
     return 1 if error else 0
+
+
+@contextlib.contextmanager
+def written_rig_file(rig, file):
+    """The rig file of a running rig, for as long as the rig lives; a file that was there before is never touched.
+
+    It is removed at the end, unless somebody changed or replaced it. ValueError where it cannot be written.
+    """
+    text = json.dumps(rig.rig_file(), indent=1) + "\n"
+    try:
+        stream = file.open("x")
+    except FileExistsError:
+        remedy = "name another file with --rig-file, or remove this one first"
+        raise ValueError(f"{file}: exists already, and is not written over: {remedy}") from None
+    except OSError as error:
+        remedy = "name a file in a folder that exists and can be written with --rig-file"
+        raise ValueError(f"{file}: cannot be written ({error.strerror}): {remedy}") from error
+    try:
+        with stream:
+            stream.write(text)
+        ours = file.stat()
+    except OSError as error:
+        file.unlink()
+        raise ValueError(f"{file}: cannot be written ({error.strerror}): name another file with --rig-file") from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # somebody removed it
+            if os.path.samestat(file.lstat(), ours) and file.read_bytes() == text.encode():
+                file.unlink()
+            else:
+                print(f"{file}: was changed, so it stays; its devices are gone", flush=True)
 
 
 def summary(rig, file):

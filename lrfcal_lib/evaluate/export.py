@@ -3,24 +3,30 @@
 import hashlib
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks
+from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.scenes import with_sigma
-from lrfcal_lib.evaluate.tables import handed_over, joint_fit, plane_residuals_of, rms
+from lrfcal_lib.evaluate.tables import joint_fit, plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
+from lrfcal_lib.session.write import whole
 
 SCHEMA = 1
 AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
+SCENES_ONLY = (
+    "all placements show scenes, and a calibration needs the board: "
+    "record three or more placements of the board with the same rig"
+)
 FRAMES = (
     "destination first: p_camera = T_camera_source p_source; metres, radians; "
     "covariances of [w, v]: R <- exp(w) R, t <- t + v"
@@ -93,45 +99,76 @@ def file_hashes(session):
 
 
 def write_calibration(path, record):
-    """Write a :func:`calibration_record` as JSON; NaN becomes null."""
-    path, plain = Path(path), json.loads(json.dumps(record), parse_constant=lambda name: None)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(plain, indent=1) + "\n")
+    """Write a :func:`calibration_record` as JSON, NaN as null; ValueError if it cannot be written."""
+    plain = json.loads(json.dumps(record), parse_constant=lambda name: None)
+    with whole(path) as draft:
+        draft.write_text(json.dumps(plain, indent=1) + "\n")
 
 
 def write_clouds(folder, calibration, method):
-    """Write ``cloud.ply`` (the boards) and, of a session with scenes, ``scene.ply`` and ``scene.pcd``: their paths.
+    """Write ``cloud.ply`` (the boards) and, where there are scenes, ``scene.ply`` and ``scene.pcd``.
 
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
+
+    Parameters
+    ----------
+    folder : path-like
+    calibration : Calibration
+        Its session may be another one of the same rig (``replace`` it in `prepared`), whose scenes
+        are then coloured.
+    method : str
+        Whose camera poses and axis make the clouds.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    ValueError
+        For a session that the calibration cannot colour, or a file that cannot be written. Every
+        file is whole, or as it was before.
     """
-    return sum(spread(_write_cloud, _clouds(folder, calibration, method))[::-1], [])
+    write = partial(_write_cloud, Path(folder), calibration, method)
+    written = spread(write, _kinds_of_clouds(calibration.prepared))
+    return [file for files in reversed(written) for file in files]
 
 
-def _clouds(folder, calibration, method):
-    """What :func:`_write_cloud` takes, of each cloud of a session."""
-    scenes = [True] * bool(calibration.prepared.session.scene_placements)
-    return [(Path(folder), calibration, method, s) for s in scenes + [False] * bool(calibration.prepared.scans)]
+def _kinds_of_clouds(prepared):
+    """The clouds that can be had, the longest work first: True of the scenes, False of the boards."""
+    kinds = []
+    session = prepared.session
+    if session.scene_placements:
+        kinds.append(True)
+    of_another_session = not prepared.scans.keys() <= set(session.placements)
+    if prepared.scans and not (kinds and of_another_session):
+        kinds.append(False)
+    return kinds
 
 
-def _write_cloud(of):
-    """The files of a cloud."""
-    folder, calibration, method, scene = of
-    blocks, files = cloud_blocks(calibration, method, scene), [folder / f"{'scene' if scene else 'cloud'}.ply"]
+def _write_cloud(folder, calibration, method, scene):
+    """Write the cloud of the scenes or of the boards; its files."""
+    blocks = cloud_blocks(calibration, method, scene)
     if method == "joint":
         blocks = (with_sigma(block, calibration.joint.solution) for block in blocks)
-    write_ply(files[0], blocks, [f"session {calibration.prepared.session.name}, method {method}, lrfcal {__version__}"])
-    if scene:
-        files.append(folder / "scene.pcd")
-        write_pcd(files[1], files[0])
-    return files
+    about = f"session {calibration.prepared.session.name}, method {method}, lrfcal {__version__}"
+    ply = folder / ("scene.ply" if scene else "cloud.ply")
+    write_ply(ply, blocks, [about])
+    if not scene:
+        return [ply]
+    pcd = folder / "scene.pcd"
+    write_pcd(pcd, ply)
+    return [ply, pcd]
 
 
 def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as PCD. Raises OSError if the file cannot be written."""
+    """Write what a PLY of :func:`write_ply` holds as PCD. ValueError if the file cannot be written."""
     import open3d as o3d
 
-    if not o3d.t.io.write_point_cloud(str(path), o3d.t.io.read_point_cloud(str(ply))):
-        raise OSError(f"{path}: the cloud could not be written; is the disk full?")
+    cloud = o3d.t.io.read_point_cloud(str(ply))
+    with whole(path) as draft:
+        if not o3d.t.io.write_point_cloud(str(draft), cloud):
+            raise OSError("is the disk full?")
 
 
 def write_mesh(path, ply, step=0.02):
@@ -146,7 +183,7 @@ def write_mesh(path, ply, step=0.02):
     Returns
     -------
     int
-        Triangles; ValueError if no point has a normal, OSError if the file cannot be written.
+        Triangles; ValueError if no point has a normal, or the file cannot be written.
     """
     import open3d as o3d
 
@@ -160,38 +197,71 @@ def write_mesh(path, ply, step=0.02):
     corners = o3d.geometry.PointCloud(mesh.vertices)
     mesh.remove_vertices_by_mask(np.asarray(corners.compute_point_cloud_distance(cloud)) > 2 * step)
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0, 1))
-    if not o3d.io.write_triangle_mesh(str(path), mesh):
-        raise OSError(f"{path}: the mesh could not be written; is the disk full?")
+    with whole(path) as draft:
+        o3d.io.write_triangle_mesh(str(draft), mesh)  # true also where the disk is full
+        if len(o3d.io.read_triangle_mesh(str(draft)).triangles) < len(mesh.triangles):
+            raise OSError("is the disk full?")
     return len(mesh.triangles)
 
 
 def calibrate_session(path, out=None):
     """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and clouds.
 
-    They go to `out`, ``reports/<name>`` under the current folder when left out. Returns 0, or 3 where the verdict is
-    'no' (also when no camera could be calibrated and nothing is written).
+    Parameters
+    ----------
+    path : path-like
+        Of the session.
+    out : path-like, optional
+        Folder of the files; ``reports/<name>`` under the current folder by default.
+
+    Returns
+    -------
+    int
+        0, or 3 where the verdict is 'no' (also when nothing could be calibrated, nor is written).
+
+    Raises
+    ------
+    ValueError
+        For a session that cannot be opened, or a file that cannot be written, which stays as it was.
     """
-    found, scale = calibrate(open_session(path)), np.repeat([np.rad2deg(1.0), 1000.0], 3)
+    session = open_session(path)
+    if not session.board_placements:
+        print(f"{path}: {SCENES_ONLY}")
+        return UNTRUSTED
+    calibration = calibrate(session)
+    _print_poses(calibration)
+    method = handed_over(calibration)
+    if method is None:
+        judged = judge(calibration)
+        print(*judged.sentences(), sep="\n")
+        return UNTRUSTED
     folder = Path(out or Path("reports") / Path(path).resolve().name)
-    for (camera, method), solution in found.solutions.items():
-        values, sigma = scale * solution.parameters[:6], scale * solution.trusted_sigma[:6]
-        turn, shift = (f"{values[i].round(2)} +- {sigma[i].round(2)}" for i in (slice(0, 3), slice(3, 6)))
-        print(f"{camera:>8} {method:<20} rotation vector {turn} deg, translation {shift} mm")
-    for key, why in (found.prepared.problems | found.problems).items():
-        print(f"{key}: {why}")
-    method, file = handed_over(found), folder / "calibration.json"
-
-    def work(cloud):
-        """Write a cloud, or else judge the calibration and write it."""
-        if cloud:
-            return _write_cloud(cloud)
-        judged = judge(found, method)
-        if method:  # otherwise nothing can be handed over
-            write_calibration(file, calibration_record(found, method, judged))
-        return judged
-
-    *files, judged = spread(work, [*(_clouds(folder, found, method) if method else ()), None])
+    kinds = _kinds_of_clouds(calibration.prepared)
+    clouds = [partial(_write_cloud, folder, calibration, method, kind) for kind in kinds]
+    tasks = [*clouds, partial(_judged, calibration, method)]
+    *written, (judged, record) = spread(lambda task: task(), tasks)
+    file = folder / "calibration.json"
+    write_calibration(file, record)  # last: where it stands, the clouds do
     print(*judged.sentences(), sep="\n")
-    if method:
-        print("written:", *(f"{path}," for path in sum(files[::-1], [])), file)
+    names = [str(name) for files in reversed(written) for name in files]
+    print("written:", ", ".join([*names, str(file)]))
     return UNTRUSTED if judged.answer == NO else 0
+
+
+def _judged(calibration, method):
+    """The Verdict on a calibration, and its record."""
+    judged = judge(calibration, method)
+    return judged, calibration_record(calibration, method, judged)
+
+
+def _print_poses(calibration):
+    """Print the pose of every camera by every method, and what could not be used."""
+    scale = np.repeat([np.rad2deg(1.0), 1000.0], 3)
+    for (camera, method), solution in calibration.solutions.items():
+        values = (scale * solution.parameters[:6]).round(2)
+        sigma = (scale * solution.trusted_sigma[:6]).round(2)
+        turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
+        shift = f"translation {values[3:]} +- {sigma[3:]} mm"
+        print(f"{camera:>8} {method:<20} {turn}, {shift}")
+    for key, why in (calibration.prepared.problems | calibration.problems).items():
+        print(f"{key}: {why}")

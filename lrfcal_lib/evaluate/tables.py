@@ -23,7 +23,7 @@ from lrfcal_lib.model.camera import INTRINSIC_NAMES, project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS
 from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
-from lrfcal_lib.solvers import METHODS, solve_camera
+from lrfcal_lib.solvers import METHODS, left_out
 from lrfcal_lib.solvers.joint import solve_again
 from lrfcal_lib.solvers.joint_noise import on_board
 
@@ -169,19 +169,6 @@ def plane_residuals_of(obs, solution):
     return plane_residuals_m(obs, solution.transform, poses_under(obs, solution.model))
 
 
-def left_out(obs, judge, method, full):
-    """Calibrations from all placements but one, and what that one shows: (CameraObservations, Solution) each.
-
-    The `method` of METHODS works on `obs` and is judged on `judge`, CameraObservations of the same placements; `full`
-    is the calibration from all of them, the start of each solve. Placements whose absence leaves the camera open are
-    missing.
-    """
-    for placement in judge.all_placements:
-        with suppress(DegenerateGeometry):
-            rest = obs.select(obs.all_placements[obs.all_placements != placement])
-            yield judge.select([placement]), solve_camera(rest, method, full.transform, search=False)
-
-
 def jointly_left_out(joint, camera):
     """The same of the joint estimate (JointCalibration), which is judged with its own platform and range offset."""
     ready = joint.prepared
@@ -243,42 +230,6 @@ def method_comparison(observations, solutions, truth=None, joint=None):
         }  # fmt: skip
         rows.append(row | camera_errors(solution, truth, camera))
     return pd.DataFrame(rows)
-
-
-def best_method(comparison, among=("line", "zhang_pless")):
-    """The method of a :func:`method_comparison` to hand over: least product of its left-out edge and plane errors.
-
-    A method that fits its own feature and fails on the other one (lines bent by a wide laser spot, say) loses. A
-    ValueError where none of them was judged on left-out placements.
-
-    Notes
-    -----
-    A rule of thumb, made after the two sessions it was first used on had been seen. It picks one winner by a margin
-    that may be within the noise (48.9 against 53.9 px mm on the LMS400 recording).
-    """
-    if comparison.empty:
-        raise ValueError("no camera was calibrated by any method")
-    mean = comparison.groupby("method")[["left_out_edge_rms_px", "left_out_plane_rms_mm"]].mean()
-    mean = mean.reindex(list(among)).dropna(axis=1, how="all")  # where no edge was seen, planes judge alone
-    score = mean.prod(axis=1, skipna=False).dropna()
-    if mean.empty or score.empty:
-        raise ValueError(f"none of {', '.join(among)} was judged on left-out placements; it takes more of them")
-    return score.idxmin()
-
-
-def handed_over(calibration):
-    """The method of a Calibration whose result goes into ``calibration.json`` and colours the cloud.
-
-    'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method` says. None where no
-    camera was calibrated, or none could be judged.
-    """
-    joint = calibration.joint
-    if joint is not None and joint.solution.converged and not joint.solution.unobservable:
-        return "joint"
-    compared = method_comparison(calibration.observations, calibration.solutions)
-    with suppress(ValueError):
-        return best_method(compared)
-    return None
 
 
 def _parameter_table(keys, found):

@@ -8,12 +8,12 @@ import pandas as pd
 from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
-from lrfcal_lib.calibrate.pipeline import largest_range
+from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
 from lrfcal_lib.evaluate import alternatives
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
 from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
-from lrfcal_lib.evaluate.tables import handed_over, placements_table
+from lrfcal_lib.evaluate.tables import placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
@@ -220,8 +220,8 @@ def judge(calibration, method=None, **options):
     """Judge what a calibration hands over, by itself and by what became of the recording: a :class:`Verdict`.
 
     'no' without errors, and with what to record, where nothing is handed over. `method` is that whose camera poses are
-    handed over, as :func:`lrfcal_lib.evaluate.tables.handed_over` says when left out; options of :func:`verdict` (what
-    the LRF sees and the board's features are known).
+    handed over, as :func:`lrfcal_lib.calibrate.pipeline.handed_over` says when left out; options of :func:`verdict`
+    (what the LRF sees and the board's features are known).
     """
     prepared, joint = calibration.prepared, calibration.joint
     lens = [Reason(NO if OTHER_SIZE in words else CARE, "lens", words) for words in lens_words(prepared).values()]

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
 STYLE = Path(__file__).with_name("figures.mplstyle")
 UNITS = {"deg": "deg", "mm": "mm", "px": "px", "m": "m", "m3": "m³", "percent": "%", "radii": "spot radii"}
-WORDS = {name: method.label for name, method in METHODS.items()} | {
+OTHER_LABELS = {  # of what is no row of METHODS
     "joint": "joint estimate", "line_3d": "lines in space", "projected_last_beam": "projected lines, last beam",
     "projected_printed": "projected lines as the paper prints them",
 }  # fmt: skip
@@ -123,10 +123,18 @@ def table(df, name, digits=3, caption=""):
     return HTML(made)
 
 
+def label_of(name):
+    """What a method is called in tables and figures; any other text as it is."""
+    return METHODS[name].label if name in METHODS else OTHER_LABELS.get(name, name)
+
+
 def in_words(text, column=False):
     """An identifier in words: a method by its name, a column with its unit; everything else as it is."""
-    if text in WORDS or not isinstance(text, str) or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)+", text):
-        return WORDS.get(text, text)
+    if not isinstance(text, str):
+        return text
+    label = label_of(text)
+    if label != text or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)+", text):
+        return label
     *words, last = text.split("_")
     return " ".join((*words, f"[{UNITS[last]}]" if column and last in UNITS else last))
 

@@ -26,7 +26,7 @@ from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernel
 from tqdm import tqdm
 
 from lrfcal_lib.report import page
-from lrfcal_lib.report.notebook import ROOT, SHIPPED, WORDS
+from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
@@ -254,7 +254,7 @@ def write_pages(out, session, runs, found, seconds):
     loader = FileSystemLoader(Path(__file__).parent)
     jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
     quoted = r"(?<=')\w+(?=')"  # methods named in sentences
-    jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: WORDS.get(m[0], m[0]), WORDS.get(text, text))
+    jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: label_of(m[0]), label_of(text))
     numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
     drawn = {}
     for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):

@@ -14,7 +14,16 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, naming, opened, reading, short
+from lrfcal_lib.session.stated import (
+    CameraInfo,
+    LrfInfo,
+    SessionError,
+    naming,
+    opened,
+    reading,
+    short,
+    whole_number,
+)
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
@@ -173,7 +182,7 @@ def read_images(path, facts, unfinished=None):
                 raise ValueError(f"no camera '{row['camera']}' in session.json, which has {short(cameras)}")
             if row["purpose"] not in PURPOSES:
                 raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
-            placement = int(row["placement"] or -1)
+            placement = whole_number(row["placement"], "placement")
             if placement not in (*facts["placements"], -1):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))

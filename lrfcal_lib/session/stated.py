@@ -188,11 +188,31 @@ def read_table(file, columns, within, torn=False):
         rows = list(csv.reader(lines))
     if not rows or tuple(rows[0]) != columns:
         got = ", ".join(rows[0]) if rows else "an empty file"
+        if rows and tuple(rows[0]) == ("", *columns):
+            got = "a first column without a name: write the table without row numbers (index=False in pandas)"
         raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(columns):
             raise SessionError(f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?")
-    return [dict(zip(columns, row, strict=True)) for row in rows[1:]], cut
+    whole = [key in WHOLE_COLUMNS for key in columns]
+    rows = [map(_without_point, row, whole) for row in rows[1:]]
+    return [dict(zip(columns, row, strict=True)) for row in rows], cut
+
+
+def _without_point(cell, whole):
+    """A cell of a table: 1.0, as programs write whole numbers beside empty cells, is 1."""
+    return cell.removesuffix(".0") if whole else cell
+
+
+def whole_number(text, name):
+    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text."""
+    try:
+        return int(text or -1)
+    except ValueError:
+        raise ValueError(f"{name} is '{text}': a whole number is needed") from None
+
+
+WHOLE_COLUMNS = ("placement", "offset", "length")  # of tables, which hold whole numbers
 
 
 def check_amount(values):
@@ -357,8 +377,10 @@ class BoardStated(BaseModel):
         corners = None if self.corners_m is None else np.array(self.corners_m)
         if len(set(self.edges)) < len(self.edges):
             raise ValueError("the edges need different names")
-        if not set(self.features) <= set(self.edges):
-            raise ValueError(f"features are two of the edges {short(self.edges)}, got {short(self.features)}")
+        if len(set(self.features) & set(self.edges)) != 2:
+            given = "none" if not any(self.features) else short(map(repr, self.features))
+            needed = f"features must be two different edges of {short(self.edges)}, at a right angle"
+            raise ValueError(f"{needed}; got {given}")
         if corners is not None and len(corners) != len(self.edges):
             raise ValueError(f"corners_m must be one corner for each of {len(self.edges)} edges, got {len(corners)}")
         if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:

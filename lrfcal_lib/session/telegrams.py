@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.stated import LARGEST_FILE, SessionError, check_amount, naming, read_bytes, read_table, short
+from lrfcal_lib.session.stated import (
+    LARGEST_FILE,
+    SessionError,
+    check_amount,
+    naming,
+    read_bytes,
+    read_table,
+    short,
+    whole_number,
+)
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
@@ -90,7 +99,9 @@ def read_telegrams(file, within):
     rows, torn = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
         index = {key: np.array([float(row[key] or "nan") for row in rows]) for key in ("t_s", "pitch_deg")}
-        index |= {key: np.array([int(row[key] or -1) for row in rows], int) for key in INDEX_COLUMNS[1:4]}
+        for key in INDEX_COLUMNS[1:4]:
+            numbers = [whole_number(row[key], f"line {n}: {key}") for n, row in enumerate(rows, start=2)]
+            index[key] = np.array(numbers, int)
         _check_index(index, len(data), file)
         check_amount(len(data) // 2)
     offset, length = index["offset"], index["length"]

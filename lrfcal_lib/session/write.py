@@ -1,6 +1,7 @@
 """Write a session so that a crash loses at most what was being written, placement by placement."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -255,6 +256,46 @@ def write_file(file, content, within):
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def whole(path):
+    """Let a file that is no session's be written whole, or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        Its folder is made where there is none.
+
+    Yields
+    ------
+    Path
+        Beside it, to write to: a file there takes the place of `path` at the end. Where anything is raised before, it
+        goes, and what was at `path` stays.
+
+    Raises
+    ------
+    ValueError
+        With the file and the remedy, where it cannot be written.
+    """
+    path = Path(path)
+    draft = path.with_name(f".{os.getpid()}-{path.name}")  # keeps the suffix, by which writers choose a format
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield draft
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+    except OSError as error:
+        raise ValueError(f"{path}: {not_written(error)}, or name another folder") from error
+
+
+def not_written(error):
+    """Why an OSError kept something from being written, and what to do; half a sentence."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    remedy = "free some space" if full else "check the disk and its permissions"
+    return f"cannot be written ({error.strerror or error}): {remedy}"
 
 
 def append_file(file, content, within):
