@@ -1,4 +1,4 @@
-"""Ways to falsify the files of a whole session, as users do by accident, with the causes that may be named."""
+"""Ways to falsify the files of a session, as users do by accident, with the causes to be named."""
 
 import json
 import os
@@ -12,7 +12,6 @@ import numpy as np
 
 from lrfcal_lib.session.read import IMAGE_COLUMNS, open_session
 from lrfcal_lib.session.stated import read_table
-from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 from lrfcal_lib.session.write import as_lines
 
 INCH = 0.0254  # metres
@@ -42,7 +41,7 @@ class Way:
 
 
 def copied(source, target):
-    """Copy a session by hard links where the disk allows; a file is replaced before it is changed."""
+    """Copy a session by hard links where the disk allows; files are replaced, never changed."""
     for file in sorted(Path(source).rglob("*")):
         other = Path(target) / file.relative_to(source)
         if file.is_dir():
@@ -86,7 +85,7 @@ def change_scans(folder, change):
 
 
 def change_images(folder, change, cameras=None, first=0):
-    """Let a function change the pixels of images: of some cameras, and of boards from a placement on."""
+    """Let a function change pixels of all or some cameras, of all images or from a placement on."""
     for record in open_session(folder).image_records:
         chosen = cameras is None or record.camera in cameras
         if chosen and (first == 0 or record.placement >= first):
@@ -122,7 +121,9 @@ def placement_twice(folder):
         number = scans["placement"]
         for key in per_line:
             scans[key] = scans[key][order]
-        scans["placement"] = np.r_[number[: others[0]], np.full(len(rows), 8), number[others[-1] + 1 :]]
+        scans["placement"] = np.r_[
+            number[: others[0]], np.full(len(rows), 8), number[others[-1] + 1 :]
+        ]
 
     change_scans(folder, copy)
 
@@ -140,7 +141,9 @@ def warped(scale=1.0, shift=0.0):
         middle = np.array([width - 1, height - 1]) / 2
         move = (1 - scale) * middle + [shift, 0.0]
         matrix = np.array([[scale, 0, move[0]], [0, scale, move[1]]])
-        return cv2.warpAffine(pixels, matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.warpAffine(
+            pixels, matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
 
     return change
 
@@ -222,28 +225,21 @@ def exchange_rows(folder):
 
 
 def half_size(folder):
-    """Images of half the size, with intrinsics that were found at the full one."""
-    models = {name: camera.model for name, camera in open_session(folder).cameras.items()}
-    truth = json.loads((folder / "truth.json").read_text()) if (folder / "truth.json").exists() else None
-    reference = json.loads((folder / "session.json").read_text())["reference"]
+    """Images of half the size, with the intrinsics that are true of the full one."""
+    truth = json.loads((folder / "truth.json").read_text())
     sizes = {}
     for record in open_session(folder).image_records:
         pixels = cv2.imread(str(record.file))
-        pixels = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sizes[record.camera] = pixels.shape[1::-1]
-        replaced(record.file, cv2.imencode(record.file.suffix, pixels)[1].tobytes())
+        small = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        sizes[record.camera] = small.shape[1::-1]
+        replaced(record.file, cv2.imencode(record.file.suffix, small)[1].tobytes())
 
     def change(data):
         for name, size in sizes.items():
             camera = data["rig"]["cameras"][name]
             camera["width"], camera["height"] = size
-            known = truth["cameras"][name] if truth else reference["intrinsics"][name]
-            lens = known["intrinsics"]
-            keys = ("k1", "k2", "k3", "k4", "k5")
-            distortion = lens["distortion"] if "distortion" in lens else [lens[key] for key in keys]
-            camera["intrinsics"] = {key: lens[key] for key in ("fx", "fy", "cx", "cy")} | {"distortion": distortion}
+            camera["intrinsics"] = truth["cameras"][name]["intrinsics"]
 
-    assert all(model is None for model in models.values())
     change_statements(folder, change)
 
 
@@ -285,17 +281,21 @@ WAYS = {
     "images mirrored": Way(mirrored, ("sense",), "mirrored"),
     "images of one camera mirrored": Way(one_mirrored, ("sense",), "mirrored"),
     "ranges in inches": Way(lambda folder: change_scans(folder, in_inches), ("unit",), "inches"),
-    "max_range_m exceeded": Way(lambda folder: change_statements(folder, beyond), ("beyond range",), "max_range_m"),
+    "max_range_m exceeded": Way(
+        lambda folder: change_statements(folder, beyond), ("beyond range",), "max_range_m"
+    ),
     "images too dark": Way(dark, ("dark",), "too dark"),
-    "field of view": Way(field_stated, ("field of view",), "field_of_view_deg"),
+    "field of view": Way(field_stated, ("field of view",), "session.json states"),
     "pitch in radians": Way(pitch_times(np.pi / 180), ("unit",), "radians"),
     "pitch in degrees": Way(pitch_times(180 / np.pi), ("refused",), "degrees"),
     "cameras exchanged": Way(exchange_folders, ("far from stated",), "folders"),
-    "bearings reversed": Way(lambda folder: change_scans(folder, turned_round), ("sense", "far from stated"), "sense"),
+    "bearings reversed": Way(
+        lambda folder: change_scans(folder, turned_round), ("sense", "far from stated"), "sense"
+    ),
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
-    "images of half the size": Way(half_size, ("lens",), "image size"),
+    "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
     "another clock": Way(other_clock, ("clock",), "clock"),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
-    "rows exchanged": Way(exchange_rows, ("excluded", "left out"), "4"),
+    "rows exchanged": Way(exchange_rows, ("exchanged",), "placement 12"),
     "squares in inches": Way(squares_in_inches, ("refused",), "inches"),
 }

@@ -1,4 +1,4 @@
-"""Did a camera change between two placements? Steps of its pose, or of its image scale, in the joint estimate."""
+"""Did a camera change between two placements? Steps of its pose and of its image scale."""
 
 from dataclasses import dataclass, replace
 
@@ -80,7 +80,7 @@ class CameraChange:
 
 @dataclass(frozen=True)
 class Step:
-    """The likeliest place of a step in the pose of a camera (by index), and its probability by chance."""
+    """The likeliest place of a step in a camera's pose (indices), and its probability by chance."""
 
     camera: int
     row: int
@@ -90,7 +90,8 @@ class Step:
 def camera_changes(solution, prepared, settings):
     """Cameras that sit, or magnify, otherwise from some placement on.
 
-    A score test of every camera and place, and where it finds a step, an estimate with two poses of that camera.
+    A score test of every camera and place; where it finds a step, an estimate with two poses of
+    that camera.
 
     Parameters
     ----------
@@ -128,10 +129,10 @@ def camera_changes(solution, prepared, settings):
 
 
 def likeliest_step(solution):
-    """The Step that explains most of what the residuals hold against one pose of every camera; None by chance.
+    """The Step that explains most of what residuals hold against one pose a camera; None by chance.
 
-    A score test with all that was estimated free. Where placements scatter more than their noise explains, the
-    statistic is measured by their scatter.
+    A score test with all that was estimated free. Where placements scatter more than their noise
+    explains, the statistic is measured by their scatter.
     """
     unknowns, placements = solution.unknowns, len(solution.observations.placements)
     last = placements - BESIDE
@@ -199,7 +200,7 @@ def with_two_poses(obs, step, name):
 
 
 def change_between(solution, first, later, camera, prepared):
-    """What lies between two poses of a camera, which `solution` knows by these names: a CameraChange."""
+    """The CameraChange between two poses of a camera, which `solution` knows by these names."""
     obs, model = solution.observations, prepared.models[camera]
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
@@ -235,9 +236,10 @@ def change_between(solution, first, later, camera, prepared):
 
 
 def growth_of_focal_length(prepared, camera, placement):
-    """How much longer a camera's focal length is from a placement on, relatively, and its standard deviation.
+    """Relative growth of a camera's focal length from a placement on, and its standard deviation.
 
-    From the corners of the chessboard, all but the focal length held; 0 and infinity where too few show them.
+    From the corners of the chessboard, the rest of the lens held; 0 and infinity where too few
+    images show them.
     """
     unknown = (0.0, np.inf)
     if prepared.board.pattern is None:
@@ -262,9 +264,9 @@ def growth_of_focal_length(prepared, camera, placement):
 
 
 def growth_by_depth(solution, camera):
-    """By how much a camera (index) magnifies more than its model says, and the standard deviation of that.
+    """How much more a camera (index) magnifies than its model, and the standard deviation.
 
-    A score test with all that was estimated free. An image that is larger shows boards nearer, not smaller.
+    A score test with all that was estimated free: who magnifies sees boards nearer than they are.
     """
     unknowns, obs = solution.unknowns, solution.observations
     nearer = obs.view_pose.copy()

@@ -9,10 +9,12 @@ import numpy as np
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.telegrams import other_than_stated
 
-MANY = 0.2  # share of a camera's images, or of all ranges: beyond it nothing can rest on them
+MANY = 0.2  # share of a camera's images: where more are wrong nothing can rest on them
 WHITE = 0.995  # quantile of the grey levels that the brightest surface of an image has at least
-DARK = 30  # grey levels of 255; a white square of a chessboard has more in every image that is of use
-BEYOND = 0.001  # share of ranges beyond the largest one: single readings are echoes of the sun or of mirrors
+DARK = (
+    30  # grey levels of 255; a white square of a chessboard has more in every image that is of use
+)
+BEYOND = 0.001  # share of ranges beyond the largest one: single readings may be mirrors or the sun
 SHOWN = 3  # examples in a sentence
 
 
@@ -24,7 +26,8 @@ class Fault:
     ----------
     kind : str
         'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark', 'clock'; of
-        :mod:`lrfcal_lib.evaluate.recording_faults` also 'camera moved', 'camera zoomed', 'sense', 'unit'.
+        :mod:`lrfcal_lib.evaluate.recording_faults` also 'camera moved', 'camera zoomed',
+        'exchanged', 'sense', 'unit'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
@@ -32,8 +35,8 @@ class Fault:
     harmless : bool
         No estimate rests on it.
     camera : str or None
-    placement : int or None
-        The first one concerned.
+    placements : tuple of int
+        Those concerned, where it is not the whole recording.
     """
 
     kind: str
@@ -41,11 +44,11 @@ class Fault:
     severe: bool = False
     harmless: bool = False
     camera: str | None = None
-    placement: int | None = None
+    placements: tuple[int, ...] = ()
 
 
 def faults_of_files(session):
-    """What cannot be right about an opened Session: repeated images and scans, ranges, bearings and times.
+    """What cannot be right about an opened Session: repetitions, ranges, bearings and times.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def faults_of_files(session):
 
 
 def repeated_images(session):
-    """Images whose files are the same to the byte: a frozen camera, a wrong copy; one Fault a pair of cameras."""
+    """Images whose files are the same to the byte; one Fault a pair of cameras."""
     by_size = defaultdict(list)
     for record in session.image_records:
         by_size[record.file.stat().st_size].append(record)
@@ -77,7 +80,10 @@ def repeated_images(session):
 def _repeated(session, first_camera, camera, pairs):
     """The Fault of images of one camera that are images of another one, or of itself, again."""
     count = len(session.images(camera))
-    examples = [f"{other.file} is {first.file}" for first, other in pairs[:SHOWN]]
+    examples = [
+        f"{other.file.relative_to(session.path)} is {first.file.relative_to(session.path)}"
+        for first, other in pairs[:SHOWN]
+    ]
     more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
     placements = sorted({other.placement for _, other in pairs} - {-1})
     where = f" (placements {stated.short(placements)})" if placements else ""
@@ -85,11 +91,12 @@ def _repeated(session, first_camera, camera, pairs):
     if first_camera != camera:
         cause = f"was the folder of camera '{first_camera}' copied?"
     words = (
-        f"{len(pairs)} of {count} images of camera '{camera}'{where} are the very pictures of others: "
-        f"{', '.join(examples)}{more}: {cause}; put the right images there or remove their rows from images.csv"
+        f"{len(pairs)} of {count} images of camera '{camera}'{where} are the very pictures of "
+        f"others: {', '.join(examples)}{more}: {cause}; put the right images there or remove their "
+        "rows from images.csv"
     )
     severe = len(pairs) > MANY * count
-    return Fault("repeated image", words, severe, camera=camera, placement=next(iter(placements), None))
+    return Fault("repeated image", words, severe, camera=camera, placements=tuple(placements))
 
 
 def repeated_scans(session):
@@ -105,10 +112,11 @@ def repeated_scans(session):
     for ((lines, _), _), numbers in same_ranges.items():
         if len(numbers) > 1:
             words = (
-                f"the scans of placements {' and '.join(map(str, numbers))} are the same to the last digit ({lines} "
-                "scan lines): a copy; record one of them again or remove it from placements in session.json"
+                f"the scans of placements {' and '.join(map(str, numbers))} are the same to the "
+                f"last digit ({lines} scan lines): a copy; record one of them again or remove it "
+                "from placements in session.json"
             )
-            found.append(Fault("repeated scan", words, placement=numbers[1]))
+            found.append(Fault("repeated scan", words, placements=tuple(numbers)))
     return found
 
 
@@ -121,11 +129,12 @@ def ranges_beyond(session):
     if share <= BEYOND:
         return []
     words = (
-        f"{100 * share:.2g} % of the ranges exceed the max_range_m of {limit:g} m that session.json states (half of "
-        f"all ranges: {np.median(known):.3g} m or more, largest: {known.max():.3g} m): state the range finder's own "
-        "max_range_m, or convert the ranges to metres"
+        f"{100 * share:.2g} % of the ranges exceed the max_range_m of {limit:g} m that "
+        f"session.json states (half of all ranges: {np.median(known):.3g} m or more, largest: "
+        f"{known.max():.3g} m): state the range finder's own max_range_m, or convert the ranges "
+        "to metres"
     )
-    return [Fault("beyond range", words, severe=share > MANY)]
+    return [Fault("beyond range", words)]
 
 
 def bearings_beyond(session):
@@ -147,14 +156,15 @@ def bearings_beyond(session):
         for values in ((bearings[0], bearings[-1], step), (first, last, lrf.bearing_step))
     )
     words = (
-        f"the bearings of the scan lines (lrf/scans.npz) cover {has}, session.json states field_of_view_deg and "
-        f"bearing_step_deg as {says}: the scan lines count; correct session.json, or the bearings if they are wrong"
+        f"the bearings of the scan lines (lrf/scans.npz) cover {has}, session.json states "
+        f"field_of_view_deg and bearing_step_deg as {says}: the scan lines count; correct "
+        "session.json, or the bearings if they are wrong"
     )
     return [Fault("field of view", words)]
 
 
 def other_clocks(session):
-    """Cameras whose times put the images of most placements beside the scans of other placements."""
+    """Cameras whose times put most images beside the scans of other placements."""
     ends = {}
     for number in session.placements:
         time = session.scans["time_s"][session.scans["placement"] == number]
@@ -167,7 +177,9 @@ def other_clocks(session):
     first, last = np.array(list(ends.values())).T
     numbers = np.array(list(ends))
     for camera in session.cameras:
-        records = [r for r in session.images(camera) if r.placement in ends and np.isfinite(r.time_s)]
+        records = [
+            r for r in session.images(camera) if r.placement in ends and np.isfinite(r.time_s)
+        ]
         away = []
         for record in records:
             outside = np.maximum(np.maximum(first - record.time_s, record.time_s - last), 0.0)
@@ -177,9 +189,10 @@ def other_clocks(session):
                 away.append(record.time_s - (begin if record.time_s < begin else end))
         if len(away) > len(records) / 2:
             words = (
-                f"the times (t_s in images.csv) of {len(away)} of {len(records)} images of camera '{camera}' lie beside "
-                f"the scans of other placements, {np.median(away):+.6g} s from their own: another clock? Placement "
-                "numbers count, not these times; leave t_s empty or set the clocks alike"
+                f"the times (t_s in images.csv) of {len(away)} of {len(records)} images of camera "
+                f"'{camera}' lie beside the scans of other placements, {np.median(away):+.6g} s "
+                "from their own: another clock? Placement numbers count, not these times; leave "
+                "t_s empty or set the clocks alike"
             )
             found.append(Fault("clock", words, harmless=True, camera=camera))
     return found
@@ -190,22 +203,11 @@ def dark_image(image):
     return bool(np.quantile(image.max(axis=2), WHITE) < DARK)
 
 
-def dark_images(session, unseen):
-    """Cameras most of whose images without a board are too dark; SHOWN of each camera are looked at.
-
-    Parameters
-    ----------
-    session : Session
-    unseen : list of ImageRecord
-        Images in which no board was found.
-
-    Returns
-    -------
-    list of Fault
-    """
+def dark_images(session):
+    """Cameras whose images of the board are too dark; SHOWN of each are looked at."""
     found = []
     for camera in session.cameras:
-        records = [record for record in unseen if record.camera == camera]
+        records = session.images(camera, purpose="board")
         looked_at = records[:: max(len(records) // SHOWN, 1)][:SHOWN]
         dark = [record for record in looked_at if dark_image(session.read_image(record))]
         if len(dark) > len(looked_at) / 2:
@@ -216,11 +218,13 @@ def dark_images(session, unseen):
 def too_dark(session, records, how_many):
     """The Fault of dark images of one camera."""
     first = records[0]
+    name = first.file.relative_to(session.path)
     brightest = int(np.quantile(session.read_image(first).max(axis=2), WHITE))
     words = (
-        f"images of camera '{first.camera}' are too dark ({how_many}): the brightest surfaces of {first.file} have "
-        f"{brightest} of 255 grey levels, a white square needs {DARK} and more; more light, a longer exposure, or, "
-        "where other values were stored (10 or 12 bits), convert the images"
+        f"images of camera '{first.camera}' are too dark ({how_many}): the brightest surfaces of "
+        f"{name} have {brightest} of 255 grey levels, a white square needs {DARK} and more; more "
+        "light, a longer exposure, or, where other values were stored (10 or 12 bits), convert "
+        "the images"
     )
-    severe = len(records) > MANY * len(session.images(first.camera))
-    return Fault("dark", words, severe, camera=first.camera, placement=first.placement)
+    placements = tuple(sorted({record.placement for record in records} - {-1}))
+    return Fault("dark", words, camera=first.camera, placements=placements)

@@ -120,7 +120,8 @@ def check_scans(scans):
     if seen.size == 0:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
     if np.median(seen) > LONGEST_MEDIAN_RANGE:
-        raise ValueError(f"the median range is {np.median(seen):g} m: millimetres? Divide by 1000")
+        units = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
+        raise ValueError(f"the median range is {np.median(seen):g} m: {units}")
     if seen.min() < 0:
         raise ValueError(f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN")
     for name, angles, limit in (("bearing", scans["bearings"], 2 * np.pi), ("pitch", scans["pitch"], np.pi)):
