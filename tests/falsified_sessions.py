@@ -94,35 +94,44 @@ def change_images(folder, change, cameras=None, first=0):
             replaced(record.file, cv2.imencode(record.file.suffix, pixels, quality)[1].tobytes())
 
 
-def copy_images(folder, pairs):
+def copy_images(pairs):
     """Put images in the place of others, by pairs of records (from, to)."""
     content = [(origin.file.read_bytes(), target.file) for origin, target in pairs]
     for data, file in content:
         replaced(file, data)
 
 
+def two_placements(session):
+    """Two placements that are swept the same way."""
+    numbers = session.board_placements
+    first = len(numbers) // 4
+    return numbers[first], numbers[first + 2]
+
+
 def image_twice(folder):
     session = open_session(folder)
-    pairs = zip(session.images("left", 7), session.images("left", 8), strict=False)
-    copy_images(folder, list(pairs)[:1])
+    first, second = two_placements(session)
+    pairs = zip(session.images("left", first), session.images("left", second), strict=False)
+    copy_images(list(pairs)[:1])
 
 
 def placement_twice(folder):
     session = open_session(folder)
+    first, second = two_placements(session)
     for camera in session.cameras:
-        pairs = zip(session.images(camera, 6), session.images(camera, 8), strict=False)
-        copy_images(folder, list(pairs))
+        pairs = zip(session.images(camera, first), session.images(camera, second), strict=False)
+        copy_images(list(pairs))
 
     def copy(scans):
-        rows = np.flatnonzero(scans["placement"] == 6)
-        others = np.flatnonzero(scans["placement"] == 8)
+        rows = np.flatnonzero(scans["placement"] == first)
+        others = np.flatnonzero(scans["placement"] == second)
         order = np.r_[np.arange(others[0]), rows, np.arange(others[-1] + 1, len(scans["pitch"]))]
         per_line = [key for key in scans if key != "bearings"]
         number = scans["placement"]
         for key in per_line:
             scans[key] = scans[key][order]
         scans["placement"] = np.r_[
-            number[: others[0]], np.full(len(rows), 8), number[others[-1] + 1 :]
+            number[: others[0]], np.full(len(rows), second), number[others[-1] + 1 :]
         ]
 
     change_scans(folder, copy)
@@ -130,7 +139,7 @@ def placement_twice(folder):
 
 def one_folder(folder):
     session = open_session(folder)
-    copy_images(folder, list(zip(session.images("left"), session.images("right"), strict=False)))
+    copy_images(list(zip(session.images("left"), session.images("right"), strict=False)))
 
 
 def warped(scale=1.0, shift=0.0):
@@ -213,13 +222,12 @@ def exchange_folders(folder):
 
 
 def exchange_rows(folder):
+    first, second = map(str, two_placements(open_session(folder)))
+    other = {first: second, second: first}
+
     def change(rows):
-        first = [row for row in rows if row["placement"] == "4" and row["purpose"] == "board"]
-        second = [row for row in rows if row["placement"] == "12" and row["purpose"] == "board"]
-        for row in first:
-            row["placement"] = "12"
-        for row in second:
-            row["placement"] = "4"
+        for row in rows:
+            row["placement"] = other.get(row["placement"], row["placement"])
 
     change_rows(folder, change)
 
@@ -273,8 +281,8 @@ def squares_in_inches(folder):
 
 
 WAYS = {
-    "an image twice": Way(image_twice, ("repeated image",), "8"),
-    "a placement twice": Way(placement_twice, ("repeated scan",), "placements 6 and 8"),
+    "an image twice": Way(image_twice, ("repeated image",), "camera 'left'"),
+    "a placement twice": Way(placement_twice, ("repeated scan",), "same to the last digit"),
     "one picture in both folders": Way(one_folder, ("repeated image",), "'right'"),
     "camera shifted": Way(camera_shifted, ("camera moved",), "placement 11"),
     "camera zoomed": Way(camera_zoomed, ("camera zoomed",), "placement 11"),
@@ -296,6 +304,6 @@ WAYS = {
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
     "another clock": Way(other_clock, ("clock",), "clock"),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
-    "rows exchanged": Way(exchange_rows, ("exchanged",), "placement 12"),
+    "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),
     "squares in inches": Way(squares_in_inches, ("refused",), "inches"),
 }
