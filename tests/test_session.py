@@ -30,22 +30,23 @@ def pixels(seed=0):
     return np.random.default_rng(seed).integers(0, 255, (24, 32, 3)).astype(np.uint8)
 
 
-def wall(lines=3):
-    ranges = np.full((lines, 1), 2.0) / np.sin(BEARINGS)
+def wall(lines=3, distance=2.0):
+    ranges = np.full((lines, 1), distance) / np.sin(BEARINGS)
     ranges[1, 7] = np.nan
     return ranges, BEARINGS, np.radians(np.linspace(-1, 1, lines))
 
 
 @pytest.fixture(scope="module")
 def written_once(tmp_path_factory):
-    """Two sweeps and five images."""
+    """Two sweeps and five images, all of them different."""
     path, about = tmp_path_factory.mktemp("sessions") / "trip", {"licence": "CC0", "source": "a test"}
     with SessionWriter(path, triangle_board(), LRF, CAMERAS, HEAD, **about) as writer:
         writer.add_sweep(1, *wall())
-        writer.add_sweep(2, *wall(), time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
-        for camera in ("left", "right"):
-            writer.add_image(camera, pixels(1), 1, pitch=0.1)
-            writer.add_image(camera, pixels(2), 2, time_s=3.5)
+        second = wall(distance=2.5)
+        writer.add_sweep(2, *second, time_s=[0.5, 1.0, 1.5], intensities=np.ones((3, len(BEARINGS))))
+        for seed, camera in ((1, "left"), (11, "right")):
+            writer.add_image(camera, pixels(seed), 1, pitch=0.1)
+            writer.add_image(camera, pixels(seed + 1), 2, time_s=3.5)
         writer.add_image("left", pixels(3), purpose="intrinsics")
     return path
 

@@ -9,6 +9,7 @@ from lrfcal_lib.preprocess import board_in_scan
 from lrfcal_lib.preprocess.board_in_image import view_board
 from lrfcal_lib.preprocess.edges_in_scan import crossings
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, grey
+from lrfcal_lib.session.faults import DARK, dark_image, repeated_images, repeated_scans
 from lrfcal_lib.session.stated import SessionError
 
 STATES = ("ok", "warn", "bad")
@@ -16,7 +17,7 @@ FEWEST_CROSSINGS = 6  # of a side, below which a straight line says little about
 PARALLEL = np.cos(np.radians(20))  # two sides that include less give one constraint, not two
 FEWEST_LINES = 8  # scan lines on the board
 BLURRED_PX = 3.5  # rise of a chessboard's edges from 10 to 90 %; about 2 in a sharp image
-DARK, CLIPPED = 30, 250  # grey levels of a white square
+CLIPPED = 250  # grey levels of a white square
 LOW_CONTRAST = 25  # grey levels between white and dark squares
 
 
@@ -55,6 +56,7 @@ def check_placement(session, placement, advice=None):
         text = f"scene: {len(sweep.pitch)} scan lines, {100 * share:.0f} % of the beams came back"
         return [Light("scan", "ok" if share > 0.2 else "warn", text)]
     lights = check_scan(sweep, session.board, session.T_head_lrf, session.lrf)
+    lights += check_repetition(session, placement)
     if placement in session.scene_placements:
         return lights
     for name, camera in session.cameras.items():
@@ -69,6 +71,12 @@ def check_placement(session, placement, advice=None):
         text = advice(session)
         lights.append(Light("information", "warn" if text else "ok", text or "every direction is well determined"))
     return lights
+
+
+def check_repetition(session, placement):
+    """A Light 'recording' for each of a placement's scans and images that another one has, too."""
+    faults = repeated_images(session) + repeated_scans(session)
+    return [Light("recording", "bad", f.words) for f in faults if placement in f.placements]
 
 
 def check_scan(sweep, board, T_head_lrf=None, lrf=None):
@@ -117,7 +125,8 @@ def check_image(image, board, model=None, name="image"):
     try:
         corners = PatternFinder(board.pattern)(image)
     except PatternNotFound as error:
-        return Light(name, "bad", str(error))
+        why = "; too dark, more light or a longer exposure" if dark_image(image) else ""
+        return Light(name, "bad", f"{error}{why}")
     picture, grid = grey(image), corners.reshape(board.pattern.rows, board.pattern.columns, 2)
     rise, centres = edge_rise(picture, grid), (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     squares, odd = _at(picture, centres), np.indices(centres.shape[:2]).sum(axis=0) % 2

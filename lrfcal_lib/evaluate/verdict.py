@@ -13,6 +13,7 @@ from lrfcal_lib.evaluate import alternatives
 from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
 from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
+from lrfcal_lib.evaluate.recording_faults import explained, recording_faults
 from lrfcal_lib.evaluate.tables import placements_table
 from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
 from lrfcal_lib.fit.result import AXIS_NAMES
@@ -72,7 +73,7 @@ class Reason:
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', 'sense', of
         :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
         'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
-        'model error', 'noise', 'warning', 'error'.
+        'model error', 'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
     words : str
     """
 
@@ -225,8 +226,10 @@ def judge(calibration, method=None, **options):
     """
     prepared, joint = calibration.prepared, calibration.joint
     lens = [Reason(NO if OTHER_SIZE in words else CARE, "lens", words) for words in lens_words(prepared).values()]
+    faults = recording_faults(calibration)
+    lens = [Reason(NO if fault.severe else CARE, fault.kind, fault.words) for fault in faults] + lens
     # also where the joint estimate is not handed over: a wrong size may be why
-    sizes, doubt = ([], 0.0) if joint is None else contradicts_stated(joint)
+    sizes, doubt = ([], 0.0) if joint is None or explained(faults) else contradicts_stated(joint)
     method = method or handed_over(calibration)
     if method is None:
         refused, lost = Reason(NO, "handed over", _refusal(calibration)), problem_words(prepared.problems)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
+from lrfcal_lib.session.faults import dark_image, faults_of_files, too_dark
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -128,7 +129,8 @@ def check_scans(scans):
     if seen.size == 0:
         raise ValueError(f"no range in {lines} scan lines (all NaN): nothing was recorded")
     if np.median(seen) > LONGEST_MEDIAN_RANGE:
-        raise ValueError(f"the median range is {np.median(seen):g} m: millimetres? Divide by 1000")
+        units = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
+        raise ValueError(f"the median range is {np.median(seen):g} m: {units}")
     if seen.min() < 0:
         raise ValueError(f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN")
     for name, angles, limit in (("bearing", scans["bearings"], 2 * np.pi), ("pitch", scans["pitch"], np.pi)):
@@ -400,11 +402,25 @@ def validate(path):
     except SessionError as error:
         return [str(error)]
     found = [*session.problems, *_disorder(session)]
+    found += [fault.words for fault in faults_of_files(session) if fault.words not in found]
+    dark = []
     for record in session.image_records:
         try:
-            session.read_image(record)
+            if dark_image(session.read_image(record)):
+                dark.append(record)
         except SessionError as error:
             found.append(str(error))
+    return found + _too_dark(session, dark)
+
+
+def _too_dark(session, dark):
+    """Sentences about the dark images (ImageRecords) of a session, one a camera."""
+    found = []
+    for camera in session.cameras:
+        records = [record for record in dark if record.camera == camera]
+        if records:
+            count = f"{len(records)} of {len(session.images(camera))}"
+            found.append(too_dark(session, records, count).words)
     return found
 
 

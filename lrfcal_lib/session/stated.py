@@ -232,7 +232,7 @@ LARGEST_IMAGE = 30_000_000  # pixels
 MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
 MOST_CAMERAS = 100
-MILLIMETRES = "millimetres? Divide by 1000"
+MILLIMETRES = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
 # metres, by part of the model's name: systematic error of a range up to 10 m according to SICK (technical description
 # of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors LMSxxx"; data sheet of TiM55x and TiM56x)
 SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS5": 0.025, "TiM5": 0.060}

@@ -1,0 +1,292 @@
+"""Did a camera change between two placements? Steps of its pose and of its image scale."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+from scipy.special import chdtrc, fdtrc
+
+from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
+from lrfcal_lib.fit.residuals import gather, named_blocks
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.intrinsics import adjust_robust, raised_points
+from lrfcal_lib.solvers.joint import solve_joint
+
+POSE = 6  # numbers of a camera's pose
+BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
+LEVEL = 0.001  # false alarms a recording, over all cameras and places that a step might be at
+LEAST_SIZE = 0.5  # pixels; edges and corners of a board are off by less at one placement
+ASKED = 4.0  # standard deviations: a change of the image scale that is none of chance
+STEP = 1e-4  # of the numeric derivative by the image scale
+NOISY = 10.0  # residuals in units of the stated noise: an estimate that explains nothing
+MOST_CHANGES = 3  # in one recording
+FEWEST_VIEWS = 3  # of a chessboard, for a focal length
+ALL_BUT_FOCAL_LENGTH = tuple(range(2, 9))  # of fx, fy, cx, cy, k1..k5
+RCOND = 1e-13
+
+
+@dataclass(frozen=True)
+class CameraChange:
+    """A camera sits, or magnifies, otherwise from a placement on.
+
+    Attributes
+    ----------
+    camera : str
+    before, after : int
+        The placements next to the change.
+    turn, turn_sigma : float
+        Radians.
+    shift, shift_sigma : float
+        Metres.
+    p_value : float
+        Probability of such a turn and shift by chance.
+    motion_px : float
+        Median motion of the boards' middles in the images.
+    zoom, zoom_sigma : float
+        Relative growth of the images.
+    corner_px : float
+        What that moves the corners of an image.
+    """
+
+    camera: str
+    before: int
+    after: int
+    turn: float
+    turn_sigma: float
+    shift: float
+    shift_sigma: float
+    p_value: float
+    motion_px: float
+    zoom: float
+    zoom_sigma: float
+    corner_px: float
+
+    @property
+    def zoomed(self):
+        """Whether the image scale has changed; turn and shift are then off, too."""
+        return abs(self.zoom) > ASKED * self.zoom_sigma and self.corner_px > LEAST_SIZE
+
+    @property
+    def moved(self):
+        """Whether turn and shift are more than chance allows, and more than nothing."""
+        return self.p_value < LEVEL and self.motion_px > LEAST_SIZE
+
+    @property
+    def size_px(self):
+        """What the change does to images."""
+        return self.corner_px if self.zoomed else self.motion_px
+
+
+@dataclass(frozen=True)
+class Step:
+    """The likeliest place of a step in a camera's pose (indices), and its probability by chance."""
+
+    camera: int
+    row: int
+    p_value: float
+
+
+def camera_changes(solution, prepared, settings):
+    """Cameras that sit, or magnify, otherwise from some placement on.
+
+    A score test of every camera and place; where it finds a step, an estimate with two poses of
+    that camera.
+
+    Parameters
+    ----------
+    solution : JointSolution
+    prepared : Prepared
+    settings : dict
+        Keyword arguments of `solve_joint`, as `solution` was found with.
+
+    Returns
+    -------
+    list of CameraChange
+        In the order in which they were found, the clearest first.
+    """
+    camera_of = {name: name for name in solution.observations.cameras}
+    changes = []
+    while len(changes) < MOST_CHANGES and (step := likeliest_step(solution)):
+        name = solution.observations.cameras[step.camera]
+        camera = camera_of[name]
+        later = f"{camera} from placement {solution.observations.placements[step.row]}"
+        parted = with_two_poses(solution.observations, step, later)
+        try:
+            solution = solve_joint(parted, required=False, **settings)
+        except DegenerateGeometry:
+            return changes
+        if not {name, later} <= solution.transforms.keys():
+            return changes
+        change = change_between(solution, name, later, camera, prepared)
+        if not (change.moved or change.zoomed):
+            return changes
+        camera_of[later] = camera
+        changes.append(change)
+    # what is hopeless also with two poses of a camera has another cause
+    explained = max(solution.noise["face_scale"], solution.noise["view_scale"]) < NOISY
+    return changes if solution.converged and explained else []
+
+
+def likeliest_step(solution):
+    """The Step that explains most of what residuals hold against one pose a camera; None by chance.
+
+    A score test with all that was estimated free. Where placements scatter more than their noise
+    explains, the statistic is measured by their scatter.
+    """
+    unknowns, placements = solution.unknowns, len(solution.observations.placements)
+    last = placements - BESIDE
+    if last < BESIDE or not unknowns.poses or not len(solution.observations.cameras):
+        return None
+    blocks = named_blocks(solution.state, solution.data, unknowns)
+    hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
+    reduced, score, _ = eliminate(hessian, gradient, unknowns.shared)
+
+    tested = []
+    first_column = unknowns.columns["cameras"].start
+    for camera in range(unknowns.cameras):
+        columns = first_column + POSE * camera + np.arange(POSE)
+        for row in range(BESIDE, last + 1):
+            if _seen_beside(solution.observations, camera, row):
+                p_value = _chance_of_step(reduced, score, columns, row)
+                tested.append(Step(camera, row, p_value))
+    best = min(tested, key=lambda step: step.p_value, default=None)
+    if best is None or best.p_value * len(tested) > LEVEL:
+        return None
+    return best
+
+
+def _seen_beside(obs, camera, row):
+    """Whether a camera sees boards in enough placements before and after a row."""
+    shown = np.unique(obs.view_placement[obs.view_camera == camera])
+    return min(np.sum(shown < row), np.sum(shown >= row)) >= BESIDE
+
+
+def _chance_of_step(reduced, score, columns, row):
+    """Probability that chance makes the pose in these columns seem another one from a row on.
+
+    `reduced` (p, c, c) and `score` (p, c) are what each placement says about the shared unknowns.
+    """
+    count, shared = score.shape
+    later = np.arange(count) >= row
+    # the normal equations with the pose's change as more unknowns, placement by placement
+    repeated = np.concatenate([np.arange(shared), columns])
+    kept = np.ones((count, len(repeated)))
+    kept[~later, shared:] = 0.0
+    whole = reduced[:, repeated][:, :, repeated] * kept[:, :, None] * kept[:, None, :]
+    gradient = score[:, repeated] * kept
+
+    covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
+    step = -covariance @ gradient.sum(axis=0)
+    information = np.linalg.pinv(covariance[-POSE:, -POSE:], rcond=RCOND, hermitian=True)
+    square = step[-POSE:] @ information @ step[-POSE:]
+    # what each placement still pulls at the value found: its scatter is that of the placements
+    pull = (gradient + whole @ step) @ covariance[:, -POSE:]
+    scatter = np.einsum("pi,ij,pj->", pull, information, pull) / POSE * count / (count - 1)
+    return float(fdtrc(POSE, POSE * (count - 1), square / POSE / max(scatter, 1.0)))
+
+
+def with_two_poses(obs, step, name):
+    """Observations in which a camera is another one, of this name, from a Step on."""
+    camera = obs.view_camera.copy()
+    camera[(camera == step.camera) & (obs.view_placement >= step.row)] = len(obs.cameras)
+    return replace(
+        obs,
+        view_camera=camera,
+        cameras=(*obs.cameras, name),
+        mounts=(*obs.mounts, obs.mounts[step.camera]),
+        lens_covariance=np.concatenate([obs.lens_covariance, obs.lens_covariance[[step.camera]]]),
+    )
+
+
+def change_between(solution, first, later, camera, prepared):
+    """The CameraChange between two poses of a camera, which `solution` knows by these names."""
+    obs, model = solution.observations, prepared.models[camera]
+    index = obs.cameras.index(later)
+    change = solution.transforms[later] * solution.transforms[first].inv()
+    shift = solution.transforms[later].translation - solution.transforms[first].translation
+    both = solution.covariance(f"{first}_", f"{later}_")
+    spread = both[:POSE, :POSE] + both[POSE:, POSE:] - both[:POSE, POSE:] - both[POSE:, :POSE]
+    sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    both_parts = np.concatenate([change.rotation.as_rotvec(), shift])
+    square = both_parts @ np.linalg.pinv(spread, rcond=RCOND, hermitian=True) @ both_parts
+
+    views = obs.view_camera == index
+    middles = obs.view_pose[views, :3, :2] @ obs.corners.mean(axis=0) + obs.view_pose[views, :3, 3]
+    motion = project(middles, model) - project(change.inv().apply(middles), model)
+    rows = np.unique(obs.view_placement[views])
+    earlier = np.unique(obs.view_placement[obs.view_camera == obs.cameras.index(first)])
+    after = int(obs.placements[rows[0]])
+    growths = [growth_by_depth(solution, index), growth_of_focal_length(prepared, camera, after)]
+    zoom, zoom_sigma = max(growths, key=lambda growth: abs(growth[0]) / growth[1])
+    return CameraChange(
+        camera=camera,
+        before=int(obs.placements[earlier[earlier < rows[0]].max(initial=0)]),
+        after=after,
+        turn=float(change.rotation.magnitude()),
+        turn_sigma=float(np.linalg.norm(sigma[:3])),
+        shift=float(np.linalg.norm(shift)),
+        shift_sigma=float(np.linalg.norm(sigma[3:])),
+        p_value=float(chdtrc(POSE, square)),
+        motion_px=float(np.median(np.linalg.norm(motion, axis=1))),
+        zoom=zoom,
+        zoom_sigma=zoom_sigma,
+        corner_px=abs(zoom) * float(np.hypot(model.width, model.height)) / 2,
+    )
+
+
+def growth_of_focal_length(prepared, camera, placement):
+    """Relative growth of a camera's focal length from a placement on, and its standard deviation.
+
+    From the corners of the chessboard, the rest of the lens held; 0 and infinity where too few
+    images show them.
+    """
+    unknown = (0.0, np.inf)
+    if prepared.board.pattern is None:
+        return unknown
+    points = raised_points(prepared.board.pattern, prepared.relief)
+    model = prepared.models[camera]
+    lengths, spreads = [], []
+    for later in (False, True):
+        views = [
+            view
+            for number, view in prepared.views[camera].items()
+            if (number >= placement) is later and view.pixels is not None and not view.reason
+        ]
+        if len(views) < FEWEST_VIEWS:
+            return unknown
+        pixels = np.array([[view.pixels for view in views]])
+        poses = RigidTransform.concatenate([view.T_camera_board for view in views])
+        lens = adjust_robust(pixels, points, [model], poses, fixed=ALL_BUT_FOCAL_LENGTH).models[0]
+        lengths.append(np.mean([lens.fx / model.fx, lens.fy / model.fy]))
+        spreads.append(lens.covariance[:2, :2].mean() / model.fx**2)
+    return float(lengths[1] / lengths[0] - 1), float(np.sqrt(sum(spreads)))
+
+
+def growth_by_depth(solution, camera):
+    """How much more a camera (index) magnifies than its model, and the standard deviation.
+
+    A score test with all that was estimated free: who magnifies sees boards nearer than they are.
+    """
+    unknowns, obs = solution.unknowns, solution.observations
+    nearer = obs.view_pose.copy()
+    nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
+    levels = solution.data.levels
+    shared = unknowns.shared
+    before = named_blocks(solution.state, solution.data, unknowns)
+    after = named_blocks(solution.state, gather(replace(obs, view_pose=nearer), **levels), unknowns)
+
+    hessian = gradient = 0.0
+    for name, block in before.items():
+        residuals, jacobian = whiten(block)
+        by_growth = np.zeros_like(residuals)
+        if name == "view":
+            by_growth = (whiten(after[name], False)[0] - residuals) / STEP
+        jacobian = np.insert(jacobian, shared, by_growth, axis=-1)
+        transposed = np.swapaxes(jacobian, -1, -2)
+        hessian = hessian + transposed @ jacobian
+        gradient = gradient + (transposed @ residuals[..., None])[..., 0]
+    reduced, score, _ = eliminate(hessian, gradient, shared + 1)
+    covariance = np.linalg.pinv(reduced.sum(axis=0), rcond=RCOND, hermitian=True)
+    growth = -(covariance @ score.sum(axis=0))[-1]
+    return float(growth), float(np.sqrt(max(covariance[-1, -1], 0.0)))

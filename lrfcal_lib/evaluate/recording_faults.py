@@ -1,0 +1,369 @@
+"""What went wrong with a recording, as far as its files and the estimates show."""
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.evaluate.camera_changes import NOISY, camera_changes
+from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
+from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
+from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.solvers import solve_camera
+
+EXPLAINING = ("sense", "unit")  # kinds that everything else which looks wrong follows from
+SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
+BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
+GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
+AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
+POINTS = 60  # of a placement's face
+LOOKED_AT = 4  # placements in which a board is searched for again
+LEVER = 0.2  # metres, weighs turns against shifts
+MOST_LOST = 8  # placements; where more are left out, something else is wrong
+BESIDE = 0.15  # metres between the middles of a board in a scan, which may be cut, and in images
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A way to read a recording otherwise than it is stated.
+
+    Attributes
+    ----------
+    kind : {'sense', 'unit'}
+    words : str
+        What is wrong if this way is right, and what to do about it.
+    ranges, pitch : float
+        Factors on what was recorded.
+    turned_round : bool
+        Bearings count the other way.
+    mirrored : bool
+        Images are mirrored.
+    """
+
+    kind: str
+    words: str
+    ranges: float = 1.0
+    pitch: float = 1.0
+    turned_round: bool = False
+    mirrored: bool = False
+
+    def apply(self, points, pitch):
+        """Points (n, 3) of the range finder and their pitch (n,), read this way."""
+        points = self.ranges * points
+        if self.turned_round:
+            points = points * [-1.0, 1.0, 1.0]
+        return points, self.pitch * pitch
+
+
+AS_STATED = Reading("", "")
+MIRRORED = Reading(
+    "sense",
+    "the images of all cameras are mirrored (turn mirroring off in the cameras, or flip them)",
+    mirrored=True,
+)
+SENSES = (
+    MIRRORED,
+    Reading(
+        "sense",
+        "bearings count in the other sense (turn the columns of the ranges round)",
+        turned_round=True,
+    ),
+    Reading(
+        "sense",
+        "the pitch counts in the other sense (positive lifts the view: change its sign)",
+        pitch=-1.0,
+    ),
+)
+UNITS = (
+    Reading(
+        "unit",
+        "the recorded pitch is in radians where degrees are asked for: multiply it by 57.29578",
+        pitch=180 / np.pi,
+    ),
+    Reading(
+        "unit",
+        "the recorded pitch is in degrees where radians are asked for: divide it by 57.29578",
+        pitch=np.pi / 180,
+    ),
+    Reading("unit", "the ranges are in inches: multiply them by 0.0254", ranges=0.0254),
+    Reading("unit", "the ranges are in feet: multiply them by 0.3048", ranges=0.3048),
+    Reading("unit", "the ranges are in centimetres: divide them by 100", ranges=0.01),
+    Reading("unit", "the ranges are in millimetres: divide them by 1000", ranges=0.001),
+)
+
+
+def recording_faults(calibration):
+    """What went wrong with the recording behind a Calibration.
+
+    Returns
+    -------
+    list of Fault
+        Those of the files first; harmless ones are left out.
+    """
+    prepared, joint = calibration.prepared, calibration.joint
+    session = prepared.session
+    found = [fault for fault in faults_of_files(session) if not fault.harmless]
+    found += dark_images(session)
+    misread = misread_recording(prepared) if hopeless(joint) else []
+    if misread or joint is None:
+        return found + misread
+    changes = camera_changes(joint.solution, prepared, joint.settings)
+    found += faults_of_changes(changes, joint.solution.observations.cameras)
+    return found + exchanged_placements(calibration)
+
+
+def explained(faults):
+    """Whether one of these is a cause that everything else which looks wrong follows from."""
+    return any(fault.kind in EXPLAINING for fault in faults)
+
+
+def hopeless(joint):
+    """Whether a JointCalibration (or None) explains so little that something may be misread."""
+    if joint is None or not joint.solution.converged or joint.solution.unobservable:
+        return True
+    noise = joint.solution.noise
+    return max(noise["face_scale"], noise.get("view_scale", 0.0)) > NOISY
+
+
+def misread_recording(prepared):
+    """Units and senses that are not as stated: read otherwise, scans and images agree."""
+    session = prepared.session
+    if len(prepared.scans) <= len(session.board_placements) / 2:
+        readings = [reading for reading in UNITS if shows_boards(session, reading)]
+        return [Fault("unit", reading.words, severe=True) for reading in readings[:1]]
+
+    stated = board_misses(prepared, AS_STATED)
+    if not stated:
+        return []
+    mirrored = {
+        camera: found
+        for camera, found in board_misses(prepared, MIRRORED).items()
+        if camera in stated and _fits({camera: found}, {camera: stated[camera]})
+    }
+    if mirrored and len(mirrored) < len(stated):
+        return [
+            _mirrored_camera(camera, stated[camera], found) for camera, found in mirrored.items()
+        ]
+
+    for readings in (SENSES, UNITS):
+        misses = {reading: board_misses(prepared, reading) for reading in readings}
+        fitting = [reading for reading in readings if _fits(misses[reading], stated)]
+        if fitting:
+            return [_misread(prepared, fitting, misses, stated)]
+    return []
+
+
+@dataclass(frozen=True)
+class BoardMiss:
+    """How far scans lie off boards in images (metres, median placement), at a camera's best pose."""
+
+    size: float
+    transform: RigidTransform
+
+
+def _fits(found, stated):
+    """Whether the BoardMisses of all cameras are good, and far better than as stated."""
+    if found.keys() != stated.keys():
+        return False
+    return _worst(found) < GOOD and BETTER * _worst(found) < _worst(stated)
+
+
+def _worst(misses):
+    """The largest BoardMiss of all cameras, metres."""
+    return max(miss.size for miss in misses.values())
+
+
+def board_misses(prepared, reading):
+    """The BoardMiss of every camera that has one, with the recording read in some way."""
+    found = {}
+    for camera in prepared.views:
+        obs = plane_observations(prepared, camera, reading)
+        with suppress(DegenerateGeometry, np.linalg.LinAlgError):
+            transform = solve_camera(obs, "zhang_pless_printed").transform
+            residuals = np.abs(plane_residuals_m(obs, transform))
+            each = [
+                np.median(residuals[obs.plane_placement == p])
+                for p in np.unique(obs.plane_placement)
+            ]
+            found[camera] = BoardMiss(float(np.median(each)), transform)
+    return found
+
+
+def plane_observations(prepared, camera, reading):
+    """CameraObservations of the faces of boards only, with the platform as stated and a Reading."""
+    mount = prepared.session.cameras[camera].mount
+    T_head_lrf = platform_of(prepared)
+    views = {
+        p: view for p, view in prepared.views[camera].items() if view.T_camera_board is not None
+    }
+    poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(-1, 4, 4)
+    if (
+        reading.mirrored
+    ):  # of a chessboard the mirror image is one, too: its normal and place are mirrored
+        mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+        poses = mirror @ poses @ mirror
+
+    points, placements = [np.zeros((0, 3))], [np.zeros(0, int)]
+    for placement in views.keys() & prepared.scans.keys():
+        image_pitch = reading.pitch * views[placement].pitch if mount == "head" else 0.0
+        p_lrf, pitch, _ = face_points(prepared.scans[placement], POINTS)
+        points.append(lrf_to_source(*reading.apply(p_lrf, pitch), T_head_lrf, mount, image_pitch))
+        placements.append(np.full(len(pitch), placement))
+    return CameraObservations(
+        model=prepared.models[camera],
+        camera=camera,
+        placements=np.array(list(views), int),
+        board_poses=poses,
+        plane_points=np.concatenate(points),
+        plane_placement=np.concatenate(placements),
+    )
+
+
+def shows_boards(session, reading):
+    """Whether boards are found in most of some sweeps, read in some way."""
+    numbers = session.board_placements
+    looked_at = numbers[:: max(len(numbers) // LOOKED_AT, 1)][:LOOKED_AT]
+    found = 0
+    for placement in looked_at:
+        with suppress(BoardNotFound, SessionError):
+            sweep = session.sweep(placement)
+            sweep = replace(
+                sweep, ranges=reading.ranges * sweep.ranges, pitch=reading.pitch * sweep.pitch
+            )
+            find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+            found += 1
+    return found > len(looked_at) / 2
+
+
+def _mirrored_camera(camera, stated, found):
+    """The Fault of one camera whose images are mirrored."""
+    words = (
+        f"the images of camera '{camera}' are mirrored: the mirror images of its boards lie "
+        f"{1000 * found.size:.0f} mm off the scans, as recorded {1000 * stated.size:.0f} mm; turn "
+        "mirroring off in the camera, or flip the images"
+    )
+    return Fault("sense", words, severe=True, camera=camera)
+
+
+def _misread(prepared, fitting, misses, stated):
+    """The Fault of a recording that fits with some Readings, the likeliest first."""
+
+    best = min(_worst(misses[reading]) for reading in fitting)
+    likely = [reading for reading in fitting if _worst(misses[reading]) < AS_GOOD * best]
+    # a mirrored cloud fits mirrored images: only where the cameras are said to be can tell
+    likely.sort(key=lambda r: (_far_from_guess(prepared, misses[r]), _worst(misses[r])))
+    causes = "; or ".join(reading.words for reading in likely)
+    words = (
+        f"{causes}; scans lie {1000 * _worst(misses[likely[0]]):.0f} mm off the boards in the "
+        f"images then, as recorded {1000 * _worst(stated):.0f} mm"
+    )
+    return Fault(likely[0].kind, words, severe=True)
+
+
+def _far_from_guess(prepared, found):
+    """How far cameras stand from where session.json guesses them, metres; 0 without guesses."""
+    guesses = {
+        name: camera.guess
+        for name, camera in prepared.session.cameras.items()
+        if camera.guess is not None
+    }
+    total = 0.0
+    for camera in guesses.keys() & found.keys():
+        turn, shift = transform_difference(found[camera].transform, guesses[camera])
+        total += LEVER * turn + shift
+    return total
+
+
+def faults_of_changes(changes, cameras):
+    """The Faults of CameraChanges; `cameras` are the names of all of them."""
+    found = []
+    for change in changes:
+        at_once = {other.camera for other in changes if other.after == change.after}
+        words = _zoomed(change) if change.zoomed else _moved(change)
+        if len(at_once) == len(cameras) and not change.zoomed:
+            words = f"{words} (or the range finder was: all cameras changed at once)"
+        remedy = (
+            "fix what is loose and record anew, or make two sessions: one of the placements up to "
+            f"{change.before}, one from {change.after} on"
+        )
+        kind = "camera zoomed" if change.zoomed else "camera moved"
+        severe = change.size_px > SEVERE_PX
+        concerned = (change.after,)
+        found.append(Fault(kind, f"{words}; {remedy}", severe, False, change.camera, concerned))
+    return found
+
+
+def _zoomed(change):
+    """A CameraChange of the image scale, in words."""
+    size = f"{100 * abs(change.zoom):.2f} +- {100 * change.zoom_sigma:.2f} %"
+    way = "larger" if change.zoom > 0 else "smaller"
+    return (
+        f"the images of camera '{change.camera}' are {size} {way} from placement {change.after} "
+        f"on, {change.corner_px:.1f} px at their corners: zoom, focus or image size were changed"
+    )
+
+
+def _moved(change):
+    """A CameraChange of the pose, in words."""
+    turn = f"{np.degrees(change.turn):.2f} +- {np.degrees(change.turn_sigma):.2f} deg"
+    shift = f"{1000 * change.shift:.1f} +- {1000 * change.shift_sigma:.1f} mm"
+    return (
+        f"camera '{change.camera}' was moved between placement {change.before} and placement "
+        f"{change.after}: turned by {turn} and shifted by {shift}, which moves the board by "
+        f"{change.motion_px:.1f} px in its images"
+    )
+
+
+def exchanged_placements(calibration):
+    """Pairs of placements that are left out, and whose images fit the scans of each other."""
+    prepared, joint = calibration.prepared, calibration.joint
+    session = prepared.session
+    lost = [
+        p
+        for p in session.board_placements
+        if p in prepared.problems or p in joint.solution.excluded
+    ]
+    scans = {}
+    for placement in lost[:MOST_LOST]:
+        with suppress(BoardNotFound, SessionError):
+            sweep = session.sweep(placement)
+            scans[placement] = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+
+    found = []
+    for first, second in combinations(scans, 2):
+        if _same_board(calibration, scans[first], second) and _same_board(
+            calibration, scans[second], first
+        ):
+            words = (
+                f"the images of placement {first} fit the scans of placement {second}, and those "
+                f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
+                "back in images.csv"
+            )
+            found.append(Fault("exchanged", words, placements=(first, second)))
+    return found
+
+
+def _same_board(calibration, scan, placement):
+    """Whether a BoardScan shows the board where all images of a placement put it."""
+    prepared, solution = calibration.prepared, calibration.joint.solution
+    p_lrf, pitch, _ = face_points(scan, POINTS)
+    agree = []
+    for camera, transform in solution.transforms.items():
+        view = prepared.views[camera].get(placement)
+        if view is None or view.T_camera_board is None:
+            continue
+        mount = prepared.session.cameras[camera].mount
+        image_pitch = view.pitch if mount == "head" else 0.0
+        points = lrf_to_source(p_lrf, pitch, solution.T_head_lrf, mount, image_pitch)
+        on_board = view.T_camera_board.inv().apply(transform.apply(points))
+        beside = np.linalg.norm(
+            on_board[:, :2].mean(axis=0) - prepared.board.known_corners().mean(axis=0)
+        )
+        agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
+    return bool(agree) and all(agree)
