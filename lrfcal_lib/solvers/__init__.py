@@ -257,19 +257,22 @@ def _mean(values):
 
 def best_minimum(obs, uses, found):
     """The best of some Solutions, with another one as `rival` that explains the data nearly as well."""
-    judged = sorted(((*misfit(obs, uses, solution.transform), i) for i, solution in enumerate(found)))
-    behind, miss, best = judged[0][0], judged[0][1], found[judged[0][2]]
-    rivals = (found[i].transform for back, other, i in judged if back == behind and other <= planes.NEARLY * miss)
-    far = (T for T in rivals if transform_difference(T, best.transform)[0] > planes.SAME_TURN)
+    misses, before = zip(*(misses_of(obs, uses, solution.transform) for solution in found), strict=True)
+    sizes, before = planes.sizes_of_minima(np.square(misses)), np.array(before)
+    order = np.lexsort([sizes, ~before])
+    best = found[order[0]]
+    nearly = (before == before[order[0]]) & (sizes <= planes.NEARLY * sizes[order[0]])
+    alike = [found[i].transform for i in order if nearly[i]]
+    far = (T for T in alike if transform_difference(T, best.transform)[0] > planes.SAME_TURN)
     return replace(best, rival=next(far, None))
 
 
-def misfit(obs, uses, transform):
-    """What tells one minimum from another: whether the board is seen from behind the camera, then the median miss."""
+def misses_of(obs, uses, transform):
+    """Distances or pixels by which observations miss at a pose, and whether the board lies before the camera."""
     points = getattr(obs, f"{uses}_points")
     block = {"crossing": line_block, "scene": lines.point_block}.get(uses)
     misses = plane_residuals_m(obs, transform) if block is None else block(pose_array(transform), obs).residuals
-    return bool(np.mean(transform.apply(points)[:, 2] < 0) > 0.5), float(np.nanmedian(np.abs(misses)))
+    return misses[np.isfinite(misses)], bool(np.mean(transform.apply(points)[:, 2] < 0) <= 0.5)
 
 
 ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal

@@ -22,13 +22,13 @@ SWEEP_SIGMA = (np.radians(0.5), 0.05)
 START_STEPS, FIRST_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 60, 10, 10, 300
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
-LEFT_OUT = 1000.0  # times the squared share: what a start value that leaves out placements counts against others
 ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
 LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
 ROUGH_MISS, LAST_MISS = 0.08, 0.025  # metres, of a board from where images of it put it: of a start value, of the end
+FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "range_offset": "the range offset",
     "edge_log_odds": "the edge bias",
@@ -169,6 +169,33 @@ class JointSolution:
         return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
 
 
+@dataclass(frozen=True)
+class Start:
+    """A start value of the joint estimate.
+
+    Attributes
+    ----------
+    kept : JointObservations
+        Without what contradicts it.
+    state : JointState
+    left_out : dict of int or str to str
+        What is not kept, in words.
+    settled : bool
+        Whether more steps with the coarse unknowns would change nothing.
+    badness : float
+        Mean half squared residual of what is kept; the share that is left out counts against it.
+    rough_miss : float
+        Median distance of scans from the boards before any step, metres.
+    """
+
+    kept: JointObservations
+    state: residuals.JointState
+    left_out: dict
+    settled: bool
+    badness: float
+    rough_miss: float = 0.0
+
+
 def solve_joint(
     obs, T0=None, *, prior=None, axis=True, sensor=SENSOR[:3], sides=False, sweep="none", sweep_sigma=SWEEP_SIGMA,
     lapse=0.0, noise="stated", start=None, required=True,
@@ -219,8 +246,11 @@ def solve_joint(
     rivals, settled = (), False
     if start is None:
         obs, lost = without_lost_placements(obs)
-        obs, start, bad, rivals, settled = best_start(obs, unknowns, sweep_sigma, T0)
-        excluded = excluded | lost | bad
+        best, rivals = best_start(obs, unknowns, sweep_sigma, T0)
+        obs = best.kept
+        start = best.state
+        settled = best.settled
+        excluded = excluded | lost | best.left_out
     data = gather(obs, sweep_sigma=tuple(sweep_sigma), prior=prior)
     # stated levels of the noise may be wrong by far: what takes many steps with them leads away
     if prior is not None or not settled:
@@ -329,9 +359,8 @@ def image_name(obs, row):
 
 
 def best_start(obs, unknowns, sweep_sigma, T0=None):
-    """The most promising start value: the observations left with it, itself, what is not left, its rivals (words).
+    """The most promising Start, and in words its rivals.
 
-    Last comes whether more steps with the coarse unknowns would change nothing.
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
     wrong.
     """
@@ -342,22 +371,21 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
                 known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
                 state = replace(state, head=pose_array(known))
             misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
-            found = agreeing_start(obs, state, data, unknowns)
-            badness = found[-1] + LEFT_OUT * max(left_out_shares(obs, found[2])) ** 2
-            tried.append((badness, *found[:4], np.median(misses)))
-        if min(one[0] for one in tried) < GOOD_START and (T0 is None or number):
+            start = agreeing_start(obs, state, data, unknowns)
+            tried.append(replace(start, rough_miss=float(np.median(misses))))
+        if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
             break
-    tried.sort(key=lambda one: one[0])
-    kept, start, bad, settled, rough = tried[0][1:]
-    if rough > ROUGH_MISS:
-        refuse_contradiction(start, gather(kept), ROUGH_MISS)
-    if max(left_out_shares(obs, bad)) > LARGEST_SHARE:
+    best = min(tried, key=lambda start: start.badness)
+    if best.rough_miss > ROUGH_MISS:
+        refuse_contradiction(best.state, gather(best.kept), ROUGH_MISS)
+    if max(left_out_shares(obs, best.left_out)) > LARGEST_SHARE:
+        bad = list(best.left_out)
         raise DegenerateGeometry(
             f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
-            f"boards elsewhere than scans ({', '.join(map(str, list(bad)[:8]))}); check that images and scans carry "
+            f"boards elsewhere than scans ({', '.join(map(str, bad[:8]))}); check that images and scans carry "
             "the right numbers"
         )
-    return kept, start, bad, second_minima(obs, tried), settled
+    return best, second_minima(obs, tried, best)
 
 
 def refuse_contradiction(state, data, most):
@@ -370,10 +398,10 @@ def refuse_contradiction(state, data, most):
         )
 
 
-def second_minima(obs, tried):
+def second_minima(obs, tried, best):
     """In words, which start values with cameras far from the best one's explain the data nearly as well."""
-    best, *others = [state.cameras for cost, _, state, *_ in tried if cost <= NEARLY**2 * tried[0][0]]
-    named = [zip(obs.cameras, best, poses, strict=True) for poses in others]
+    others = [start.state.cameras for start in tried if start.badness <= NEARLY**2 * best.badness]
+    named = [zip(obs.cameras, best.state.cameras, poses, strict=True) for poses in others]
     pairs = [(name, *map(pose_transform, both)) for poses in named for name, *both in poses]
     far = [pair for pair in pairs if geometry.transform_difference(*pair[1:])[0] > SAME_TURN]
     return tuple(dict.fromkeys(rival_words(*pair) for pair in far))
@@ -388,17 +416,20 @@ def left_out_shares(obs, bad):
 def agreeing_start(obs, state, data, unknowns):
     """A few steps without what contradicts a start value; what a rough one leaves out is judged again by the rest.
 
-    Returns the observations kept, the state, what is left out in words, whether it converged, and the mean cost.
+    The better one of both attempts, a Start: what still contradicts may have led the rest astray.
     """
-    few = coarse(unknowns)
+    few, tried = coarse(unknowns), []
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = gather(kept, **data.levels) if bad else data
         found, settled, _, costs = fit(fitting, cut, few, steps=START_STEPS)
-        if not bad or max(left_out_shares(obs, bad)) > LARGEST_SHARE:
+        share = max(left_out_shares(obs, bad))
+        cost = np.nan_to_num(costs[-1], nan=np.inf) / count_rows(kept) * (1 + CONTRADICTION * share)
+        tried.append(Start(kept=kept, state=found, left_out=bad, settled=settled, badness=cost))
+        if not bad or share > LARGEST_SHARE:
             break
         state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
-    return kept, found, bad, settled, np.nan_to_num(costs[-1], nan=np.inf) / count_rows(kept)
+    return min(tried, key=lambda start: start.badness)
 
 
 def without_contradictions(obs, state, data):
@@ -408,7 +439,7 @@ def without_contradictions(obs, state, data):
         return obs, state, {}
     boards = boards_in_images(obs, state.head, state.cameras, np.arange(len(place)))
     misses = joint_noise.face_misses(state, data, boards, place)
-    wrong = misses > max(ROUGH_MISS, 5 * np.median(misses))
+    wrong = misses > max(LAST_MISS, FAR_MISS * np.median(misses))
     if not wrong.any():
         return obs, state, {}
     good, first = np.unique(place[~wrong], return_index=True)

@@ -144,6 +144,8 @@ def check_normals(sets, camera, least=0.02):
 
 SUBSETS, MINIMAL = 400, 40
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
+MOST_APART = 8
+CAPPED = 16.0  # times the usual square: a larger miss, four standard deviations, belongs to no minimum
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200
@@ -172,34 +174,51 @@ def start_from_planes(obs):
         found += [closed_form(lines, sets.boards, rows, False) @ frame.T for rows in own]
     candidates = _before_boards(np.concatenate(found), sets, _centred(triangles)[1])
 
-    least = max(p // 2 + 2, 7 if flat else 5)  # more placements than a closed form uses
-
-    def trimmed(candidates, count=least):
-        """Mean square (m^2) of candidates over so many placements, those they suit best."""
-        residuals = plane_residuals(candidates[:, None], triangles, sets.boards)[0]
-        squares = np.sort(np.sum(residuals**2, axis=2) / sets.number, axis=1)
-        return squares[:, :count].mean(axis=1)
+    def trimmed(count):
+        """Order of the candidates by their mean square over so many placements, those they suit best."""
+        squares = np.sort(_squares(candidates, triangles, sets), axis=1)
+        return np.argsort(squares[:, :count].mean(axis=1))
 
     def evaluate(pose):
         return plane_block(pose, triangles / 0.005, sets.boards, None, sets.number)
 
-    order = np.argsort(trimmed(candidates))
-    best = candidates[[*order[:4], *_apart(candidates, order[:100])]]
+    # more placements than a closed form uses; half of them may be wrong, or all but one right
+    counts = {p // 2 + 2, max(p // 2 + 2, 7 if flat else 5)}
+    orders = [trimmed(min(count, p)) for count in counts]
+    best = candidates[np.unique([row for order in orders for row in (*order[:4], *_apart(candidates, order))])]
     options = {"loss": "cauchy", "scale": "auto", "max_iterations": 12, "tolerance": 0.01}
-    refined, *_ = minimise(evaluate, best, move_pose, **options)
-    every = np.concatenate([refined, best])
-    apart = every[_apart(every, np.argsort(trimmed(every)))]
-    most = trimmed(apart, max(least, round(SEEN * p)))
-    return pose_transform(apart[most <= NEARLY**2 * most[0]])
+    robust, *_ = minimise(evaluate, best, move_pose, **options)
+    plain, *_ = minimise(evaluate, robust, move_pose, max_iterations=12, tolerance=0.01)
+    every = np.concatenate([robust, plain, best])
+    sizes = sizes_of_minima(_squares(every, triangles, sets), sets.number)
+    apart = _apart(every, np.argsort(sizes))
+    return pose_transform(every[[row for row in apart if sizes[row] <= NEARLY * sizes[apart[0]]]])
+
+
+def _squares(poses, triangles, sets):
+    """Mean squared distances (n, p) of the points of every placement from its plane, at some poses (n, 3, 4)."""
+    residuals = plane_residuals(poses[:, None], triangles, sets.boards)[0]
+    return np.sum(residuals**2, axis=2) / sets.number
+
+
+def sizes_of_minima(squares, weights=None):
+    """Robust sizes (n,) of the misses at n minima, which tell the one that explains the data best.
+
+    Roots of weighted means of squares (n, k), each one counted up to `CAPPED` times the level: that of the minimum with
+    the smallest median, one level for all. The median alone would not see what half of the data say.
+    """
+    level = np.median(squares, axis=1).min()
+    return np.sqrt(np.average(np.minimum(squares, CAPPED * level + SIGMA_FLOOR**2), axis=1, weights=weights))
 
 
 def _apart(poses, order):
-    """Indices of poses, the first ones in some order that are turned against all before, at most 6."""
-    found = []
-    for i in order:
-        turns = np.trace(np.swapaxes(poses[found, :, :3], -1, -2) @ poses[i, :, :3], axis1=1, axis2=2)
-        if len(found) < 6 and (turns < 1 + 2 * np.cos(SAME_TURN)).all():
-            found.append(i)
+    """Indices of poses, the first ones in some order that are turned against all before, at most `MOST_APART`."""
+    found, left = [], np.asarray(order)
+    while len(left) and len(found) < MOST_APART:
+        first = left[0]
+        found.append(first)
+        turns = np.trace(poses[left, :, :3] @ poses[first, :, :3].T, axis1=1, axis2=2)
+        left = left[turns < 1 + 2 * np.cos(SAME_TURN)]
     return found
 
 
