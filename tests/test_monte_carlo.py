@@ -6,9 +6,10 @@ import pandas as pd
 import pytest
 from joint_draws import MOUNTS, draw, none
 from notebook_runs import GOLDEN
+from scipy.stats import chi2
 from shared import campaign
 
-from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo
+from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, state_errors
 from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
@@ -92,6 +93,18 @@ def test_errors_reach_the_bound_and_are_as_stated(mount):
     assert (table.failed == 0).all() and (table.trials >= 12).all()
     for name in ("rmse_over_crb", "coverage", "nees"):
         assert pooled[f"{name}_low"] <= pooled[name] <= pooled[f"{name}_high"]
+
+
+@MOUNTS
+def test_what_is_trusted_holds_for_all_unknowns_together(mount):
+    """Chance lets single unknowns scatter over ten placements; what they share must not become precise by that."""
+    squares = []
+    for seed in range(500, 512):
+        obs, truth, _ = draw(np.random.default_rng(seed), 10, mount=mount, floor=LEAST_STEP)
+        found = solve_joint(obs)
+        error = state_errors(found.state, truth, found.unknowns)
+        squares.append(error @ np.linalg.solve(found.solution.trusted, error) / len(error))
+    assert np.mean(squares) < chi2.ppf(0.999, 12 * len(error)) / (12 * len(error)) and max(squares) < 2.5
 
 
 @campaign

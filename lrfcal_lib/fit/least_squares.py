@@ -58,19 +58,22 @@ class Block:
         """Number d of residuals that are judged together by a robust loss."""
         return self.whitener.shape[-1] if self.whitener.ndim > self.residuals.ndim else 1
 
+    def whitened(self, rows):
+        """Rows (..., n, k), such as a Jacobian, in independent standard deviations."""
+        w = self.whitener
+        if w.ndim == self.residuals.ndim:
+            return w[..., None] * rows
+        return (w @ rows.reshape(rows.shape[:-2] + (-1, w.shape[-1], rows.shape[-1]))).reshape(rows.shape)
+
     @cached_property
     def white(self):
         """Whitened residuals."""
-        w, r = self.whitener, self.residuals
-        return w * r if w.ndim == r.ndim else (w @ r.reshape(r.shape[:-1] + (-1, w.shape[-1], 1))).reshape(r.shape)
+        return self.whitened(self.residuals[..., None])[..., 0]
 
     @cached_property
     def white_jacobian(self):
         """Whitened Jacobian, the corrected one where there is one."""
-        w, J = self.whitener, self.jacobian if self.corrected is None else self.corrected
-        if w.ndim == self.residuals.ndim:
-            return w[..., None] * J
-        return (w @ J.reshape(J.shape[:-2] + (-1, w.shape[-1], J.shape[-1]))).reshape(J.shape)
+        return self.whitened(self.jacobian if self.corrected is None else self.corrected)
 
 
 def whiten(block, jacobian=True):

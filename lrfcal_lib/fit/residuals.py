@@ -8,6 +8,7 @@ from scipy.special import log_ndtr
 
 from lrfcal_lib.fit.least_squares import Block
 from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.fit.stops import ViewBlock, same_stop
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, line_distance, line_through, project, undistort
 from lrfcal_lib.model.geometry import (
@@ -308,12 +309,12 @@ class JointData:
     `face`, `beam` and `view` hold the fields of that group of JointObservations, with ``ray`` (LRF frame) or, for
     views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and `direction` (p,) the sweeps'. Then
     come factors on the stated standard deviations of ranges and of each camera's views, the standard deviation of the
-    recorded pitch of a single image (what a head at rest is off by, radians), shares of independent errors per
-    observation (below one where neighbours repeat each other's errors; above where edges are sharper than the floor of
-    :func:`flip_sigma`, so that beams say more), `lapse` (see :func:`beam_terms`), what is expected of the sweeps' own
-    offset (radians) and stretch, the scale of the sides' deviations of the log odds (Student's t with `SIDE_FREEDOM`
-    degrees of freedom: most backgrounds are alike, some are dark), and the stated platform, which yields where the data
-    contradict it.
+    recorded pitch at a stop (what a head at rest is off by, radians; see :mod:`lrfcal_lib.fit.stops`), shares of
+    independent errors per observation (below one where neighbours repeat each other's errors; above where edges are
+    sharper than the floor of :func:`flip_sigma`, so that beams say more), `lapse` (see :func:`beam_terms`), what is
+    expected of the sweeps' own offset (radians) and stretch, the scale of the sides' deviations of the log odds
+    (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are dark), and the stated
+    platform, which yields where the data contradict it.
     """
 
     face: dict
@@ -513,17 +514,14 @@ def view_block(state, data, unknowns):
     cameras = (own[..., None, :] * mine[:, :, None, :, None]).reshape(A.shape[:2] + (6, -1))
     J = assemble(unknowns, axis=axis, parts=turn * by_parts[..., None, :], board=by_board, cameras=cameras)
     p, v = pitch.shape
-    return Block(residuals.reshape(p, 6 * v), J.reshape(p, 6 * v, -1), view_whitener(data, turn[..., 0]))
-
-
-def view_whitener(data, by_pitch):
-    """Inverse Cholesky factors of the views' covariances, with what the error of the recorded pitch adds to them."""
-    scale = data.view_scale[data.view["camera"]][..., None, None]
-    if data.sigma_pitch == 0:
-        return data.view["whitener"] / scale
-    covariance = scale**2 * data.view["covariance"]
-    covariance = covariance + data.sigma_pitch**2 * by_pitch[..., :, None] * by_pitch[..., None, :]
-    return np.linalg.inv(np.linalg.cholesky(covariance)) * data.view["used"][..., None, None]
+    return ViewBlock(
+        residuals.reshape(p, 6 * v),
+        J.reshape(p, 6 * v, -1),
+        view["whitener"] / data.view_scale[view["camera"]][..., None, None],
+        by_pitch=turn[..., 0],
+        same=same_stop(view["pitch"], view["used"]),
+        sigma_pitch=data.sigma_pitch,
+    )
 
 
 def own_jacobian(unknowns, p, name):

@@ -104,15 +104,21 @@ class Solution:
     def trusted(self):
         """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
 
-        That of the noise, with its correlations, and grown where a parameter scatters more over placements than chance
-        explains: of the square of the logarithm of the ratio of both variances, what n placements leave to chance
-        (trigamma of (n - 1) / 2) is taken off. A large excess over many placements counts in full.
+        That of the noise C, and where a parameter scatters more over placements than chance explains, as much more,
+        C + h C h. What is added has the correlations of C: left and right camera lean on the same axis, and growing one
+        of them by itself (``g C g``) would claim that their difference is known better than anybody measured it.
+
+        Of the square of the logarithm of the ratio of both variances, what n placements leave to chance (trigamma of
+        (n - 1) / 2) is taken off. A large excess over many placements counts in full.
         """
         known = (self.sigma > 0) & np.isfinite(self.sigma)
         ratio = np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known)
-        excess, chance = 2 * np.log(np.fmax(ratio, 1.0)), polygamma(1, (self.n_placements - 1) / 2)
-        grow = np.exp(np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0) / 2)
-        return grow[..., :, None] * self.covariance * grow[..., None, :]
+        excess = 2 * np.log(np.fmax(ratio, 1.0))
+        chance = polygamma(1, (self.n_placements - 1) / 2)
+        believed = np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0)
+        h = np.sqrt(np.expm1(believed))
+        finite = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
+        return self.covariance + h[..., :, None] * finite * h[..., None, :]
 
     @property
     def trusted_sigma(self):

@@ -53,6 +53,7 @@ class Bench(Devices):
     pitch_step: float = np.radians(0.5)  # between scan lines, radians
     range_offset: float = 0.0  # metres
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
+    sigma_stop: float = 0.0  # standard deviation of the recorded pitch at the stop of an image, radians
     floor: float = 0.0  # least softness, in beam steps; real edges have none, the model of the joint estimate has
 
 
@@ -175,9 +176,11 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
 
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
-    true = []
+    true, head = [], at * (1 + bench.stretch)
+    if bench.sigma_stop:  # one error for all cameras
+        head = head + noise * bench.sigma_stop * rng.standard_normal(len(at))
     for camera in bench.cameras.values():
-        turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(-at * (1 + bench.stretch), [1.0, 0.0, 0.0])))
+        turn = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(-head, [1.0, 0.0, 0.0])))
         back = bench.T_head_lrf.inv() * turn if bench.mount == "head" else turn * turn.inv()
         true.append((camera * back * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])

@@ -1,6 +1,6 @@
 """Noise levels of the joint estimate, the share of the intrinsics, misfits, and what is suspicious, in words."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,6 @@ PARTS = 3  # of a board in x and y, and of an edge
 SHARP = 0.4  # scatter of scores over their information where edges are sharp, for the floor of `flip_sigma`
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
-LEAST_FREEDOM = 0.2  # share of the residuals of views that a scale is taken from, at least
 SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
 SETTLED = 0.02  # change of the logarithm of a noise level
 NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
@@ -61,32 +60,29 @@ def lens_covariance(obs, found, data, unknowns):
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
     for camera, spread in enumerate(obs.lens_covariance):
         mine = (used & (data.view["camera"] == camera))[..., None, None]
-        shift = (block.whitener @ (lens * mine)).reshape(J.shape[:2] + (LENS,))
+        shift = block.whitened((lens * mine).reshape(J.shape[:2] + (LENS,)))
         gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
         left = shift - reduced @ gain - J[..., c:] @ (own @ (np.swapaxes(J[..., c:], -1, -2) @ shift))
         total, square = total + gain @ spread @ gain.T, square + np.sum(left @ spread * left)
     level = data.view_scale[0] ** 2
-    square *= level / (6 * used.sum() * _freedom(used))
+    taken = np.sum((J[..., c:] @ own) * J[..., c:]) + np.sum((reduced @ finite) * reduced)
+    square *= level / max(6 * used.sum() - taken, 1.0)  # rows that are left to show it
     share = np.clip(level - 1, 0, square) / level
     return total, share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite, float(np.sqrt(square))
-
-
-def _freedom(used):
-    """Share of the residuals of views that is left to them: the boards' own poses take up the rest."""
-    return max(1 - used.any(axis=1).sum() / max(used.sum(), 1), LEAST_FREEDOM)
 
 
 def estimate_noise(state, data, unknowns):
     """Padded observations with noise levels from the residuals at a solution."""
     blocks = residuals.named_blocks(state, data, unknowns)
-    own = linearise(blocks.values(), None, 1.0, (-2, -1))[0][:, unknowns.shared :, unknowns.shared :]
+    hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
+    own = hessian[:, unknowns.shared :, unknowns.shared :]
     variance = np.diagonal(np.linalg.pinv(own, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
     if "face" in blocks:
         data = replace(data, **face_levels(state, data, blocks["face"]))
     if "beam" in blocks:
         data = replace(data, beam_share=beam_share(state, data, blocks["beam"], unknowns))
     if "view" in blocks:
-        data = view_levels(data, blocks["view"], state)
+        data = view_levels(data, blocks["view"], hessian, gradient, unknowns.shared)
     count = SWEEPS[unknowns.sweep]
     if unknowns.sides:
         data = replace(data, side_sigma=side_level(state.sides**2 + variance[:, 6 + count :], data.side_sigma))
@@ -152,32 +148,116 @@ def beam_share(state, data, block, unknowns):
     return float(1 / max(ratio, SHARP))
 
 
-def view_levels(data, block, state):
-    """Scale of the pose errors in images and the error of the pitch of single images: the most likely pair.
+def view_levels(data, block, hessian, gradient, shared):
+    """Scale of the pose errors in images and error of the pitch at a stop: the most likely pair.
+
+    The likelihood is the restricted one: what the unknowns take up of the residuals is no sign of small errors. A board
+    that moves with its images hides what all of them share, so that stops of one placement tell the error of the pitch
+    by their differences alone. `hessian` (p, k, k) and `gradient` (p, k) are of all blocks, `shared` unknowns first.
 
     One scale serves all cameras: with one view each, a camera could buy itself perfection at the other's cost.
     """
-    used = data.view["used"]
-    r = block.residuals.reshape(used.shape + (6, 1))
-    # derivatives of the residuals by the pitch of the image; zero for cameras on the base
-    lone = Unknowns(len(state.cameras), len(data.lines), axis=False, poses=False, sensor=("pitch_by_direction",))
-    turned = replace(data, direction=np.ones(len(data.direction)))
-    by_pitch = view_block(state, turned, lone).jacobian[..., 0].reshape(used.shape + (6,))
-    free = _freedom(used)
-
-    def level(sigma):
-        """Negative log likelihood at an error of the pitch of images, and the data with the scale that fits it."""
-        trial = replace(data, sigma_pitch=float(sigma))
+    views = ViewEvidence.of(block, hessian, gradient, shared)
+    trials, factor = [], 1.0
+    for sigma in PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]:
         for _ in range(SCALE_ROUNDS):
-            z = (residuals.view_whitener(trial, by_pitch) @ r)[..., 0][used]
-            factor = np.sqrt(np.mean(z**2) / free)
-            trial = replace(trial, view_scale=np.clip(trial.view_scale * factor**0.7, *SCALE_LIMITS))
-        whitener = residuals.view_whitener(trial, by_pitch)
-        z = (whitener @ r)[..., 0][used]
-        return 0.5 * np.sum(z**2) / free - np.log(np.diagonal(whitener[used], axis1=-2, axis2=-1)).sum(), trial
+            cost, factor = views.judged(sigma**2, factor, float(np.min(data.view_scale)))
+        trials.append((cost, factor))
+    costs, factors = np.array(trials).T
+    best = int(np.argmin(costs))
+    sigma = PITCH_LEVELS[best]
+    if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
+        x, y = np.log(PITCH_LEVELS[best - 1 : best + 2]), costs[best - 1 : best + 2]
+        bend, slope, _ = np.polyfit(x - x[1], y, 2)
+        sigma *= np.exp(-slope / (2 * bend)) if bend > 0 else 1.0
+    scale = np.clip(data.view_scale * factors[best], *SCALE_LIMITS)
+    return replace(data, view_scale=scale, sigma_pitch=float(sigma * factors[best]))
 
-    sigmas = PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]
-    return min(map(level, sigmas), key=lambda pair: pair[0])[1]
+
+@dataclass(frozen=True)
+class ViewEvidence:
+    """What views say about their own noise levels, at the scale that they are whitened with.
+
+    Attributes
+    ----------
+    other_hessian, other_gradient : ndarray, shapes (p, k, k), (p, k)
+        Normal equations of all that is no view.
+    hessian, gradient, square : ndarray, shapes (p, k, k), (p, k), (p,)
+        Those of the views without an error of the pitch, and the sum of their squared residuals.
+    by_stop, along, strength : ndarray, shapes (p, v, k), (p, v), (p, v)
+        Of every stop (zeros where there are fewer stops than images): products of the whitened derivative g by its
+        pitch with the Jacobian, with the residuals, with itself.
+    rows, shared : int
+    """
+
+    other_hessian: np.ndarray
+    other_gradient: np.ndarray
+    hessian: np.ndarray
+    gradient: np.ndarray
+    square: np.ndarray
+    by_stop: np.ndarray
+    along: np.ndarray
+    strength: np.ndarray
+    rows: int
+    shared: int
+
+    @classmethod
+    def of(cls, block, hessian, gradient, shared):
+        """From the views' block and the normal equations of all blocks."""
+        z, J = whiten(block)
+        transposed = np.swapaxes(J, -1, -2)
+        other = hessian - transposed @ J, gradient - (transposed @ z[..., None])[..., 0]
+        single = replace(block, sigma_pitch=0.0)
+        z, J = whiten(single)
+        transposed = np.swapaxes(J, -1, -2)
+        g = block.white_by_pitch[0]
+        first = block.same & (np.argmax(block.same, axis=1)[:, None] == np.arange(g.shape[1])[None, :, None])
+        stop = first.astype(float)  # (p, stop, view): one at the views of a stop, in the row of the first of them
+        rows = g.shape[:2] + (6, -1)
+        return cls(
+            *other,
+            hessian=transposed @ J,
+            gradient=(transposed @ z[..., None])[..., 0],
+            square=np.sum(z**2, axis=-1),
+            by_stop=stop @ np.sum(g[..., None] * J.reshape(rows), axis=2),
+            along=(stop @ np.sum(g[..., None] * z.reshape(rows), axis=2))[..., 0],
+            strength=(stop @ np.vecdot(g, g)[..., None])[..., 0],
+            rows=6 * int(np.trace(block.same, axis1=1, axis2=2).sum()),
+            shared=shared,
+        )
+
+    def judged(self, variance, factor, scale):
+        """Negative log likelihood of an error of the pitch and a factor on the scale, and a better factor.
+
+        `variance` is that of the pitch at the scale that the views are whitened with (a factor serves both). Of the
+        factor one row more is believed, as large as stated: where nothing else shows the scale, it is the stated one.
+        """
+        f2, c = factor**2, self.shared
+        less = variance / (1 + variance * self.strength)
+        weighted = np.swapaxes(self.by_stop * less[..., None], -1, -2)
+        hessian = self.hessian - weighted @ self.by_stop
+        gradient = self.gradient - (weighted @ self.along[..., None])[..., 0]
+        square = self.square - np.sum(less * self.along**2, axis=-1)
+        whole, right = self.other_hessian + hessian / f2, self.other_gradient + gradient / f2
+        whole = whole + 1e-12 * np.eye(whole.shape[-1]) * np.trace(whole, axis1=1, axis2=2)[:, None, None]
+        reduced, score, back = eliminate(whole, right, c, rcond=None)
+        total = np.sum(reduced, axis=0)
+        inverse = np.linalg.inv(total)
+        step = -inverse @ np.sum(score, axis=0)
+        own = -(back[..., c] + back[..., :c] @ step)
+        moved = np.concatenate([np.broadcast_to(step, (len(own), c)), own], axis=-1)
+        left = square + 2 * np.vecdot(moved, gradient) + np.vecdot(moved, (hessian @ moved[..., None])[..., 0])
+        # share of the views in what is known of the unknowns: rows that these take up
+        inner = np.linalg.inv(whole[:, c:, c:])
+        spread = np.concatenate([np.broadcast_to(np.eye(c), (len(own), c, c)), -back[..., :c]], axis=1)
+        taken = np.sum(inner * hessian[:, c:, c:]) + np.sum((spread @ inverse) * (hessian @ spread))
+        weight = np.linalg.slogdet(whole[:, c:, c:])[1].sum() + np.linalg.slogdet(total)[1]
+        cost = 0.5 * (
+            np.sum(square) / f2 + np.vecdot(moved, right).sum() + self.rows * np.log(f2)
+            + np.log1p(variance * self.strength).sum() + weight
+        )  # fmt: skip
+        better = (np.sum(left) + scale**-2) / (max(self.rows - taken / f2, 0.0) + 1)
+        return cost, float(np.sqrt(better))
 
 
 def side_level(square, sigma):

@@ -1,0 +1,61 @@
+"""Images at one stop of the head: all its cameras share the error of the pitch there."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lrfcal_lib.fit.least_squares import Block
+
+SAME_STOP = np.radians(0.001)  # recorded pitch angles that agree to this are one stop: platforms record 0.01 deg or so
+
+
+def same_stop(pitch, used):
+    """Which images of a placement (p, v) were taken at one stop, shape (p, v, v)."""
+    stop = np.rint(pitch / SAME_STOP)
+    return (stop[:, :, None] == stop[:, None, :]) & used[:, :, None] & used[:, None, :]
+
+
+@dataclass(frozen=True)
+class ViewBlock(Block):
+    """Board poses in images (p, 6 v), each whitened by itself, with the error of the pitch that a stop's images share.
+
+    The covariance of whitened views of a stop is ``I + sigma^2 g g^T``, of which ``I - h h^T`` with h along g is the
+    inverse root: no matrix larger than that of one view is needed.
+
+    Attributes
+    ----------
+    by_pitch : ndarray, shape (p, v, 6)
+        Derivative of the residuals by the pitch of the image; zeros for cameras on the base.
+    same : ndarray of bool, shape (p, v, v)
+        See :func:`same_stop`.
+    sigma_pitch : float
+        Standard deviation of the pitch at a stop, radians.
+    """
+
+    by_pitch: np.ndarray = None
+    same: np.ndarray = None
+    sigma_pitch: float = 0.0
+
+    @cached_property
+    def white_by_pitch(self):
+        """The vectors g (p, v, 6), and the square of the whole one of a view's stop (p, v)."""
+        g = (self.whitener @ self.by_pitch[..., None])[..., 0]
+        return g, (self.same @ np.vecdot(g, g)[..., None])[..., 0]
+
+    @cached_property
+    def shared_error(self):
+        """The vectors h (p, v, 6)."""
+        g, square = self.white_by_pitch
+        gain = 1 - 1 / np.sqrt(1 + self.sigma_pitch**2 * square)
+        return g * np.sqrt(gain / np.maximum(square, 1e-300))[..., None]
+
+    def whitened(self, rows):
+        """Rows (p, 6 v, k) in independent standard deviations."""
+        white = super().whitened(rows)
+        if self.sigma_pitch == 0:
+            return white
+        h = self.shared_error[..., None]
+        views = white.reshape(*h.shape[:-1], -1)
+        common = self.same @ np.sum(h * views, axis=2)
+        return (views - h * common[:, :, None]).reshape(white.shape)
