@@ -17,9 +17,9 @@ from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import polar_to_points, tilt
 
-CORNERS = np.array(
-    [[0.04 + 0.03 * i, 0.04 + 0.03 * j, 0.0] for i in range(5) for j in range(6) if i + j < 7]
-)
+# corners of a pattern that fills the triangle, metres, where the board has none
+PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
+CORNERS = np.array([0.04, 0.04, 0.0]) + 0.03 * np.array(PLACES)
 # axes of a camera, or a board, ahead of the LRF
 AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 MARGIN = 6  # beams beyond the board
@@ -69,9 +69,7 @@ class Bench(Devices):
 
 @dataclass(frozen=True, kw_only=True)
 class ShotSetup(Devices):
-    """What single shots are drawn from: devices like the paper's, boards at `distances`
-    (metres).
-    """
+    """What single shots are drawn from: devices like the paper's, and distances in metres."""
 
     board: Board = field(
         default_factory=lambda: triangle_board(pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
@@ -83,38 +81,37 @@ class ShotSetup(Devices):
 
     def bearings(self):
         """From 40 to 140 deg, radians, shape (B,)."""
-        return np.radians(40) + self.step * np.arange(int(np.radians(100) / self.step + 1.5))
+        count = int(np.radians(100) / self.step + 1.5)
+        return np.radians(40) + self.step * np.arange(count)
 
 
 def bench(rng, cameras=("left", "right"), **settings):
-    """A :class:`Bench` like the paper's with random mounting errors of some degrees and
-    centimetres.
-    """
+    """A :class:`Bench` like the paper's, mounted wrongly by some degrees and centimetres."""
     turn = Rotation.from_rotvec([0.0, *rng.normal(0, 0.02, 2)])
     head = RigidTransform.from_components([0.0, *rng.normal(0, 0.05, 2)], turn)
     poses = {}
     for i, name in enumerate(cameras):
         rotation = Rotation.from_rotvec(rng.normal(0, 0.03, 3)) * AHEAD
-        centre = np.array([0.12 * (2 * i - 1), 0.03, 0.12]) + rng.normal(0, 0.01, 3)
+        side = 2 * i - 1  # the first camera on the left
+        centre = np.array([0.12 * side, 0.03, 0.12]) + rng.normal(0, 0.01, 3)
         poses[name] = RigidTransform.from_components(-rotation.apply(centre), rotation)
     return Bench(head, poses, **settings)
 
 
 def board_poses(rng, count, distances=(1.0, 2.5)):
-    """Poses ``T_platform_board`` of boards ahead of the rig, facing it, turned every way in
-    their plane.
-    """
-    low, high = zip(
-        (0.0, 2 * np.pi),
-        (-0.6, 0.6),
-        (-0.6, 0.6),
-        (-0.35, 0.35),
-        (-0.1, 0.1),
-        distances,
-        strict=True,
+    """Poses ``T_platform_board`` of boards ahead of the rig, facing it, turned in their plane."""
+    limits = np.array(
+        [
+            (0.0, 2 * np.pi),  # turn in the plane, radians
+            (-0.6, 0.6),  # lean about x and y, radians
+            (-0.6, 0.6),
+            (-0.35, 0.35),  # to the right and up, of the distance
+            (-0.1, 0.1),
+            distances,
+        ]
     )
     poses = []
-    for spin, *lean, right, up, away in rng.uniform(low, high, (count, 6)):
+    for spin, *lean, right, up, away in rng.uniform(*limits.T, (count, 6)):
         face = _facing(spin, lean)
         centre = np.array([right, 1.0, up]) * away
         poses.append(RigidTransform.from_components(centre - face.apply([0.105, 0.127, 0.0]), face))
@@ -149,15 +146,20 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
     for number, pose in enumerate(poses):
         pitch, bearings = _grid(bench, pose, span)
         face, beam = _scan_lines(bench, pose, pitch, bearings, rng, noise)
-        view = _views(bench, pose, np.linspace(pitch[0], pitch[-1], images + 2)[1:-1], rng, noise)
+        between = np.linspace(pitch[0], pitch[-1], images + 2)[1:-1]
+        view = _views(bench, pose, between, rng, noise)
         for name, group in (("face", face), ("beam", beam), ("view", view)):
-            for key, values in {**group, "placement": np.full(len(group["pitch"]), number)}.items():
+            group["placement"] = np.full(len(group["pitch"]), number)
+            for key, values in group.items():
                 parts[f"{name}_{key}"].append(values)
         middle.append(float(pitch.mean()))
+    direction = np.zeros(count, int)
+    if span != 0:
+        direction = np.where(np.arange(count) % 2, -1, 1)
     return {name: np.concatenate(values) for name, values in parts.items()} | {
         "placements": np.arange(1, count + 1),
         "middle": np.array(middle),
-        "direction": np.where(np.arange(count) % 2, -1, 1) if span != 0 else np.zeros(count, int),
+        "direction": direction,
         "edges": bench.board.edges,
         "corners": np.asarray(bench.board.corners, float),
         "cameras": tuple(bench.cameras),
@@ -167,60 +169,52 @@ def observe(bench, poses, rng, *, images=3, span=None, noise=1.0):
 
 
 def _grid(bench, pose, span):
-    """Recorded pitch of the scan lines over a board, and bearings of the beams that pass it or
-    come near.
-    """
+    """Recorded pitch of the scan lines over a board, and bearings of the beams about it."""
     p = pose.apply(bench.board.points())
     up = np.arctan2(p[:, 2], p[:, 1])
     middle = np.arctan2(*p.mean(axis=0)[[2, 1]])
-    half = (
-        span / 2
-        if span is not None
-        else max(up.max() - middle, middle - up.min()) + 6 * bench.pitch_step
-    )
+    if span is None:
+        half = max(up.max() - middle, middle - up.min()) + 6 * bench.pitch_step
+    else:
+        half = span / 2
     steps = int(half / bench.pitch_step)
     pitch = middle + bench.pitch_step * np.arange(-steps, steps + 1)
-    p_lrf = bench.T_head_lrf.inv().apply(
-        tilt(p[:, None], -pitch * (1 + bench.stretch)).reshape(-1, 3)
-    )
+    p_head = tilt(p[:, None], -pitch * (1 + bench.stretch)).reshape(-1, 3)
+    p_lrf = bench.T_head_lrf.inv().apply(p_head)
     bearing = np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
     first, last = (round(b / bench.step) for b in (bearing.min(), bearing.max()))
     return pitch, bench.step * np.arange(first - MARGIN, last + MARGIN + 1)
 
 
 def _scan_lines(bench, pose, pitch, bearings, rng, noise):
-    """Readings of the face, and the beams within reach of where readings change between board
-    and background.
-    """
+    """Readings of the face, and the beams about where readings change to the background."""
     true = pitch[:, None] * (1 + bench.stretch)
     R = pose.rotation.as_matrix()
     head = bench.T_head_lrf
-    rays = tilt(head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings)), true) @ R
+    p_head = head.rotation.apply(polar_to_points(np.ones(len(bearings)), bearings))
+    rays = tilt(p_head, true) @ R
     origin = (tilt(head.translation, true) - pose.translation) @ R
     distances, r = _beside(bench.board, origin, rays)
     radius = bench.radius(r)
     sensible = (r > 0.2) & (r < 30)
     u = distances.max(axis=-1)
     edge = distances.argmax(axis=-1)
-    jitter = (
-        noise
-        * np.hypot(bench.softness * radius, bench.floor * bench.step * r)
-        * rng.standard_normal(r.shape)
-    )
+    soft = np.hypot(bench.softness * radius, bench.floor * bench.step * r)
+    jitter = noise * soft * rng.standard_normal(r.shape)
     hit = (u + jitter < bench.bias * radius) & sensible
     # near to an edge across the scan lines, and along them
     changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
     across, along = (
         maximum_filter1d(c, 2 * REACH, axis, mode="constant") for axis, c in enumerate(changes)
     )
-    alone = np.sort(distances, axis=-1)[..., -2] <= -2 * radius  # elsewhere two edges cut the spot
+    second = np.sort(distances, axis=-1)[..., -2]
+    alone = second <= -2 * radius  # elsewhere two edges cut the spot
     row, b = np.nonzero((across | along) & alone & sensible)
     step = np.where(along[row, b], bench.step, bench.pitch_step)
     line, beam = np.nonzero(hit)
+    errors = noise * bench.sigma_range * rng.standard_normal(len(line))
     face = {
-        "range": r[line, beam]
-        + bench.range_offset
-        + noise * bench.sigma_range * rng.standard_normal(len(line)),
+        "range": r[line, beam] + bench.range_offset + errors,
         "bearing": bearings[beam],
         "pitch": pitch[line],
         "sigma": np.full(len(line), bench.sigma_range),
@@ -241,11 +235,12 @@ def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
     true = []
     for camera in bench.cameras.values():
-        turn = RigidTransform.from_rotation(
-            Rotation.from_rotvec(np.outer(-at * (1 + bench.stretch), [1.0, 0.0, 0.0]))
-        )
-        back = bench.T_head_lrf.inv() * turn if bench.mount == "head" else turn * turn.inv()
-        true.append((camera * back * pose).as_matrix())
+        T_source_platform = RigidTransform.identity(len(at))
+        if bench.mount == "head":
+            turn = np.outer(-at * (1 + bench.stretch), [1.0, 0.0, 0.0])
+            T_head_platform = RigidTransform.from_rotation(Rotation.from_rotvec(turn))
+            T_source_platform = bench.T_head_lrf.inv() * T_head_platform
+        true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
     drawn, covariance = _seen_poses(bench, true[:, :3], rng, noise)
     camera = np.repeat(np.arange(len(bench.cameras)), len(at))
@@ -275,9 +270,8 @@ def draw_shots(setup, rng, trials, placements=20):
     A beam reads the board while its ray passes an edge line at less than `bias` radii outside, give
     or take the softness. Placements whose crossings come near a corner are drawn anew.
     """
-    rotation = (
-        Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3))).as_matrix() @ AHEAD.as_matrix()
-    )
+    turn = Rotation.from_rotvec(rng.normal(0, 0.03, (trials, 3)))
+    rotation = turn.as_matrix() @ AHEAD.as_matrix()
     centre = np.array([0.12, 0.03, 0.12]) + rng.normal(0, 0.01, (trials, 3))
     rig = np.concatenate([rotation, -rotation @ centre[..., None]], axis=-1)
     parts = []
@@ -288,13 +282,15 @@ def draw_shots(setup, rng, trials, placements=20):
         before = np.cumsum(good) - good
         rank = before - before[np.searchsorted(who, who)]  # among the good ones of its trial
         keep = good & (rank < missing[who])
-        parts.append({"who": who[keep]} | {name: value[keep] for name, value in found.items()})
+        found["who"] = who
+        parts.append({name: value[keep] for name, value in found.items()})
         missing = missing - np.bincount(who[keep], minlength=trials)
         if not missing.any():
             break
     else:
         raise ValueError(
-            f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by the camera"
+            f"boards at {setup.distances} m are hardly ever crossed on two edges and seen by "
+            "the camera"
         )
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(whole.pop("who"), kind="stable")
@@ -314,39 +310,44 @@ def _candidates(setup, rng, rig):
     spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
     turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
     away = rng.uniform(*setup.distances, count)
-    centre = np.column_stack(
-        [rng.uniform(-0.35, 0.35, count) * away, away, rng.uniform(-0.12, 0.12, count)]
-    )
+    right = rng.uniform(-0.35, 0.35, count) * away
+    up = rng.uniform(-0.12, 0.12, count)
+    centre = np.column_stack([right, away, up])
     shift = centre - turn @ np.append(board.corners.mean(axis=0), 0.0)
-    u, ranges = _beside(
-        board, -(shift[:, None] @ turn), polar_to_points(np.ones(len(bearings)), bearings) @ turn
-    )
+    rays = polar_to_points(np.ones(len(bearings)), bearings) @ turn
+    u, ranges = _beside(board, -(shift[:, None] @ turn), rays)
     radius = setup.radius(ranges)
-    own = setup.spread * rng.standard_normal((count, 1, u.shape[-1])) if setup.spread else 0.0
+    own = 0.0
+    if setup.spread:
+        own = setup.spread * rng.standard_normal((count, 1, u.shape[-1]))
     soft = (setup.bias + setup.softness * rng.standard_normal(ranges.shape)) * radius
     hit = (u - own * radius[..., None]).max(axis=-1) < soft
     hit &= ranges > 0
-    ends = np.stack([hit.argmax(axis=1), hit.shape[1] - 1 - hit[:, ::-1].argmax(axis=1)], axis=1)
+    last = hit.shape[1] - 1
+    first_hit = hit.argmax(axis=1)
+    last_hit = last - hit[:, ::-1].argmax(axis=1)
+    ends = np.stack([first_hit, last_hit], axis=1)
     across = np.take_along_axis(u / radius[..., None], ends[..., None], axis=1)
     edges = across.argmax(axis=-1)
-    good = (hit.sum(axis=1) >= FEWEST_BEAMS) & (ends[:, 0] > 0) & (ends[:, 1] < hit.shape[1] - 1)
-    good &= (edges[:, 0] != edges[:, 1]) & (np.sort(across, axis=-1)[..., -2] < -CLEAR).all(axis=1)
-    pose = np.concatenate(
-        [rig[:, :, :3] @ turn, rig[:, :, :3] @ shift[..., None] + rig[:, :, 3:]], axis=-1
-    )
-    corners = board.corners @ np.swapaxes(pose[..., :2], 1, 2) + pose[:, None, :, 3]
+    second = np.sort(across, axis=-1)[..., -2]
+    good = hit.sum(axis=1) >= FEWEST_BEAMS
+    good &= (first_hit > 0) & (last_hit < last)
+    good &= (edges[:, 0] != edges[:, 1]) & (second < -CLEAR).all(axis=1)
+    R, t = np.split(rig, [3], axis=-1)
+    pose = np.concatenate([R @ turn, R @ shift[..., None] + t], axis=-1)
+    corners = board.corners @ np.swapaxes(pose[..., :2], 1, 2)
+    corners = corners + pose[:, None, :, 3]
     uv = pinhole(corners, model)
-    good &= ((uv > 0) & (uv < [model.width, model.height])).all(axis=(1, 2)) & (
-        corners[..., 2] > 0
-    ).all(axis=1)
+    inside = (uv > 0) & (uv < [model.width, model.height])
+    good &= inside.all(axis=(1, 2)) & (corners[..., 2] > 0).all(axis=1)
     boards, covariance = _seen_poses(setup, pose, rng, 1.0)
-    noisy = np.where(hit, ranges + setup.sigma_range * rng.standard_normal(ranges.shape), np.nan)
-    # normals out of the board
-    lines = board.lines()[edges] @ np.linalg.inv(model.matrix @ pose[..., [0, 1, 3]])
+    noisy = ranges + setup.sigma_range * rng.standard_normal(ranges.shape)
+    homography = model.matrix @ pose[..., [0, 1, 3]]  # from the board's plane to pixels
+    lines = board.lines()[edges] @ np.linalg.inv(homography)  # normals out of the board
     lines /= np.linalg.norm(lines[..., :2], axis=-1, keepdims=True)
     lines[..., 2] += setup.sigma_px * rng.standard_normal(edges.shape)
     return good, {
-        "ranges": noisy,
+        "ranges": np.where(hit, noisy, np.nan),
         "lines": lines,
         "edges": edges,
         "boards": boards,
@@ -355,13 +356,11 @@ def _candidates(setup, rng, rig):
 
 
 def _facing(spin, lean):
-    """Rotation of boards that face the LRF, leant about their x and y and then turned in their
-    plane, radians.
-    """
+    """Rotation of boards that face the LRF, leant about x and y, then turned in their plane."""
     lean = np.asarray(lean)
-    spin = np.asarray(spin)
-    leant = Rotation.from_rotvec(np.concatenate([lean, np.zeros(lean.shape[:-1] + (1,))], axis=-1))
-    return AHEAD * leant * Rotation.from_rotvec(spin[..., None] * np.array([0, 0, 1.0]))
+    leant = np.concatenate([lean, np.zeros(lean.shape[:-1] + (1,))], axis=-1)
+    turned = np.asarray(spin)[..., None] * np.array([0, 0, 1.0])
+    return AHEAD * Rotation.from_rotvec(leant) * Rotation.from_rotvec(turned)
 
 
 def _beside(board, origin, rays):
@@ -372,25 +371,28 @@ def _beside(board, origin, rays):
     ranges = -origin[..., 2] / rays[..., 2]
     at = origin + ranges[..., None] * rays
     lines = board.lines()
-    inside = at[..., :2] @ lines[:, :2].T + lines[:, 2]
+    normals = lines[:, :2].T
+    inside = at[..., :2] @ normals + lines[:, 2]
     # ray along the edge's normal; its part along z is the other cosine
-    across = rays[..., :2] @ lines[:, :2].T
-    return inside * np.abs(rays[..., 2:]) / np.hypot(across, rays[..., 2:]), ranges
+    across = rays[..., :2] @ normals
+    z = rays[..., 2:]
+    return inside * np.abs(z) / np.hypot(across, z), ranges
 
 
 def _seen_poses(devices, true, rng, noise):
     """Poses (n, 3, 4) of boards as their pattern tells them, and their covariances."""
-    corners = CORNERS if devices.board.pattern is None else devices.board.pattern.points()
+    pattern = devices.board.pattern
+    corners = CORNERS if pattern is None else pattern.points()
     turned = corners @ np.swapaxes(true[..., :3], -1, -2)
     points = turned + true[:, None, :, 3]
-    by_point = project_jacobians(points.reshape(-1, 3), devices.model)[0].reshape(
-        points.shape[:2] + (2, 3)
-    )
+    by_point = project_jacobians(points.reshape(-1, 3), devices.model)[0]
+    by_point = by_point.reshape(points.shape[:2] + (2, 3))
     J = np.concatenate([np.cross(turned[:, :, None], by_point), by_point], axis=-1)
     J = J.reshape(len(true), 2 * len(corners), 6)
-    covariance = np.linalg.inv(np.swapaxes(J, -1, -2) @ J) * devices.sigma_px**2
-    error = (
-        noise * (np.linalg.cholesky(covariance) @ rng.standard_normal((len(true), 6, 1)))[..., 0]
-    )
+    information = np.swapaxes(J, -1, -2) @ J
+    covariance = np.linalg.inv(information) * devices.sigma_px**2
+    unit = rng.standard_normal((len(true), 6, 1))
+    error = noise * (np.linalg.cholesky(covariance) @ unit)[..., 0]
     rotation = Rotation.from_rotvec(error[:, :3]).as_matrix() @ true[..., :3]
-    return np.concatenate([rotation, true[..., 3:] + error[:, 3:, None]], axis=-1), covariance
+    translation = true[..., 3:] + error[:, 3:, None]
+    return np.concatenate([rotation, translation], axis=-1), covariance

@@ -29,7 +29,10 @@ from lrfcal_lib.simulate.rig import held_close, placements_of, random
 from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room, need
 
 LICENCE = "CC-BY-4.0"
-RECORDING = "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at rest"
+RECORDING = (
+    "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at "
+    "rest"
+)
 SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACES is one more
 # s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
 REPLY_TIME = 0.0016 + 0.016
@@ -243,9 +246,8 @@ def _add_placements(writer, setup, placements, truth, workers):
     log = []
     took = beam.turns * MIRROR_TURN
     unit = beam.unit_name
-    writer.add_telegrams(
-        -1, [encode_configuration(Configuration().changed(measuring_mode=0, unit=unit))], time_s=0.0
-    )
+    configuration = Configuration().changed(measuring_mode=0, unit=unit)
+    writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
     files = _photographs(setup, shots, workers)
     _add_images(writer, setup, [s for s in shots if s.placement < 0], files, truth)
@@ -254,23 +256,23 @@ def _add_placements(writer, setup, placements, truth, workers):
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
         own = [s for s in shots if s.placement == placement.number]
         _add_images(writer, setup, own, files, truth, images, shot_at)
-        began = shot_at[-1] + pause + (pause + took) * np.arange(len(lines.true))
+        first = shot_at[-1] + pause
+        began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
-        writer.add_telegrams(
-            placement.number, telegrams, lines.measured, np.round(began + took + REPLY_TIME, 4)
-        )
+        arrived = np.round(began + took + REPLY_TIME, 4)
+        writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
-            rows = zip(times, np.degrees(stops.commanded), np.degrees(stops.measured), strict=True)
-            log += [f"{t:.4f},{c:.4f},{m:.4f}" for t, c, m in rows]
+            commanded = np.degrees(stops.commanded)
+            measured = np.degrees(stops.measured)
+            for t, c, m in zip(times, commanded, measured, strict=True):
+                log.append(f"{t:.4f},{c:.4f},{m:.4f}")
         truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
 
 
 def _photographs(setup, shots, workers):
-    """The images of all shots in order, an iterator of lists of files, rendered ahead by worker
-    processes.
-    """
+    """The images of all shots in order, lists of files, rendered ahead by worker processes."""
     if workers <= 1:
         yield from (photograph(setup, item) for item in shots)
         return
@@ -279,20 +281,21 @@ def _photographs(setup, shots, workers):
 
 
 def _add_images(writer, setup, shots, files, truth, stops=None, times=None):
-    """Write the next images, with where the head then stood: at pitch 0 where no stops are
-    given.
-    """
+    """Write the next images, with where the head then stood: at pitch 0 without stops."""
     for shot, images in zip(shots, files, strict=False):
         name = setup.rig.cameras[shot.camera].name
         for i, data in enumerate(images):
-            pitch, true = (
-                (0.0, 0.0) if stops is None else (float(stops.measured[i]), float(stops.true[i]))
-            )
-            time = math.nan if times is None else float(np.round(times[i], 4))
+            pitch = true = 0.0
+            time = math.nan
+            if stops is not None:
+                pitch = float(stops.measured[i])
+                true = float(stops.true[i])
+                time = float(np.round(times[i], 4))
             writer.add_image(
                 name, data, shot.placement, pitch=pitch, time_s=time, purpose=shot.purpose
             )
             known = {"pitch_rad": true}
             if shot.T_platform_board is not None:
                 known["T_camera_board"] = transform_to_json(shot.poses[i] * shot.T_platform_board)
-            truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
+            file = f"images/{name}/{writer.shots[name]:04d}.jpg"
+            truth["images"][file] = known

@@ -57,8 +57,7 @@ class Platform:
         need(abs(self.stretch) < 0.5, f"platform: {share}")
 
     def stop(self, commanded, direction, rng):
-        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or from
-        above (-1).
+        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or above.
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
         """
@@ -66,18 +65,21 @@ class Platform:
         step = self.encoder_step
         self.check(commanded)
         motor = commanded + self.noise * rng.standard_normal(commanded.shape)
-        head = (1 + self.stretch) * motor - np.asarray(direction) * self.backlash / 2
-        return head, np.rint(motor / step) * step if step else motor
+        behind = np.asarray(direction) * self.backlash / 2
+        head = (1 + self.stretch) * motor - behind
+        if step:
+            return head, np.rint(motor / step) * step
+        return head, motor
 
     def check(self, pitch):
         """Refuse angles beyond the limits."""
         low = min(pitch, default=0.0)
         high = max(pitch, default=0.0)
-        (first, last), has = (np.round(np.degrees(ends), 2) for ends in ((low, high), self.limits))
-        words = (
-            f"platform: pitch {first} to {last} deg is asked for, it turns {has[0]} to {has[1]} deg"
-        )
-        need(self.limits[0] <= low and high <= self.limits[1], words)
+        first, last = np.round(np.degrees([low, high]), 2)
+        lowest, highest = np.round(np.degrees(self.limits), 2)
+        asked = f"platform: pitch {first} to {last} deg is asked for"
+        good = self.limits[0] <= low and high <= self.limits[1]
+        need(good, f"{asked}, it turns {lowest} to {highest} deg")
 
 
 @dataclass(frozen=True)
@@ -151,25 +153,27 @@ class Rig:
         along = n[1] * y + n[2] * z
         across = n[1] * z - n[2] * y
         turn = np.arctan2(across, along)
-        lift = np.arccos(np.clip(-(n[0] * x + h) / np.hypot(along, across), -1, 1))
-        both = [np.angle(np.exp(1j * (turn + s * lift))) for s in (1, -1)]
-        pitch = np.where(np.abs(both[0]) < np.abs(both[1]), *both)
+        cosine = -(n[0] * x + h) / np.hypot(along, across)
+        lift = np.arccos(np.clip(cosine, -1, 1))
+        first, second = np.angle(np.exp(1j * np.stack([turn + lift, turn - lift])))
+        pitch = np.where(np.abs(first) < np.abs(second), first, second)
         p_lrf = back.apply(tilt(p_platform, -pitch))
         return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
-        """Whether a camera sees points of the board (corners by default) inside the image by a
-        margin in pixels.
+        """Whether a camera sees points of the board (corners by default) well inside the image.
 
-        For a pose, or each of a stack of poses.
+        For a pose, or each of a stack of poses; the margin is in pixels.
         """
-        p = apply_pose(
-            pose_array(T_camera_board), self.board.points() if points is None else points
-        )
+        if points is None:
+            points = self.board.points()
+        p = apply_pose(pose_array(T_camera_board), points)
         uv = project(p, camera.model)
         size = np.array([camera.model.width, camera.model.height])
-        ahead = (p[..., 2] >= 0.1) & (np.abs(p[..., :2]) <= p[..., 2:]).all(axis=-1)
-        return np.all(ahead & ((uv > margin) & (uv < size - 1 - margin)).all(axis=-1), axis=-1)
+        within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
+        ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
+        inside = (uv > margin) & (uv < size - 1 - margin)
+        return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -259,11 +263,14 @@ def load_setup(name):
 
 def _radians(row):
     """A row with what ends in _deg in radians, and no lists."""
-    turned = {
-        k.removesuffix("_deg"): np.radians(v).tolist() if k.endswith("_deg") else v
-        for k, v in row.items()
-    }
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()}
+    turned = {}
+    for key, value in row.items():
+        if key.endswith("_deg"):
+            value = np.radians(value).tolist()
+        if isinstance(value, list):
+            value = tuple(value)
+        turned[key.removesuffix("_deg")] = value
+    return turned
 
 
 @dataclass(frozen=True)
@@ -284,38 +291,31 @@ class Placement:
 
 
 def random(setup, *key):
-    """Random numbers that depend on the setup's seed and a key alone, whatever else is
-    simulated.
-    """
+    """Random numbers that depend on a setup's seed and a key, whatever else is simulated."""
     return np.random.default_rng([setup.seed, *key])
 
 
 def placements_of(setup):
-    """The placements of a setup, a list: those of the board, then the sweep of the room where
-    there is one.
-    """
-    room = (
-        [Placement(2 * setup.pairs + 1, None, setup.room_sweep[:2], setup.room_images)]
-        if setup.room_sweep
-        else []
-    )
-    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES)) + room
+    """The placements of a setup, a list: those of the board, then a sweep of the room if any."""
+    out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
+    if setup.room_sweep:
+        number = 2 * setup.pairs + 1
+        out.append(Placement(number, None, setup.room_sweep[:2], setup.room_images))
+    return out
 
 
 def check_size(rig, nearest):
-    """Refuse a board that does not fit into the view of the LRF or of a camera at a distance,
-    metres.
-    """
+    """Refuse a board that does not fit into a view of LRF or camera at a distance, metres."""
     length = pdist(rig.board.known_corners()).max()
     angle = np.degrees(2 * np.arctan(length / 2 / nearest))
     views = {rig.beam.name: float(rig.beam.field_of_view)}
     for camera in rig.cameras:
         m = camera.model
-        views[f"camera '{camera.name}'"] = np.degrees(
-            2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2)
-        )
+        narrow = min(m.width / m.fx, m.height / m.fy)
+        views[f"camera '{camera.name}'"] = np.degrees(2 * np.arctan(narrow / 2))
+    board = f"board '{rig.board.name}' is {length:.3g} m long"
+    large = f"{board}: {angle:.0f} deg at {nearest:g} m"
     for name, view in views.items():
-        large = f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m"
         seen = f"{name} sees {view:.0f} deg; take a smaller board or a greater distance"
         need(angle <= 0.9 * view, f"{large}, but {seen}")
 
@@ -336,7 +336,8 @@ def pairs(rig, count, distances, rng, margin=OUTSIDE):
     )
     check_size(rig, distances[0])
     out = []
-    for i, distance in enumerate(rng.permutation(np.linspace(*distances, count))):
+    shuffled = rng.permutation(np.linspace(*distances, count))
+    for i, distance in enumerate(shuffled):
         turn = -135.0 + 90.0 * (i % 4)  # which way the right angle points: up, left, down, right
         for _ in range(MOST_TRIES):
             poses = _pair(rig, distance, turn, rng)
@@ -345,16 +346,22 @@ def pairs(rig, count, distances, rng, margin=OUTSIDE):
                 break
         else:
             raise ValueError(
-                f"no place at {distance:.2f} m where the LRF and all cameras see board '{rig.board.name}'"
+                f"no place at {distance:.2f} m where the LRF and all cameras see board "
+                f"'{rig.board.name}'"
             )
-        for k, (pose, (sweep, seen)) in enumerate(zip(poses, spans, strict=True)):
-            middle = np.mean(seen)
-            half = min(np.ptp(seen) * 0.4, np.radians(9.0))
-            angles = middle + half * np.array([[-1.0, 0.0, 1.0], [0.0]][k])
-            angles = np.radians(np.round(np.degrees(angles), 2))
-            way = (1, -1)[k]
-            out.append(Placement(2 * i + k + 1, pose, sweep[::way], tuple(angles[::way])))
+        upward, downward = zip(poses, spans, strict=True)
+        out.append(_placement(2 * i + 1, *upward, [-1.0, 0.0, 1.0], 1))
+        out.append(_placement(2 * i + 2, *downward, [0.0], -1))
     return out
+
+
+def _placement(number, pose, spans, image_shares, way):
+    """A Placement swept upwards (1) or downwards (-1), images at shares of the pitch that shows it."""
+    sweep, seen = spans
+    half = min(np.ptp(seen) * 0.4, np.radians(9.0))
+    angles = np.mean(seen) + half * np.array(image_shares)
+    angles = np.radians(np.round(np.degrees(angles), 2))
+    return Placement(number, pose, sweep[::way], tuple(angles[::way]))
 
 
 def _pair(rig, distance, turn, rng):
@@ -365,12 +372,10 @@ def _pair(rig, distance, turn, rng):
     centre = rig.board.points().mean(axis=0)
     out = []
     for more in (0.0, 90.0):
-        angles = [rng.uniform(-35, 35), rng.uniform(-28, 28), turn + more + rng.uniform(-12, 12)]
-        turned = (
-            Rotation.from_euler("z", -azimuth)
-            * AHEAD
-            * Rotation.from_euler("YXZ", angles, degrees=True)
-        )
+        lean = [rng.uniform(-35, 35), rng.uniform(-28, 28)]
+        angles = [*lean, turn + more + rng.uniform(-12, 12)]
+        leant = Rotation.from_euler("YXZ", angles, degrees=True)
+        turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
         out.append(RigidTransform.from_components(middle - turned.apply(centre), turned))
     return out
 
@@ -380,22 +385,22 @@ def _spans(rig, pose, margin):
 
     None where that is too little.
     """
-    shown = np.all(
-        [rig.shows(c, rig.camera_pose(c, PITCH_GRID) * pose) for c in rig.cameras], axis=0
-    )
+    shown = np.ones(len(PITCH_GRID), bool)
+    for camera in rig.cameras:
+        shown &= rig.shows(camera, rig.camera_pose(camera, PITCH_GRID) * pose)
     seen = PITCH_GRID[shown]
-    (pitch, bearing) = rig.sweep_pitch(pose.apply(rig.board.points()))
-    beside = (
-        np.abs(bearing - np.pi / 2).max() >= np.radians(rig.beam.field_of_view / 2) - 2 * margin
-    )
-    if beside or not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
+    if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
-    return (pitch.min() - margin, pitch.max() + margin), (seen[0], seen[-1])
+    pitch, bearing = rig.sweep_pitch(pose.apply(rig.board.points()))
+    half_field = np.radians(rig.beam.field_of_view / 2)
+    if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
+        return None
+    sweep = pitch.min() - margin, pitch.max() + margin
+    return sweep, (seen[0], seen[-1])
 
 
 def held_close(rig, camera, count, rng):
-    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list
-    of RigidTransform.
+    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list.
 
     The whole pattern is inside the image, spread over all of it by the poses together; ValueError
     if it does not fit.
@@ -409,18 +414,19 @@ def held_close(rig, camera, count, rng):
     )
     size = np.array([m.width, m.height])
     columns = int(np.ceil(np.sqrt(count * 4 / 3)))
+    to_camera = Rotation.from_euler("x", 180, degrees=True)
+    rows = np.ceil(count / max(columns, 1))
     for i in range(count):
         points = pattern.points()
-        rows = np.ceil(count / columns)
-        pixel = np.array([(i % columns + 0.5) / columns, (i // columns + 0.5) / rows]) * size
+        row, column = divmod(i, columns)
+        pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
         for attempt in range(MOST_TRIES):
-            uv = pixel + (size / 2 - pixel) * attempt / MOST_TRIES + rng.normal(0, 15, 2)
+            inwards = (size / 2 - pixel) * attempt / MOST_TRIES
+            u, v = pixel + inwards + rng.normal(0, 15, 2)
             z = rng.uniform(*CLOSE)
-            angles = [rng.uniform(-42, 42), rng.uniform(-42, 42), rng.uniform(-180, 180)]
-            turn = Rotation.from_euler("x", 180, degrees=True) * Rotation.from_euler(
-                "YXZ", angles, degrees=True
-            )
-            place = z * np.array([(uv[0] - m.cx) / m.fx, (uv[1] - m.cy) / m.fy, 1.0])
+            angles = rng.uniform([-42, -42, -180], [42, 42, 180])
+            turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
+            place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
             pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
             if rig.shows(camera, pose, points, margin=18.0):
                 break
