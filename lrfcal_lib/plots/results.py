@@ -245,7 +245,7 @@ def residuals_by_range(ax, distance, residual):
     """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in
     bins.
 
-    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.tables.range_residuals`.
+    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.joint_tables.range_residuals`.
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
@@ -281,7 +281,7 @@ def residuals_by_region(ax, uv, shift, model, name):
     """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the
     image's width.
 
-    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.tables.view_residuals`. The
+    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.joint_tables.view_residuals`. The
     camera's name is its colour.
     """
     length = np.linalg.norm(shift, axis=1)

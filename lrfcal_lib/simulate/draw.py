@@ -15,13 +15,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
-from lrfcal_lib.model.geometry import polar_to_points, tilt
+from lrfcal_lib.model.geometry import AHEAD, polar_to_points, tilt
 
 # corners of a pattern that fills the triangle, metres, where the board has none
 PLACES = [(i, j, 0) for i in range(5) for j in range(6) if i + j < 7]
 CORNERS = np.array([0.04, 0.04, 0.0]) + 0.03 * np.array(PLACES)
-# axes of a camera, or a board, ahead of the LRF
-AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 MARGIN = 6  # beams beyond the board
 REACH = 2  # beams kept on either side of an edge, along and across the scan lines
 CLEAR = 1.3  # spot radii between a crossing and a second edge

@@ -13,10 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import apply_pose, pose_array, tilt
+from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
 from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate.beam import LMS221, Beam
-from lrfcal_lib.simulate.draw import AHEAD
 from lrfcal_lib.simulate.scene import Exposure, need
 
 MOST_TRIES = 4000
