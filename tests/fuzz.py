@@ -31,7 +31,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.drivers.port import PortError, open_port
 from lrfcal_lib.drivers.rig_file import HeadSettings, RigFileError, read_rig_file
 from lrfcal_lib.evaluate.export import file_hashes
-from lrfcal_lib.evaluate.tables import read_truth
+from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of

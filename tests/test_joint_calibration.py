@@ -8,8 +8,9 @@ from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
-from lrfcal_lib.evaluate import scenes, tables
+from lrfcal_lib.evaluate import edge_tables, joint_tables, scenes
 from lrfcal_lib.evaluate.export import calibration_record
+from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.session.read import open_session
 
@@ -21,7 +22,7 @@ def joint(quick):
 
 @pytest.fixture(scope="module")
 def truth():
-    return tables.read_truth(open_session(QUICK))
+    return read_truth(open_session(QUICK))
 
 
 def test_the_session_asks_for_its_unknowns(joint):
@@ -36,7 +37,7 @@ def test_the_session_asks_for_its_unknowns(joint):
 
 
 def test_errors_agree_with_their_sigma(joint, truth):
-    table = tables.joint_errors(joint, truth)
+    table = joint_tables.joint_errors(joint, truth)
     assert (table.rotation_error_deg < 3.5 * table.rotation_sigma_deg).all()
     assert (table.translation_error_mm < 3.5 * table.translation_sigma_mm).all()
     assert table.translation_error_mm.max() < 25
@@ -60,7 +61,7 @@ def test_it_is_handed_over_with_its_platform_and_sensor(quick):
     assert record["sensor"]["range_offset"]["sigma"] > 0 and record["sensor"]["excluded"] == []
     assert record["verdict"]["answer"] == "with care" and record["verdict"]["expected_error_at_m"]["2"]["cloud_mm"] > 0
     edges = [camera["edge_rms_px"] for camera in record["cameras"].values()]  # the same figure as in the report
-    assert min(edges) <= tables.joint_fit(quick.joint)["edge_rms_px"] <= max(edges)
+    assert min(edges) <= joint_tables.joint_fit(quick.joint)["edge_rms_px"] <= max(edges)
     assert "sensor" not in calibration_record(quick, "line")
 
 
@@ -80,7 +81,7 @@ def test_what_did_not_converge_is_not_handed_over(quick):
 
 
 def test_combined_lengths_are_good_know_how_good_they_are_and_do_not_know_the_board(joint):
-    table = tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint)
+    table = edge_tables.edge_lengths(joint.prepared, joint.solution.T_head_lrf, joint)
     own = table[(table.source != "paper") & table.measured_mm.notna()].set_index("variant")
     error = own.error_mm.abs().groupby("variant").mean()
     assert error["combined"] < 1.0 and error["combined"] < error.drop("combined").min() / 10

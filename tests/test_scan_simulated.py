@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from lrfcal_lib.evaluate import tables
+from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess.board_in_scan import find_board
 from lrfcal_lib.report.notebook import ROOT
@@ -18,7 +18,7 @@ WIDEST = 0.025  # metres; half a spot at 3 m, by which an edge before nothing li
 @lru_cache
 def opened(name):
     session = open_session(ROOT / "data" / name)
-    return session, tables.read_truth(session)
+    return session, read_truth(session)
 
 
 @lru_cache

@@ -19,8 +19,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import norm
 
 from lrfcal_lib.calibrate import combined, pipeline
-from lrfcal_lib.evaluate import tables
 from lrfcal_lib.evaluate.monte_carlo import joint_truth, state_errors
+from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.evaluate.verdict import judge
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
@@ -381,7 +381,7 @@ class Outcome:
 def judged(path):
     """Calibrate a session, everything at once: an Outcome, without names where there is no joint estimate."""
     session = open_session(path)
-    truth = tables.read_truth(session)
+    truth = read_truth(session)
     calibration = pipeline.calibrate(session, methods=("line",))
     verdict = judge(calibration, suggest=False)
     words = tuple(reason.words for reason in verdict.reasons)

@@ -11,8 +11,9 @@ import numpy as np
 from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
 from lrfcal_lib.calibrate.reconstruct import write_ply
+from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
-from lrfcal_lib.evaluate.tables import joint_fit, plane_residuals_of, rms
+from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
 from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.session.cache import spread

@@ -1,4 +1,6 @@
-"""Monte-Carlo trials of the joint estimate and of every method on single shots, beside bound and truth."""
+"""Monte-Carlo trials of the joint estimate and of every method on single shots, beside bound
+and truth.
+"""
 
 import re
 from dataclasses import dataclass, replace
@@ -11,7 +13,12 @@ from scipy.stats import binom, chi2
 
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import AXIS_COLUMNS, JointState, disc_share, gather, named_blocks
-from lrfcal_lib.model.geometry import DegenerateGeometry, polar_to_points, pose_array, pose_transform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    polar_to_points,
+    pose_array,
+    pose_transform,
+)
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
@@ -24,12 +31,16 @@ HALF_WIDTH = 1.6448536269514722  # standard normal: 90 % of it lies within
 LIMITS = (0.005, 0.995)  # of what chance alone does
 FEWEST_TRIALS = 10
 GROUPS = {  # unknowns by name: what they are together, the unit of that and the factor to it
-    r"axis_.*": ("axis direction", "deg", np.degrees(1.0)), r"offset_.*": ("axis offset", "mm", 1000.0),
+    r"axis_.*": ("axis direction", "deg", np.degrees(1.0)),
+    r"offset_.*": ("axis offset", "mm", 1000.0),
     r"range_offset": ("range offset", "mm", 1000.0),
-    r"edge_log_odds": ("edge bias", "log odds", 1.0), r"edge_log_softness": ("edge softness", "log", 1.0),
-    r"pitch_scale": ("pitch scale", "%", 100.0), r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
-    r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)), r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
-}  # fmt: skip
+    r"edge_log_odds": ("edge bias", "log odds", 1.0),
+    r"edge_log_softness": ("edge softness", "log", 1.0),
+    r"pitch_scale": ("pitch scale", "%", 100.0),
+    r"pitch_by_direction": ("pitch by direction", "deg", np.degrees(1.0)),
+    r"(.+)_r[xyz]": (r"\1 rotation", "deg", np.degrees(1.0)),
+    r"(.+)_t[xyz]": (r"\1 translation", "mm", 1000.0),
+}
 FACE = 24  # face points a placement
 
 
@@ -61,8 +72,11 @@ class Trials:
     failed: dict
 
 
-def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0, softness=0.1, pitch_scale=0.0):
-    """The truth behind drawn JointObservations, in the form (JointState) and gauge of the joint estimate.
+def joint_truth(
+    obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0, softness=0.1, pitch_scale=0.0
+):
+    """The truth behind drawn JointObservations, in the form (JointState) and gauge of the joint
+    estimate.
 
     Parameters
     ----------
@@ -75,14 +89,15 @@ def joint_truth(obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0,
     range_offset : float
         Metres.
     bias, softness : float
-        How far outside an edge a spot still reads the board, between -1 and 1, and the standard deviation of that, in
-        spot radii.
+        How far outside an edge a spot still reads the board, between -1 and 1, and the standard
+        deviation of that, in spot radii.
     pitch_scale : float
         The head turns ``1 + pitch_scale`` times as far as recorded.
     """
     poses = np.array([pose_array(cameras[name]) for name in obs.cameras]).reshape(-1, 3, 4)
     sensor = np.array([range_offset, logit(disc_share(bias)), np.log(softness), pitch_scale, 0.0])
-    count, boards = len(boards), np.stack([pose_array(T) for T in boards])
+    count = len(boards)
+    boards = np.stack([pose_array(T) for T in boards])
     own = boards, np.zeros((count, 2)), np.zeros((count, len(obs.edges)))
     return in_stated_gauge(JointState(pose_array(T_head_lrf), poses, sensor, *own), obs)
 
@@ -93,7 +108,8 @@ def monte_carlo(draw, solve, seeds):
     Parameters
     ----------
     draw : callable
-        ``rng -> (JointObservations, JointState)``: observations and the truth (:func:`joint_truth`).
+        ``rng -> (JointObservations, JointState)``: observations and the truth
+        (:func:`joint_truth`).
     solve : callable
         ``JointObservations -> JointSolution``.
     seeds : iterable of int
@@ -104,7 +120,9 @@ def monte_carlo(draw, solve, seeds):
     ValueError
         When every draw was refused, or the unknowns differ between draws.
     """
-    rows, failed, names = [], {}, None
+    rows = []
+    failed = {}
+    names = None
     for seed in seeds:
         obs, truth = draw(np.random.default_rng(seed))
         try:
@@ -115,7 +133,8 @@ def monte_carlo(draw, solve, seeds):
         names = names or found.solution.names
         if names != found.solution.names:
             raise ValueError(f"seed {seed} estimates {found.solution.names}, earlier ones {names}")
-        error, limit = state_errors(found.state, truth, found.unknowns), bound(obs, truth, found.unknowns)
+        error = state_errors(found.state, truth, found.unknowns)
+        limit = bound(obs, truth, found.unknowns)
         rows.append((int(seed), error, found.solution.covariance, limit))
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
@@ -124,7 +143,9 @@ def monte_carlo(draw, solve, seeds):
 
 
 def state_errors(state, truth, unknowns):
-    """Increments of the shared unknowns that take the truth to an estimate (JointStates in one gauge), shape (c,)."""
+    """Increments of the shared unknowns that take the truth to an estimate (JointStates in one
+    gauge), shape (c,).
+    """
     both = (np.concatenate([s.head[None], s.cameras]) for s in (state, truth))
     poses = pose_errors(*both)
     sensor = state.sensor - truth.sensor
@@ -132,26 +153,33 @@ def state_errors(state, truth, unknowns):
 
 
 def pose_errors(poses, true):
-    """``[w, v]`` with ``R = exp(w) R_true`` and ``t = t_true + v`` of poses (n, 3, 4), shape (n, 6)."""
+    """``[w, v]`` with ``R = exp(w) R_true`` and ``t = t_true + v`` of poses (n, 3, 4), shape
+    (n, 6).
+    """
     turn = pose_transform(poses).rotation * pose_transform(true).rotation.inv()
     return np.concatenate([turn.as_rotvec(), poses[..., 3] - true[..., 3]], axis=-1)
 
 
 def bound(obs, truth, unknowns):
-    """Cramer-Rao bound of the shared unknowns from the expected information at the truth, shape (c, c).
+    """Cramer-Rao bound of the shared unknowns from the expected information at the truth, shape (c,
+    c).
 
-    Nothing of the drawn values enters but which beams and views there are, so it checks the covariance that a solver
-    takes from its own residuals. Board poses, and whatever else a placement owns, count as unknown.
-    DegenerateGeometry when the data leave a direction of the shared unknowns open.
+    Nothing of the drawn values enters but which beams and views there are, so it checks the
+    covariance that a solver takes from its own residuals. Board poses, and whatever else a
+    placement owns, count as unknown. DegenerateGeometry when the data leave a direction of the
+    shared unknowns open.
     """
     data = gather(obs)
     hits = ({"hit": np.full_like(data.beam["hit"], hit)} for hit in (True, False))
-    read, missed = (named_blocks(truth, replace(data, beam=data.beam | hit), unknowns) for hit in hits)
+    read, missed = (
+        named_blocks(truth, replace(data, beam=data.beam | hit), unknowns) for hit in hits
+    )
     hessian = 0.0
     for name, block in read.items():
         J = whiten(block)[1]
         if name == "beam":  # expected: over both readings, weighted by how likely each is
-            chance, other = np.exp(-block.cost)[..., None], whiten(missed[name])[1]
+            chance = np.exp(-block.cost)[..., None]
+            other = whiten(missed[name])[1]
             hessian = hessian + np.swapaxes(other, -1, -2) @ ((1 - chance) * other)
             J = np.sqrt(chance) * J
         hessian = hessian + np.swapaxes(J, -1, -2) @ J
@@ -175,45 +203,70 @@ def groups_of(names):
 
 
 def spread(covariance, names):
-    """Standard deviation of each group of unknowns, by its words: root of the trace of `covariance`, in its unit."""
+    """Standard deviation of each group of unknowns, by its words: root of the trace of
+    `covariance`, in its unit.
+    """
     variance = np.diagonal(covariance)
-    return {words: float(factor * np.sqrt(variance[i].sum())) for words, (i, _, factor) in groups_of(names).items()}
+    return {
+        words: float(factor * np.sqrt(variance[i].sum()))
+        for words, (i, _, factor) in groups_of(names).items()
+    }
 
 
 def consistency(trials):
-    """How errors compare with the bound and with what the solver states, by group of unknowns and pooled.
+    """How errors compare with the bound and with what the solver states, by group of unknowns and
+    pooled.
 
-    Columns group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated covariances where there are
-    none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals, nees (mean normalised squared error by number of
-    unknowns), limits of chance of three of them (_low, _high), trials, failed. The last row pools all unknowns, each by
-    its own bound. A ValueError with fewer than ten trials, or errors that are not finite.
+    Columns group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated
+    covariances where there are none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals,
+    nees (mean normalised squared error by number of unknowns), limits of chance of three of them
+    (_low, _high), trials, failed. The last row pools all unknowns, each by its own bound. A
+    ValueError with fewer than ten trials, or errors that are not finite.
     """
     count = len(trials.seeds)
     if count < FEWEST_TRIALS:
-        raise ValueError(f"{count} trials say nothing about consistency: at least {FEWEST_TRIALS} are needed")
+        raise ValueError(
+            f"{count} trials say nothing about consistency: at least {FEWEST_TRIALS} are needed"
+        )
     if not (np.isfinite(trials.errors).all() and np.isfinite(trials.covariances).all()):
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
     groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
-    rows = [{"group": words, "unit": unit} | _judge(trials, i, factor) for words, (i, unit, factor) in groups.items()]
+    rows = [
+        {"group": words, "unit": unit} | _judge(trials, i, factor)
+        for words, (i, unit, factor) in groups.items()
+    ]
     return pd.DataFrame(rows).assign(trials=count, failed=len(trials.failed))
 
 
 def _judge(trials, index, factor):
-    """One row: a group in its unit, or (factor None) unknowns of many units, each in its own bounds."""
+    """One row: a group in its unit, or (factor None) unknowns of many units, each in its own
+    bounds.
+    """
     e = trials.errors[:, index]
     C, B = (X[:, index][:, :, index] for X in (trials.covariances, trials.bounds))
     mean = np.mean(C, axis=0)
-    seen = max(round(len(e) * _freedom(mean / np.sqrt(np.outer(np.diagonal(mean), np.diagonal(mean))))), 1)
-    unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2)) if factor is None else np.full(e.shape, factor)
-    e, (C, B) = unit * e, (unit[:, :, None] * X * unit[:, None, :] for X in (C, B))
+    seen = max(
+        round(len(e) * _freedom(mean / np.sqrt(np.outer(np.diagonal(mean), np.diagonal(mean))))), 1
+    )
+    unit = (
+        1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))
+        if factor is None
+        else np.full(e.shape, factor)
+    )
+    e = unit * e
+    (C, B) = (unit[:, :, None] * X * unit[:, None, :] for X in (C, B))
     crb, stated = (np.sqrt(np.mean(np.trace(X, axis1=1, axis2=2))) for X in (B, C))
-    rmse, free = np.sqrt(np.mean(np.sum(e**2, axis=1))), len(e) * _freedom(np.mean(B, axis=0))
+    rmse = np.sqrt(np.mean(np.sum(e**2, axis=1)))
+    free = len(e) * _freedom(np.mean(B, axis=0))
     row = {
-        "rmse": rmse, "crb": crb, "rmse_over_crb": rmse / crb, "stated_over_crb": stated / crb,
+        "rmse": rmse,
+        "crb": crb,
+        "rmse_over_crb": rmse / crb,
+        "stated_over_crb": stated / crb,
         "coverage": np.mean(np.abs(e) < HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))),
         "nees": np.mean(np.sum(e * np.linalg.solve(C, e[..., None])[..., 0], axis=-1)) / len(index),
-    }  # fmt: skip
+    }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
     row["nees_low"], row["nees_high"] = chi2.ppf(LIMITS, e.size) / e.size
@@ -226,42 +279,62 @@ def _freedom(C):
 
 
 def observations(shots, setup, last_beam=False):
-    """Drawn shots as the preprocessing makes CameraObservations of a scan line, with a leading trial axis.
+    """Drawn shots as the preprocessing makes CameraObservations of a scan line, with a leading
+    trial axis.
 
-    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24 face points. `shots`
-    and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
+    Two crossings a placement, at the last beams on the board or half a beam step outside, and 24
+    face points. `shots` and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
     """
-    ranges, bearings, (t, p, _) = shots["ranges"], setup.bearings(), shots["ranges"].shape
-    flat, half = ranges.reshape(t * p, -1), np.array([-0.5, 0.5]) * setup.step
+    ranges = shots["ranges"]
+    bearings = setup.bearings()
+    (t, p, _) = shots["ranges"].shape
+    flat = ranges.reshape(t * p, -1)
+    half = np.array([-0.5, 0.5]) * setup.step
     lines, information = fit_lines(flat, bearings)
     ends = bearings[np.stack(row_ends(np.isfinite(flat))[1:], axis=1)]
     ray = polar_to_points(1.0, ends if last_beam else ends + half)
-    across, u = np.cross([0.0, 0.0, 1.0], ray), np.pad(lines, ((0, 0), (0, 1)))[:, None]
+    across = np.cross([0.0, 0.0, 1.0], ray)
+    u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
     r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line
-    turned = r[..., None] * across - (r**2 * np.sum(u * across, axis=-1))[..., None] * ray  # by the bearing
+    # by the bearing
+    turned = r[..., None] * across - (r**2 * np.sum(u * across, axis=-1))[..., None] * ray
     spread = np.linalg.inv(information) * setup.sigma_range**2
     variance = r**4 * np.einsum("nei,nij,nej->ne", ray[..., :2], spread, ray[..., :2])
     noise = variance[..., None, None] * _outer(ray)
     found = {
-        "points": r[..., None] * ray, "half_step": turned * half[:, None], "noise": noise,
-        "covariance": noise + _outer(turned * setup.step * UNIFORM), "radius": setup.radius(r), "background": 0 * r,
+        "points": r[..., None] * ray,
+        "half_step": turned * half[:, None],
+        "noise": noise,
+        "covariance": noise + _outer(turned * setup.step * UNIFORM),
+        "radius": setup.radius(r),
+        "background": 0 * r,
         "line_sigma": np.full(r.shape, setup.sigma_px),
-    }  # fmt: skip
+    }
     crossings = {f"crossing_{k}": v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
     # face points for the plane method
     hit = np.isfinite(ranges)
-    count, on_board = hit.sum(axis=-1), np.argsort(~hit, axis=-1, kind="stable")
+    count = hit.sum(axis=-1)
+    on_board = np.argsort(~hit, axis=-1, kind="stable")
     pick = (np.linspace(0, 1, FACE) * (count[..., None] - 1)).round().astype(int)
     beam = np.take_along_axis(on_board, pick, axis=-1)
-    ray, repeats = polar_to_points(1.0, bearings[beam]), np.maximum(FACE / count, 1.0)  # short lines give some twice
+    # short lines give some twice
+    ray = polar_to_points(1.0, bearings[beam])
+    repeats = np.maximum(FACE / count, 1.0)
     points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
-    covariance = _outer(ray) * (setup.sigma_range**2 * repeats)[..., None, None, None] + 1e-10 * np.eye(3)
+    covariance = _outer(ray) * (setup.sigma_range**2 * repeats)[
+        ..., None, None, None
+    ] + 1e-10 * np.eye(3)
     return CameraObservations(
-        setup.model, **crossings, crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
-        crossing_placement=np.repeat(np.arange(p), 2), plane_points=points.reshape(t, -1, 3),
-        plane_covariance=covariance.reshape(t, -1, 3, 3), plane_placement=np.repeat(np.arange(p), FACE),
-        board_poses=shots["boards"], board_covariance=shots["board_covariance"],
-    )  # fmt: skip
+        setup.model,
+        **crossings,
+        crossing_lines=shots["lines"].reshape(t, 2 * p, 3),
+        crossing_placement=np.repeat(np.arange(p), 2),
+        plane_points=points.reshape(t, -1, 3),
+        plane_covariance=covariance.reshape(t, -1, 3, 3),
+        plane_placement=np.repeat(np.arange(p), FACE),
+        board_poses=shots["boards"],
+        board_covariance=shots["board_covariance"],
+    )
 
 
 def _outer(v):
@@ -269,8 +342,11 @@ def _outer(v):
 
 
 def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):
-    """All trials from start values `T0`, one a trial: Solutions with a trial axis by method, 'line_last_beam' first."""
-    half, last = observations(shots, setup), observations(shots, setup, last_beam=True)
+    """All trials from start values `T0`, one a trial: Solutions with a trial axis by method,
+    'line_last_beam' first.
+    """
+    half = observations(shots, setup)
+    last = observations(shots, setup, last_beam=True)
     found = {"line_last_beam": solve_camera(last, "line", T0)}
     return found | {method: solve_camera(half, method, T0) for method in methods}
 
@@ -278,22 +354,33 @@ def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):
 def shots_table(shots, setup, solutions):
     """Errors of every method over the trials.
 
-    Columns method, rotation_median_deg, rotation_rms_deg, translation_median_mm, translation_rms_mm, nees (mean
-    normalised squared error of the pose over 6), bias_error (median absolute error of the edge bias in spot radii, NaN
-    for methods without), converged (share).
+    Columns method, rotation_median_deg, rotation_rms_deg, translation_median_mm,
+    translation_rms_mm, nees (mean normalised squared error of the pose over 6), bias_error (median
+    absolute error of the edge bias in spot radii, NaN for methods without), converged (share).
     """
     rows = []
     for method, found in solutions.items():
         error = pose_errors(pose_array(found.transform), shots["T_camera_lrf"])
-        squares = np.sum(error * np.linalg.solve(found.covariance[..., :6, :6], error[..., None])[..., 0], axis=-1)
-        angle, distance = np.degrees(np.linalg.norm(error[:, :3], axis=-1)), 1e3 * np.linalg.norm(error[:, 3:], axis=-1)
-        rows.append({
-            "method": method, "rotation_median_deg": np.median(angle), "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
-            "translation_median_mm": np.median(distance), "translation_rms_mm": np.sqrt(np.mean(distance**2)),
-            "nees": np.mean(squares) / 6,
-            "bias_error": np.median(np.abs(edge_bias(found)[0] - setup.bias)) if method == "line_ml" else np.nan,
-            "converged": np.mean(found.converged),
-        })  # fmt: skip
+        squares = np.sum(
+            error * np.linalg.solve(found.covariance[..., :6, :6], error[..., None])[..., 0],
+            axis=-1,
+        )
+        angle = np.degrees(np.linalg.norm(error[:, :3], axis=-1))
+        distance = 1e3 * np.linalg.norm(error[:, 3:], axis=-1)
+        rows.append(
+            {
+                "method": method,
+                "rotation_median_deg": np.median(angle),
+                "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
+                "translation_median_mm": np.median(distance),
+                "translation_rms_mm": np.sqrt(np.mean(distance**2)),
+                "nees": np.mean(squares) / 6,
+                "bias_error": np.median(np.abs(edge_bias(found)[0] - setup.bias))
+                if method == "line_ml"
+                else np.nan,
+                "converged": np.mean(found.converged),
+            }
+        )
     return pd.DataFrame(rows)
 
 

@@ -1,4 +1,6 @@
-"""What a joint estimate knows badly, and which of the placements that a rig could record next would help most."""
+"""What a joint estimate knows badly, and which of the placements that a rig could record next
+would help most.
+"""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -15,53 +17,65 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.solvers.joint import UNSEEN, WORDS
 
-FACING = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # upright ahead of the LRF, print towards it
 LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
 PLACES = {
-    "distances": (1.0, 1.5, 2.0, 2.5, 3.0), "bearings": tuple(np.radians([-20, -10, 0, 10, 20])),
-    "elevations": tuple(np.radians([-12, 0, 12])), "turns": tuple(np.radians(np.arange(0, 360, 60))),
+    "distances": (1.0, 1.5, 2.0, 2.5, 3.0),
+    "bearings": tuple(np.radians([-20, -10, 0, 10, 20])),
+    "elevations": tuple(np.radians([-12, 0, 12])),
+    "turns": tuple(np.radians(np.arange(0, 360, 60))),
     "leans": tuple(np.radians([0, 35])),
-}  # fmt: skip
+}
 FIELD_OF_VIEW = (np.radians(40), np.radians(140))
 PITCH_LIMITS = (np.radians(-30), np.radians(30))
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
-IMAGES = 3  # of each camera on the head, spread over the pitch angles at which every camera sees the board
+# of each camera on the head, spread over the pitch angles at which every camera sees the board
+IMAGES = 3
 MARGIN = 0.02  # of the image, that a board keeps from its border
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 THINNED = 3  # times fewer ranges and beams than a placement has, each counted as often: time
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
-LARGE, MOST = 0.5, 3  # of a direction, components above this share of the largest are named, and so many of them
+# of a direction, components above this share of the largest are named, and so many of them
+LARGE = 0.5
+MOST = 3
 
 
 def outline(solution):
     """Corners of the board, shape (e, 3), metres."""
-    return np.column_stack([solution.observations.corners, np.zeros(len(solution.observations.corners))])
+    corners = solution.observations.corners
+    return np.column_stack([corners, np.zeros(len(corners))])
 
 
 def board_grid(solution, distances, bearings, elevations, turns, leans):
-    """All combinations of a grid of poses, visible or not; every lean above zero in four directions.
+    """All combinations of a grid of poses, visible or not; leans above zero in four directions.
 
-    A DataFrame with distance of the board's middle from the LRF (metres), bearing to the left, elevation, turn in the
-    board's plane (anticlockwise as the rig sees it; 0 with the board's x to the right), lean out of the upright plane
-    that faces the LRF (radians), towards ('back' with the top farther away, 'forward', 'left', 'right'; '' upright);
-    and ``T_platform_board``, shape (n, 3, 4).
+    A DataFrame with distance of the board's middle from the LRF (metres), bearing to the left,
+    elevation, turn in the board's plane (anticlockwise as the rig sees it; 0 with the board's x to
+    the right), lean out of the upright plane that faces the LRF (radians), towards ('back' with the
+    top farther away, 'forward', 'left', 'right'; '' upright); and ``T_platform_board``, shape (n,
+    3, 4).
     """
-    leant = [(lean, way) for lean in leans for way in LEANS if bool(lean) == bool(way)]
-    places = [(*place, *lean) for *place, lean in product(distances, bearings, elevations, turns, leant)]
-    places = pd.DataFrame(places, columns=["distance", "bearing", "elevation", "turn", "lean", "towards"])
+    rows = []
+    for *place, lean, way in product(distances, bearings, elevations, turns, leans, LEANS):
+        if bool(lean) == bool(way):
+            rows.append((*place, lean, way))
+    columns = ["distance", "bearing", "elevation", "turn", "lean", "towards"]
+    places = pd.DataFrame(rows, columns=columns)
     gaze = Rotation.from_euler("ZX", places[["bearing", "elevation"]])
     tip = places[["lean"]].to_numpy() * [(*LEANS[way], 0) for way in places.towards]
     spin = Rotation.from_rotvec(places[["turn"]].to_numpy() * [0.0, 0.0, 1.0])
-    face, head = gaze * FACING * Rotation.from_rotvec(tip) * spin, solution.T_head_lrf
+    face = gaze * geometry.AHEAD * Rotation.from_rotvec(tip) * spin
+    head = solution.T_head_lrf
     rotation = (head.rotation * face).as_matrix()
-    centre = head.apply(places[["distance"]].to_numpy() * gaze.apply([0.0, 1.0, 0.0]))
+    ahead = gaze.apply([0.0, 1.0, 0.0])
+    centre = head.apply(places[["distance"]].to_numpy() * ahead)
     origin = centre - rotation @ outline(solution).mean(axis=0)
     return places, np.concatenate([rotation, origin[..., None]], axis=-1)
 
 
 def visible(boards, solution, models, field_of_view):
-    """Which boards lie wholly in the view of LRF and cameras, (m,), and the pitch angles of their images, (m, k)."""
-    points, normals = geometry.apply_pose(boards, outline(solution)), boards[:, :, 2]
+    """Which boards (m,) lie wholly in all views, and the pitch angles (m, k) of their images."""
+    points = geometry.apply_pose(boards, outline(solution))
+    normals = boards[:, :, 2]
     bearing, pitch, _ = beams_to(points, solution.T_head_lrf)
     inside = (bearing > field_of_view[0]) & (bearing < field_of_view[1])
     inside &= (pitch > PITCH_LIMITS[0]) & (pitch < PITCH_LIMITS[1])
@@ -69,31 +83,45 @@ def visible(boards, solution, models, field_of_view):
     rows = np.flatnonzero(inside.all(axis=1))
     seen = np.ones((len(LATTICE), len(rows)), bool)
     for name in solution.transforms:
-        pose, model = camera_poses(solution, name, LATTICE), models[name]
-        p, size = geometry.apply_pose(pose[:, None], points[rows]), np.array([model.width, model.height])
-        uv, border = project(p, model), MARGIN * size
+        pose = camera_poses(solution, name, LATTICE)
+        model = models[name]
+        p = geometry.apply_pose(pose[:, None], points[rows])
+        size = np.array([model.width, model.height])
+        uv = project(p, model)
+        border = MARGIN * size
         # far outside the image the lens model folds back: only rays near the image count
-        tangent = np.abs(p[..., :2] / np.where(p[..., 2:] > 0, p[..., 2:], np.nan))
-        inside = (uv > border) & (uv < size - border) & (tangent < 0.65 * size / [model.fx, model.fy])
-        seen &= np.all(inside.all(axis=-1) & _facing(p, geometry.rotate_points(pose, normals[rows])), axis=2)
-    rows, seen = rows[seen.any(axis=0)], seen[:, seen.any(axis=0)]
-    low, high = LATTICE[np.argmax(seen, axis=0)], LATTICE[len(LATTICE) - 1 - np.argmax(seen[::-1], axis=0)]
-    share = np.linspace(0, 1, IMAGES) if "head" in solution.observations.mounts else np.array([0.5])
-    return rows, low[:, None] + (high - low)[:, None] * share
+        depth = np.where(p[..., 2:] > 0, p[..., 2:], np.nan)
+        tangent = np.abs(p[..., :2] / depth)
+        near = tangent < 0.65 * size / [model.fx, model.fy]
+        inside = near & (uv > border) & (uv < size - border)
+        facing = _facing(p, geometry.rotate_points(pose, normals[rows]))
+        seen &= np.all(inside.all(axis=-1) & facing, axis=2)
+    ever = seen.any(axis=0)
+    seen = seen[:, ever]
+    first = np.argmax(seen, axis=0)
+    last = len(LATTICE) - 1 - np.argmax(seen[::-1], axis=0)
+    low = LATTICE[first]
+    high = LATTICE[last]
+    share = np.array([0.5])
+    if "head" in solution.observations.mounts:
+        share = np.linspace(0, 1, IMAGES)
+    return rows[ever], low[:, None] + (high - low)[:, None] * share
 
 
 def _facing(sight, normals):
-    """Whether lines of sight (..., n, k, 3) meet the fronts of boards (..., n, 3) steeply enough."""
-    return -np.sum(sight * normals[..., None, :], axis=-1) > np.cos(STEEPEST) * np.linalg.norm(sight, axis=-1)
+    """Whether lines of sight (..., n, k, 3) meet the fronts of boards (..., n, 3) steeply."""
+    towards = -np.sum(sight * normals[..., None, :], axis=-1)
+    return towards > np.cos(STEEPEST) * np.linalg.norm(sight, axis=-1)
 
 
 def camera_poses(solution, name, pitch):
     """``T_camera_platform`` of a camera at pitch angles (n,), shape (n, 3, 4)."""
-    return np.broadcast_to(geometry.pose_array(solution.camera_at(name, pitch)), (len(pitch), 3, 4))
+    pose = geometry.pose_array(solution.camera_at(name, pitch))
+    return np.broadcast_to(pose, (len(pitch), 3, 4))
 
 
 def _view_covariance(pose, features, model):
-    """Covariance of board poses (n, 4, 4) in a camera from features of the board, 1 px each, shape (n, 6, 6)."""
+    """Covariance (n, 6, 6) of board poses (n, 4, 4) in a camera from features known to 1 px."""
     turned = geometry.rotate_points(pose[:, :3], features)
     by_point = project_jacobians(turned + pose[:, None, :3, 3], model)[0]
     J = geometry.gradient_by_pose(turned[..., None, :], by_point)
@@ -101,21 +129,31 @@ def _view_covariance(pose, features, model):
 
 
 def typical_placement(solution):
-    """What the placement of median information recorded: data, state, and points (1, n, 3) of faces and of beams.
+    """What the placement of median information recorded, thinned: data, state, and points.
 
-    The points are where their rays meet the board's plane, metres in its frame.
+    The points (1, n, 3), of faces and of beams, are where their rays meet the board's plane, metres
+    in its frame.
     """
-    told = np.diagonal(information(solution), axis1=1, axis2=2) @ scales_of(solution, solution.solution.names) ** 2
-    k, state, groups, points = np.argsort(told)[[len(told) // 2]], solution.state, {}, []
+    by_unknown = np.diagonal(information(solution), axis1=1, axis2=2)
+    told = by_unknown @ scales_of(solution, solution.solution.names) ** 2
+    k = np.argsort(told)[[len(told) // 2]]
+    state = solution.state
+    data = solution.data
     state = replace(state, boards=state.boards[k], sweeps=state.sweeps[k], sides=state.sides[k])
-    data = replace(solution.data, middle=solution.data.middle[k], direction=solution.data.direction[k])
-    for name, weight in (("face", THINNED**0.5), ("beam", THINNED)):  # a whitener of ranges, a number of beams
-        group, board = getattr(data, name), state.boards[0]
-        some = np.flatnonzero(group["used"][k[0]])[::THINNED]
-        groups[name] = {key: v[k][:, some] for key, v in group.items()} | {"used": np.full((1, len(some)), weight)}
-        o, d = rays(state, data, groups[name])[:2]
-        way = (board[:, 3] - o) @ board[:, 2] / (d @ board[:, 2])
-        points.append((o + way[..., None] * d - board[:, 3]) @ board[:, :3])
+    data = replace(data, middle=data.middle[k], direction=data.direction[k])
+    groups = {}
+    points = []
+    # a whitener of ranges, a number of beams
+    for name, weight in (("face", THINNED**0.5), ("beam", THINNED)):
+        group = getattr(data, name)
+        kept = np.flatnonzero(group["used"][k[0]])[::THINNED]
+        groups[name] = {key: values[k][:, kept] for key, values in group.items()}
+        groups[name]["used"] = np.full((1, len(kept)), weight)
+        origin, ray = rays(state, data, groups[name])[:2]
+        R, t = np.split(state.boards[0], [3], axis=1)
+        normal = R[:, 2]
+        away = (t[:, 0] - origin) @ normal / (ray @ normal)
+        points.append((origin + away[..., None] * ray - t[:, 0]) @ R)
     return replace(data, **groups), state, points
 
 
@@ -124,25 +162,41 @@ def spot_growth(solution):
     obs = solution.observations
     radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
     distance = np.linalg.norm(solution.state.boards[radius.index, :, 3], axis=1)
+    if not len(radius):
+        return np.array([0.0, 0.005])
     if len(radius) < 2 or np.ptp(distance) < 0.1 or np.ptp(radius) < 1e-6:
-        return np.array([0.0, radius.median() if len(radius) else 0.005])
+        return np.array([0.0, radius.median()])
     return np.polyfit(distance, radius, 1)
 
 
 def _views(boards, pitches, solution, models, features):
-    """Poses of the boards in all images, as well known as the recorded ones are beside those from features at 1 px."""
-    obs, parts, corners = solution.observations, [], outline(solution)
-    features = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]) if features is None else features
+    """Poses of the boards in all images, as well known beside 1 px as the recorded ones are."""
+    obs = solution.observations
+    parts = []
+    if features is None:
+        corners = outline(solution)
+        middles = (corners + np.roll(corners, 1, axis=0)) / 2
+        features = np.concatenate([corners, middles])
     for number, (name, mount) in enumerate(zip(solution.transforms, obs.mounts, strict=True)):
+        model = models[name]
         mine = obs.view_camera == number
-        recorded = np.diagonal(obs.view_covariance[mine], axis1=1, axis2=2)
-        expected = np.diagonal(_view_covariance(obs.view_pose[mine], features, models[name]), axis1=1, axis2=2)
-        pixels = np.sqrt(np.median(recorded / expected, axis=0)) if mine.any() else np.ones(6)
-        for pitch in (pitches if mount == "head" else pitches[:, :1]).T:
-            pose = geometry.pose_transform(camera_poses(solution, name, pitch)) * geometry.pose_transform(boards)
-            covariance = _view_covariance(pose.as_matrix(), features, models[name]) * np.outer(pixels, pixels)
-            camera = np.full(len(pitch), number)
-            parts.append({"camera": camera, "pitch": pitch, "pose": pose.as_matrix(), "covariance": covariance})
+        pixels = np.ones(6)
+        if mine.any():
+            expected = _view_covariance(obs.view_pose[mine], features, model)
+            ratio = obs.view_covariance[mine] / expected
+            pixels = np.sqrt(np.median(np.diagonal(ratio, axis1=1, axis2=2), axis=0))
+        images = pitches if mount == "head" else pitches[:, :1]
+        for pitch in images.T:
+            T_camera_platform = geometry.pose_transform(camera_poses(solution, name, pitch))
+            pose = (T_camera_platform * geometry.pose_transform(boards)).as_matrix()
+            covariance = _view_covariance(pose, features, model)
+            part = {
+                "camera": np.full(len(pitch), number),
+                "pitch": pitch,
+                "pose": pose,
+                "covariance": covariance * np.outer(pixels, pixels),
+            }
+            parts.append(part)
     if not parts:
         return {key: value[: len(boards)] for key, value in solution.data.view.items()}
     group = {key: np.stack([part[key] for part in parts], axis=1) for key in parts[0]}
@@ -153,45 +207,65 @@ def _views(boards, pitches, solution, models, features):
 def candidate_information(boards, pitches, solution, models, features=None):
     """Information that each candidate would add about the shared unknowns, shape (n, c, c).
 
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. A candidate shows what the
-    typical placement of the recording showed, points of the face and beams about the edges, from where it stands: spots
-    grow with the distance, and beams get fewer the smaller the board looks. Cameras see `features` of it (k, 3), those
-    of its outline when left out. Its own pose and sweep are eliminated; at the noise levels of the solution.
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. A candidate
+    shows what the typical placement of the recording showed, points of the face and beams about the
+    edges, from where it stands: spots grow with the distance, and beams get fewer the smaller the
+    board looks. Cameras see `features` of it (k, 3), those of its outline when left out. Its own
+    pose and sweep are eliminated; at the noise levels of the solution.
     """
-    (data, home, (face, beam)), n = typical_placement(solution), len(boards)
-    line, middle = data.lines[data.beam["edge"]], outline(solution).mean(axis=0, keepdims=True)
-    (_, distance, size), (pitch, away, seen) = (_as_seen(b, middle, solution.T_head_lrf) for b in (home.boards, boards))
+    data, home, (face_points, beam_points) = typical_placement(solution)
+    n = len(boards)
+    middle = outline(solution).mean(axis=0, keepdims=True)
+    _, distance, size = _as_seen(home.boards, middle, solution.T_head_lrf)
+    pitch, away, seen = _as_seen(boards, middle, solution.T_head_lrf)
     spot = spot_growth(solution)
-    grown, off = np.polyval(spot, away) / np.polyval(spot, distance), np.sum((beam + [0, 0, 1.0]) * line, axis=-1)
-    most = np.sqrt(max(solution.data.face["used"].sum(axis=1).max(), 1) / max(THINNED * face.shape[1], 1))
-    factors = {"radius": grown, "step": away / distance, "used": np.minimum(seen / size, most)}
-    moved = beam + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
-    groups = {name: _beams(getattr(data, name), p, boards, solution) for name, p in (("face", face), ("beam", moved))}
-    groups["beam"] |= {key: groups["beam"][key] * factor for key, factor in factors.items()}
-    groups["face"]["used"] = groups["face"]["used"] * factors["used"]
-    groups["view"] = _views(boards, pitches, solution, models, features)
-    state = replace(home, boards=boards, sweeps=np.zeros((n, 2)), sides=np.repeat(home.sides, n, axis=0))
-    data = replace(data, **groups, middle=pitch[:, 0], direction=np.ones(n, int))
-    blocks = named_blocks(state, data, solution.unknowns)
-    hessian = sum(np.swapaxes(J, -1, -2) @ J for J in (whiten(block)[1] for block in blocks.values()))
+    grown = np.polyval(spot, away) / np.polyval(spot, distance)
+    # beams stay as many spots off the edge as they were
+    line = data.lines[data.beam["edge"]]
+    off = np.sum((beam_points + [0, 0, 1.0]) * line, axis=-1)
+    moved = beam_points + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
+    # as many more of them as the board looks larger, at most as many as a placement has
+    recorded = max(solution.data.face["used"].sum(axis=1).max(), 1)
+    most = np.sqrt(recorded / max(THINNED * face_points.shape[1], 1))
+    more = np.minimum(seen / size, most)
+    face = _beams(data.face, face_points, boards, solution)
+    beam = _beams(data.beam, moved, boards, solution)
+    view = _views(boards, pitches, solution, models, features)
+    face["used"] = face["used"] * more
+    beam["used"] = beam["used"] * more
+    beam["radius"] = beam["radius"] * grown
+    beam["step"] = beam["step"] * (away / distance)
+    sides = np.repeat(home.sides, n, axis=0)
+    state = replace(home, boards=boards, sweeps=np.zeros((n, 2)), sides=sides)
+    data = replace(data, face=face, beam=beam, view=view)
+    data = replace(data, middle=pitch[:, 0], direction=np.ones(n, int))
+    hessian = 0.0
+    for block in named_blocks(state, data, solution.unknowns).values():
+        J = whiten(block)[1]
+        hessian = hessian + np.swapaxes(J, -1, -2) @ J
     return reduced_hessian(hessian, solution.unknowns.shared) / solution.solution.inflation
 
 
 def _as_seen(boards, middle, T_head_lrf):
-    """Pitch and range of beams to the middle (1, 3) of boards (n, 3, 4), and how wide a board looks, shapes (n, 1)."""
+    """Pitch and range (n, 1) of beams to the middle (1, 3) of boards (n, 3, 4), and their size."""
     points = geometry.apply_pose(boards, middle)
     _, pitch, away = beams_to(points, T_head_lrf)
-    cosine = np.abs(np.vecdot(points - T_head_lrf.translation, boards[:, None, :, 2])) / away
+    sight = points - T_head_lrf.translation
+    cosine = np.abs(np.vecdot(sight, boards[:, None, :, 2])) / away
     return pitch, away, np.sqrt(cosine) / away
 
 
 def _beams(group, points, boards, solution):
     """The beams of a group to points (k, 3) of other boards (n, 3, 4)."""
     bearing, pitch, distance = beams_to(geometry.apply_pose(boards, points), solution.T_head_lrf)
-    recorded = pitch / (1 + solution.sensor["pitch_scale"])
-    every = {key: np.broadcast_to(value, (len(boards), *value.shape[1:])) for key, value in group.items()}
-    ray = geometry.polar_to_points(1.0, bearing)
-    return every | {"bearing": bearing, "pitch": recorded, "range": distance, "ray": ray}
+    out = {}
+    for key, value in group.items():
+        out[key] = np.broadcast_to(value, (len(boards), *value.shape[1:]))
+    out["bearing"] = bearing
+    out["pitch"] = pitch / (1 + solution.sensor["pitch_scale"])  # as recorded
+    out["range"] = distance
+    out["ray"] = geometry.polar_to_points(1.0, bearing)
+    return out
 
 
 @dataclass(frozen=True)
@@ -210,41 +284,69 @@ def scales_of(solution, names):
     radii = solution.observations.beam_radius
     radius = np.median(radii) if len(radii) else 0.01
     turns = (*AXIS_NAMES[:2], "pitch_scale", "pitch_by_direction")
-    plain = {name: 1 / RADIUS if name in turns or name[-3:] in ("_rx", "_ry", "_rz") else 1.0 for name in names}
-    return np.array([(plain | {"edge_log_odds": 2.0 / radius})[name] for name in names])
+    scales = np.ones(len(names))
+    for i, name in enumerate(names):
+        if name == "edge_log_odds":
+            scales[i] = 2.0 / radius
+        elif name in turns or name.endswith(("_rx", "_ry", "_rz")):
+            scales[i] = 1 / RADIUS
+    return scales
 
 
 def observability(solution):
-    """Directions of the scaled information of a JointSolution, the least known first: list of Direction.
+    """Directions of the scaled information of a JointSolution, the least known first: list of
+    Direction.
 
     The softness of the edges is eliminated.
     """
     names = np.array(solution.solution.names)
-    index = [i for i, n in enumerate(names) if n != "edge_log_softness"]
+    index = np.flatnonzero(names != "edge_log_softness")
     scales = scales_of(solution, names[index])
     H = marginal(information(solution).sum(axis=0), index) * scales[:, None] * scales
     values, vectors = np.linalg.eigh(H)
-    least, cameras = max(1e-13 * values[-1], UNSEEN**-2), tuple(solution.transforms)
+    least = max(1e-13 * values[-1], UNSEEN**-2)
+    cameras = tuple(solution.transforms)
     sigmas = np.where(values > least, np.maximum(values, least) ** -0.5, np.inf)
-    found = zip(vectors.T, sigmas.tolist(), strict=True)
-    return [Direction(direction_words(x, names[index], cameras), sigma) for x, sigma in found]
+    out = []
+    for vector, sigma in zip(vectors.T, sigmas.tolist(), strict=True):
+        out.append(Direction(direction_words(vector, names[index], cameras), sigma))
+    return out
 
 
 def direction_words(direction, names, cameras):
-    """A direction (k,) of unknowns, scaled to metres at 2 m, in words; what cameras have in common is said once."""
-    value = dict(zip(names, np.asarray(direction) / np.max(np.abs(direction)), strict=True))
+    """A direction (k,) of unknowns, scaled to metres at 2 m, in words.
+
+    What cameras have in common is said once.
+    """
+    relative = np.asarray(direction) / np.max(np.abs(direction))
+    value = dict(zip(names, relative, strict=True))
     words = [(abs(value[name]), what) for name, what in WORDS.items() if name in value]
-    for kind, part in (("rotation about", geometry.POSE_NAMES[:3]), ("shift along", geometry.POSE_NAMES[3:])):
-        found = {f"camera '{c}'": np.array([value[f"{c}_{p}"] for p in part]) for c in cameras}
-        mean = np.mean([*found.values()], axis=0) if found else 0.0
-        if len(found) > 1 and all(np.linalg.norm(v - mean) < 0.3 * np.linalg.norm(mean) for v in found.values()):
-            found = {"all cameras": mean}
-        for who, vector in found.items():
+    kinds = {
+        "rotation about": geometry.POSE_NAMES[:3],
+        "shift along": geometry.POSE_NAMES[3:],
+    }
+    for kind, part in kinds.items():
+        vectors = {}
+        for camera in cameras:
+            vectors[f"camera '{camera}'"] = np.array([value[f"{camera}_{p}"] for p in part])
+        for who, vector in _in_common(vectors).items():
             size = np.linalg.norm(vector)
-            axes = " and ".join(np.array(["x", "y", "z"])[np.abs(vector) > 0.4 * size])
-            words += [(size, f"{kind} {axes} of {who}")] * bool(size)
+            axes = np.array(["x", "y", "z"])[np.abs(vector) > 0.4 * size]
+            if size:
+                words.append((size, f"{kind} {' and '.join(axes)} of {who}"))
     words.sort(key=lambda pair: -pair[0])
-    return " with ".join(w for size, w in words[:MOST] if size > LARGE * words[0][0])
+    least = LARGE * words[0][0]
+    return " with ".join(what for size, what in words[:MOST] if size > least)
+
+
+def _in_common(vectors):
+    """Their mean as that of all cameras where the vectors (3,) of several cameras are alike."""
+    if len(vectors) > 1:
+        mean = np.mean([*vectors.values()], axis=0)
+        apart = max(np.linalg.norm(vector - mean) for vector in vectors.values())
+        if apart < 0.3 * np.linalg.norm(mean):
+            return {"all cameras": mean}
+    return vectors
 
 
 @dataclass(frozen=True)
@@ -259,11 +361,11 @@ class Suggestion:
     pitches : ndarray, shape (k,)
         Of the images, radians; None where no camera is on the head.
     before, after : dict of str to float
-        Standard deviation of 'axis' and of each camera, metres at 2 m (root of the sum of the variances of rotation
-        times 2 m and of translation), of the propagated noise.
+        Standard deviation of 'axis' and of each camera, metres at 2 m (root of the sum of the
+        variances of rotation times 2 m and of translation), of the propagated noise.
     gain, median_gain : float
-        By how much the standard deviation of all of them shrinks, a fraction; of all candidates, what a placement
-        chosen blindly brings.
+        By how much the standard deviation of all of them shrinks, a fraction; of all candidates,
+        what a placement chosen blindly brings.
     """
 
     T_platform_board: RigidTransform
@@ -275,27 +377,45 @@ class Suggestion:
     median_gain: float
 
     def words(self):
-        """The pose in words, e.g. ``board 1.5 m ahead, 20 deg to the left, turned 60 deg in its plane, ...``."""
-        place, parts = self.place, [f"board {self.place.distance:.1f} m ahead"]
-        for angle, plus, minus in ((place.bearing, "to the left", "to the right"), (place.elevation, "up", "down")):
+        """The pose in words, e.g.
+
+        ``board 1.5 m ahead, 20 deg to the left, turned 60 deg in its plane, ...``.
+        """
+        place = self.place
+        parts = [f"board {self.place.distance:.1f} m ahead"]
+        right_or_left = "to the left" if place.bearing > 0 else "to the right"
+        down_or_up = "up" if place.elevation > 0 else "down"
+        for angle, way in ((place.bearing, right_or_left), (place.elevation, down_or_up)):
             if round(np.degrees(angle)):
-                parts.append(f"{abs(np.degrees(angle)):.0f} deg {plus if angle > 0 else minus}")
+                parts.append(f"{abs(np.degrees(angle)):.0f} deg {way}")
         if round(np.degrees(place.turn)):
             parts.append(f"turned {np.degrees(place.turn):.0f} deg in its plane")
-        way = {"back": "leaning back", "forward": "leaning forward"}.get(place.towards, f"facing {place.towards} by")
-        words = ", ".join([*parts, f"{way} {np.degrees(place.lean):.0f} deg" if place.towards else "upright"])
+        parts.append(self.lean_words())
+        words = ", ".join(parts)
         if self.pitches is None:
             return words
         *most, last = [f"{np.degrees(p):+.0f}" for p in self.pitches]
         return f"{words}; images at pitch {', '.join(most)} and {last} deg"
 
+    def lean_words(self):
+        """How the board leans."""
+        towards = self.place.towards
+        if not towards:
+            return "upright"
+        way = f"leaning {towards}" if towards in ("back", "forward") else f"facing {towards} by"
+        return f"{way} {np.degrees(self.place.lean):.0f} deg"
+
     def sentence(self):
         """What to record next and what it brings."""
-        pairs = ((name, brief(1000 * sigma), brief(1000 * self.after[name])) for name, sigma in self.before.items())
-        known = [f"{name} {before} to {after} mm" for name, before, after in pairs]
+        known = []
+        for name, sigma in self.before.items():
+            after = brief(1000 * self.after[name])
+            known.append(f"{name} {brief(1000 * sigma)} to {after} mm")
+        gain = f"{100 * self.gain:.0f} % less"
+        blindly = f"a blindly chosen placement: {100 * self.median_gain:.0f} %"
         return (
-            f"Record next: {self.words()}. Predicted standard deviations at 2 m: {', '.join(known)} "
-            f"({100 * self.gain:.0f} % less; a blindly chosen placement: {100 * self.median_gain:.0f} %)."
+            f"Record next: {self.words()}. Predicted standard deviations at 2 m: "
+            f"{', '.join(known)} ({gain}; {blindly})."
         )
 
 
@@ -305,7 +425,9 @@ def brief(value):
 
 
 def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features=None, places=None):
-    """The board pose and pitch angles of images that would make the summed variances of axis and cameras least.
+    """The board pose and pitch angles of images that would make axis and cameras known best.
+
+    Their summed variances are made least.
 
     Parameters
     ----------
@@ -326,33 +448,48 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
     """
     missing = [c for c in solution.transforms if c not in models]
     if missing:
-        raise ValueError(f"camera '{missing[0]}' has no intrinsics: give its CameraModel in `models`")
+        raise ValueError(
+            f"camera '{missing[0]}' has no intrinsics: give its CameraModel in `models`"
+        )
     grid, boards = board_grid(solution, **PLACES | (places or {}))
     rows, pitches = visible(boards, solution, models, field_of_view)
     if len(rows) == 0:
         low, high = np.degrees(PITCH_LIMITS)
         raise geometry.DegenerateGeometry(
-            f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all cameras at a pitch from "
-            f"{low:.0f} to {high:.0f} deg: give other distances, wider limits, or check the calibration"
+            f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
+            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: give other distances, wider "
+            "limits, or check the calibration"
         )
     known = information(solution).sum(axis=0)
     added = candidate_information(boards[rows], pitches, solution, models, features)
-    # what is not observed counts as known to a metre at 2 m, not better, so that it can be compared as well
-    unit = np.multiply.outer(*[scales_of(solution, solution.solution.names)] * 2)
-    covariances = (np.linalg.inv(H * unit + np.eye(len(unit))) * unit for H in (known, known + added))
-    before, after = (group_sigma(C, solution) for C in covariances)
-    total, totals = (np.sqrt(sum(sigma**2 for sigma in groups.values())) for groups in (before, after))
-    best, gains = int(np.argmin(totals)), 1 - totals / total
-    T_platform_board, place = geometry.pose_transform(boards[rows[best]]), grid.iloc[rows[best]]
+    # what is not observed counts as known to a metre at 2 m, not better, so that it can be compared
+    # as well
+    scales = scales_of(solution, solution.solution.names)
+    unit = np.outer(scales, scales)
+    prior = np.eye(len(unit))
+    before = group_sigma(np.linalg.inv(known * unit + prior) * unit, solution)
+    after = group_sigma(np.linalg.inv((known + added) * unit + prior) * unit, solution)
+    total = np.sqrt(sum(sigma**2 for sigma in before.values()))
+    totals = np.sqrt(sum(sigma**2 for sigma in after.values()))
+    best = int(np.argmin(totals))
+    gains = 1 - totals / total
+    T_platform_board = geometry.pose_transform(boards[rows[best]])
+    place = grid.iloc[rows[best]]
     pitches = pitches[best] if "head" in solution.observations.mounts else None
     after = {name: sigma[best] for name, sigma in after.items()}
-    return Suggestion(T_platform_board, place, pitches, before, after, gains[best], np.median(gains))
+    return Suggestion(
+        T_platform_board, place, pitches, before, after, gains[best], np.median(gains)
+    )
 
 
 def group_sigma(covariance, solution):
-    """Standard deviations of the axis and of each camera, metres at 2 m, from covariances (..., c, c)."""
+    """Standard deviations of axis and cameras, metres at 2 m, from covariances (..., c, c)."""
     names = np.array(solution.solution.names)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution, names) ** 2
     groups = {"axis": np.isin(names, AXIS_NAMES)}
     groups |= {camera: np.char.startswith(names, f"{camera}_") for camera in solution.transforms}
-    return {name: np.sqrt(variance[..., rows].sum(axis=-1)) for name, rows in groups.items() if rows.any()}
+    return {
+        name: np.sqrt(variance[..., rows].sum(axis=-1))
+        for name, rows in groups.items()
+        if rows.any()
+    }

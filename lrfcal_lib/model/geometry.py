@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+# axes of a camera that looks ahead of the LRF, and of an upright board with its print towards it
+AHEAD = Rotation.from_matrix([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
 
 class DegenerateGeometry(ValueError):
     """The data do not determine what was asked for; the message names the motion that stays

@@ -13,7 +13,9 @@ ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covar
 
 
 def check_finite(record, whose="", missing=()):
-    """Refuse a record with a NaN or an infinity in an array (those named in `missing` may have them)."""
+    """Refuse a record with a NaN or an infinity in an array (those named in `missing` may have
+    them).
+    """
     for name, value in vars(record).items():
         if name not in missing and isinstance(value, np.ndarray) and value.dtype.kind == "f":
             bad = ~np.isfinite(value)
@@ -26,7 +28,8 @@ def check_finite(record, whose="", missing=()):
 
 
 def rows(*shape, of, each=0.0):
-    """A field of arrays with a row for each member of a group: `each` row is this by default, None: its number.
+    """A field of arrays with a row for each member of a group: `each` row is this by default, None:
+    its number.
 
     Of groups of which nothing is given there are no rows.
     """
@@ -47,7 +50,11 @@ class _Groups:
 
     def group(self, name):
         """Fields of one group of observations: dict of arrays without the group's prefix."""
-        return {f.name[len(name) + 1 :]: getattr(self, f.name) for f in fields(self) if f.name.startswith(name + "_")}
+        return {
+            f.name[len(name) + 1 :]: getattr(self, f.name)
+            for f in fields(self)
+            if f.name.startswith(name + "_")
+        }
 
     def keep(self, **masks):
         """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
@@ -61,9 +68,10 @@ class _Groups:
 class CameraObservations(_Groups):
     """Paired observations of the board by the LRF and one camera, stacked over all placements.
 
-    Points are in the *source* frame, the frame the camera is fixed to as seen from the LRF: ``platform`` for a camera
-    on the base, ``lrf`` (at the pitch of the image) for a camera on the head. What a method estimates is
-    ``T_camera_source``. What is not given is empty or has a default; many trials at once have a leading axis.
+    Points are in the *source* frame, the frame the camera is fixed to as seen from the LRF:
+    ``platform`` for a camera on the base, ``lrf`` (at the pitch of the image) for a camera on the
+    head. What a method estimates is ``T_camera_source``. What is not given is empty or has a
+    default; many trials at once have a leading axis.
 
     Attributes
     ----------
@@ -75,22 +83,24 @@ class CameraObservations(_Groups):
     crossing_covariance : ndarray, shape (n, 3, 3)
         A centimetre every way by default, as of the other points.
     crossing_lines : ndarray, shape (n, 3)
-        The image line of that edge (ab and ac), undistorted pixels, unit normal pointing out of the board.
+        The image line of that edge (ab and ac), undistorted pixels, unit normal pointing out of the
+        board.
     crossing_line_sigma : ndarray, shape (n,)
         Standard deviation of the image line at the crossing, pixels; 0.5 by default.
     crossing_placement, crossing_edge : ndarray of int and of str, shape (n,)
         Every row has a placement of its own by default, as of the other groups.
     crossing_pitch, plane_pitch : ndarray, shapes (n,), (m,)
-        Recorded pitch of the points, radians; only its errors (:mod:`lrfcal_lib.solvers.pitch`) need it.
+        Recorded pitch of the points, radians; only its errors (:mod:`lrfcal_lib.solvers.pitch`)
+        need it.
     crossing_across : ndarray of bool, shape (n,)
-        Where the edge was found across the scan lines (the sweep enters or leaves the board there): its place hangs on
-        the recorded pitch. The paper uses none of these.
+        Where the edge was found across the scan lines (the sweep enters or leaves the board there):
+        its place hangs on the recorded pitch. The paper uses none of these.
     crossing_half_step, crossing_noise : ndarray, shapes (n, 3), (n, 3, 3)
-        From halfway between the last beam on the board and the first off it to the latter, metres; the covariance
-        without this spacing of the beams.
+        From halfway between the last beam on the board and the first off it to the latter, metres;
+        the covariance without this spacing of the beams.
     crossing_radius, crossing_background : ndarray, shape (n,)
-        Of the beam's spot there, metres (5 mm by default), and what the background adds to the log odds at which a
-        reading flips from the board to it (see :mod:`lrfcal_lib.fit.residuals`).
+        Of the beam's spot there, metres (5 mm by default), and what the background adds to the log
+        odds at which a reading flips from the board to it (see :mod:`lrfcal_lib.fit.residuals`).
     plane_points, plane_covariance, plane_placement : ndarray, shapes (m, 3), (m, 3, 3), (m,)
         Points on the face of the board, metres.
     placements : ndarray of int, shape (p,)
@@ -100,8 +110,8 @@ class CameraObservations(_Groups):
     board_covariance : ndarray, shape (p, 6, 6)
         Of ``[w, v]`` of the poses (see :mod:`lrfcal_lib`); zeros (exact) by default.
     pattern_points, pattern_pixels : ndarray, shapes (k, 3), (p, k, 2)
-        Corners of the printed pattern in the board frame, metres (k = 0 without a pattern), and their recorded pixels,
-        NaN where not seen.
+        Corners of the printed pattern in the board frame, metres (k = 0 without a pattern), and
+        their recorded pixels, NaN where not seen.
     pattern_sigma_px : float
         Standard deviation of one coordinate of a pattern corner.
     scene_points, scene_covariance : ndarray, shapes (q, 3) and (q, 3, 3)
@@ -116,22 +126,19 @@ class CameraObservations(_Groups):
 
     Examples
     --------
-    Six points on edges of a board, and the lines of these edges in the image of a camera 10 cm to the right:
+    Six points on edges of a board, and the lines of these edges in the image of a camera 10 cm to
+    the right:
 
-    >>> import numpy as np
-    >>> from lrfcal_lib.model.camera import CameraModel, line_through
-    >>> from lrfcal_lib.model.observations import CameraObservations
-    >>> from lrfcal_lib.solvers import solve_camera
-    >>> model = CameraModel(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-    >>> ahead = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # R of T_camera_lrf: x right, z where the LRF's y is
-    >>> points = np.array([[-1, 3, 0], [-0.6, 2, 0], [-0.1, 3, 0], [0.2, 2, 0], [0.7, 3, 0], [0.5, 2, 0.0]])
-    >>> seen = points @ ahead.T - [0.1, 0, 0]
-    >>> pixels = seen[:, :2] / seen[:, 2:] * 500.0 + [320.0, 240.0]
-    >>> turn = np.radians([80, 100, 35, 145, 60, 120])  # of the edges in the image
-    >>> lines = line_through(pixels, pixels + np.stack([np.cos(turn), np.sin(turn)], axis=1))
-    >>> obs = CameraObservations(model, crossing_points=points, crossing_lines=lines)
-    >>> np.allclose(solve_camera(obs, "line").transform.translation, [-0.1, 0, 0])
-    True
+    >>> import numpy as np >>> from lrfcal_lib.model.camera import CameraModel, line_through >>>
+    from lrfcal_lib.model.observations import CameraObservations >>> from lrfcal_lib.solvers import
+    solve_camera >>> model = CameraModel(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0) >>> ahead
+    = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # R of T_camera_lrf: x right, z where the
+    LRF's y is >>> points = np.array([[-1, 3, 0], [-0.6, 2, 0], [-0.1, 3, 0], [0.2, 2, 0], [0.7, 3,
+    0], [0.5, 2, 0.0]]) >>> seen = points @ ahead.T - [0.1, 0, 0] >>> pixels = seen[:, :2] / seen[:,
+    2:] * 500.0 + [320.0, 240.0] >>> turn = np.radians([80, 100, 35, 145, 60, 120])  # of the edges
+    in the image >>> lines = line_through(pixels, pixels + np.stack([np.cos(turn), np.sin(turn)],
+    axis=1)) >>> obs = CameraObservations(model, crossing_points=points, crossing_lines=lines) >>>
+    np.allclose(solve_camera(obs, "line").transform.translation, [-0.1, 0, 0]) True
     """
 
     model: CameraModel
@@ -166,7 +173,10 @@ class CameraObservations(_Groups):
     scene_placement: np.ndarray = rows(of="scene", each=None)
 
     def __post_init__(self):
-        points = {group: getattr(self, f"{group}_points") for group in ("crossing", "plane", "pattern", "scene")}
+        points = {
+            group: getattr(self, f"{group}_points")
+            for group in ("crossing", "plane", "pattern", "scene")
+        }
         counts = {group: 0 if p is None else p.shape[-2] for group, p in points.items()}
         self.fill(board=0 if self.board_poses is None else self.board_poses.shape[-3], **counts)
         if self.pattern_pixels is None:
@@ -177,11 +187,18 @@ class CameraObservations(_Groups):
     @property
     def all_placements(self):
         """Every placement that contributes anything, sorted."""
-        parts = (self.crossing_placement, self.plane_placement, self.placements, self.scene_placement)
+        parts = (
+            self.crossing_placement,
+            self.plane_placement,
+            self.placements,
+            self.scene_placement,
+        )
         return np.unique(np.concatenate(parts))
 
     def require(self, kind, least):
-        """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for what they leave open."""
+        """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for
+        what they leave open.
+        """
         found = self.scene_placement if kind == "scene" else self.crossing_placement
         if kind == "plane":
             found = np.intersect1d(self.placements, self.plane_placement)
@@ -204,9 +221,16 @@ class CameraObservations(_Groups):
         """The observations of some placements (numbers) only."""
         wanted = list(placements)
         groups = ("crossing", "plane", "scene")
-        out = self.keep(**{group: np.isin(getattr(self, f"{group}_placement"), wanted) for group in groups})
-        known, boards = np.isin(self.placements, wanted), ("board_poses", "board_covariance", "pattern_pixels")
-        return replace(out, placements=self.placements[known], **{name: getattr(self, name)[known] for name in boards})
+        out = self.keep(
+            **{group: np.isin(getattr(self, f"{group}_placement"), wanted) for group in groups}
+        )
+        known = np.isin(self.placements, wanted)
+        boards = ("board_poses", "board_covariance", "pattern_pixels")
+        return replace(
+            out,
+            placements=self.placements[known],
+            **{name: getattr(self, name)[known] for name in boards},
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +264,9 @@ class PlatformObservations(_Groups):
         check_finite(self)
         if not np.isin(self.edge_number, (1, 2)).all():
             found = np.unique(self.edge_number)
-            raise ValueError(f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}")
+            raise ValueError(
+                f"edge_number must be 1 or 2 (the two perpendicular edges), got {found}"
+            )
 
 
 GROUPS = ("face", "beam", "view")
@@ -250,7 +276,8 @@ GROUPS = ("face", "beam", "view")
 class JointObservations(_Groups):
     """Ranges on boards, beams about their edges and board poses in images, of all placements.
 
-    Every group has an array `<group>_placement` of indices into `placements`. Any group may be empty.
+    Every group has an array `<group>_placement` of indices into `placements`. Any group may be
+    empty.
 
     Attributes
     ----------
@@ -261,17 +288,18 @@ class JointObservations(_Groups):
     middle : ndarray, shape (p,)
         Pitch about which a sweep may be stretched, radians.
     face_range, face_bearing, face_pitch, face_sigma : ndarray, shape (m,)
-        Ranges measured on the board's face (metres), their bearings and recorded pitch (radians), and standard
-        deviations (metres).
+        Ranges measured on the board's face (metres), their bearings and recorded pitch (radians),
+        and standard deviations (metres).
     face_placement : ndarray of int, shape (m,)
     beam_bearing, beam_pitch, beam_hit, beam_edge : ndarray, shape (n,)
         Of beams near an edge: radians, whether the beam read the board, index into `edges`.
     beam_radius, beam_background, beam_step : ndarray, shape (n,)
-        Of the spot at the board, metres; see :mod:`lrfcal_lib.fit.residuals`; distance at the board to the next beam in
-        the direction in which the edge was found, metres.
+        Of the spot at the board, metres; see :mod:`lrfcal_lib.fit.residuals`; distance at the board
+        to the next beam in the direction in which the edge was found, metres.
     beam_placement : ndarray of int, shape (n,)
     view_camera, view_pitch : ndarray, shape (v,)
-        Index into `cameras`, and recorded pitch at the image, radians; only used for cameras on the head.
+        Index into `cameras`, and recorded pitch at the image, radians; only used for cameras on the
+        head.
     view_pose : ndarray, shape (v, 4, 4)
         ``T_camera_board`` from the pattern's corners and the board's edges in the image.
     view_covariance : ndarray, shape (v, 6, 6)
@@ -283,9 +311,11 @@ class JointObservations(_Groups):
     cameras, mounts : tuple of str
         Names, and 'head' or 'platform'.
     T_head_lrf : RigidTransform or None
-        Stated platform: one of the start values, and the rotation about the axis and shift along it that no data show.
+        Stated platform: one of the start values, and the rotation about the axis and shift along it
+        that no data show.
     view_lens : ndarray, shape (v, 6, 9), optional
-        Derivative of the view's pose by the intrinsics; see :mod:`lrfcal_lib.solvers.joint_noise`. Zeros by default.
+        Derivative of the view's pose by the intrinsics; see :mod:`lrfcal_lib.solvers.joint_noise`.
+        Zeros by default.
     lens_covariance : ndarray, shape (c, 9, 9), optional
         Of the intrinsics of every camera. Zeros (exactly known) by default.
     """
@@ -320,12 +350,16 @@ class JointObservations(_Groups):
     lens_covariance: np.ndarray = rows(9, 9, of="camera")
 
     def __post_init__(self):
-        self.fill(view=0 if self.view_pose is None else len(self.view_pose), camera=len(self.cameras))
+        self.fill(
+            view=0 if self.view_pose is None else len(self.view_pose), camera=len(self.cameras)
+        )
         check_finite(self)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")
             if len(place) and not 0 <= place.min() <= place.max() < len(self.placements):
-                raise ValueError(f"{group}_placement are indices below {len(self.placements)}, got up to {place.max()}")
+                raise ValueError(
+                    f"{group}_placement are indices below {len(self.placements)}, got up to {place.max()}"
+                )
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
 
@@ -336,9 +370,18 @@ class JointObservations(_Groups):
     def select(self, placements):
         """The observations of some placements (numbers) only."""
         kept = np.flatnonzero(np.isin(self.placements, list(placements)))
-        out = self.keep(**{name: np.isin(getattr(self, f"{name}_placement"), kept) for name in GROUPS})
-        moved = {f"{name}_placement": np.searchsorted(kept, getattr(out, f"{name}_placement")) for name in GROUPS}
-        return replace(out, **moved, **{key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")})
+        out = self.keep(
+            **{name: np.isin(getattr(self, f"{name}_placement"), kept) for name in GROUPS}
+        )
+        moved = {
+            f"{name}_placement": np.searchsorted(kept, getattr(out, f"{name}_placement"))
+            for name in GROUPS
+        }
+        return replace(
+            out,
+            **moved,
+            **{key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")},
+        )
 
     def with_cameras(self, names):
         """The observations of some cameras only."""
@@ -346,4 +389,6 @@ class JointObservations(_Groups):
         out = self.keep(view=np.isin(self.view_camera, kept))
         chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
         camera = np.searchsorted(kept, out.view_camera)
-        return replace(out, view_camera=camera, lens_covariance=self.lens_covariance[kept], **chosen)
+        return replace(
+            out, view_camera=camera, lens_covariance=self.lens_covariance[kept], **chosen
+        )

@@ -1,4 +1,7 @@
-"""Figures of what was recorded: scans, range images, pictures, edges; and one colour for each sensor."""
+"""Figures of what was recorded: scans, range images, pictures, edges.
+
+And one colour for each sensor.
+"""
 
 import numpy as np
 from matplotlib.patches import Rectangle
@@ -8,9 +11,16 @@ from lrfcal_lib.model.camera import distort
 from lrfcal_lib.model.geometry import polar_to_points
 
 COLORS = {
-    "lrf": "#d55e00", "left": "#0072b2", "right": "#009e73", "fit": "#b5378a", "truth": "#222222", "raw": "#a3a3a3",
-    "filtered": "#e69f00", "outlier": "#cc2222", "platform": "#666666",
-}  # fmt: skip
+    "lrf": "#d55e00",
+    "left": "#0072b2",
+    "right": "#009e73",
+    "fit": "#b5378a",
+    "truth": "#222222",
+    "raw": "#a3a3a3",
+    "filtered": "#e69f00",
+    "outlier": "#cc2222",
+    "platform": "#666666",
+}
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#b5378a", "#e69f00", "#56b4e9", "#7a5c3e", "#222222")
 AXES_RGB = ("#d62728", "#2ca02c", "#1f5fd6")  # x, y, z of every frame
 
@@ -23,29 +33,47 @@ def color_of(name, index=0):
 PLANES = {"xz": (0, 2), "yz": (1, 2), "xy": (0, 1)}
 BESIDE = 14  # beams shown on either side of the end of a board
 ABOUT = 6.0  # degrees shown on either side of a board
-BRIGHT, GAIN = 150, 5.0  # a picture whose brightest hundredth is darker is brightened, by this factor at most
+# a picture whose brightest hundredth is darker is brightened, by this factor at most
+BRIGHT = 150
+GAIN = 5.0
 
 
 def range_image(ax, sweep, mask=None, limits=None):
-    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch; what was drawn.
+    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch; what
+    was drawn.
 
-    With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found to be the board; it
-    is outlined, and bearings far from it are cut off. With `limits` (two ranges, metres) several sweeps share their
-    colours, and the colour bar is left to the caller.
+    With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found
+    to be the board; it is outlined, and bearings far from it are cut off. With `limits` (two
+    ranges, metres) several sweeps share their colours, and the colour bar is left to the caller.
     """
-    moves, bearing, order = np.ptp(sweep.pitch) > 0, np.degrees(sweep.bearings), np.argsort(sweep.pitch, kind="stable")
+    moves = np.ptp(sweep.pitch) > 0
+    bearing = np.degrees(sweep.bearings)
+    order = np.argsort(sweep.pitch, kind="stable")
     height = np.degrees(sweep.pitch) if moves else np.arange(len(sweep.pitch))
-    looks = {"shading": "nearest", "rasterized": True} | dict(zip(("vmin", "vmax"), limits or (), strict=False))
+    looks = {"shading": "nearest", "rasterized": True} | dict(
+        zip(("vmin", "vmax"), limits or (), strict=False)
+    )
     drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], **looks)
     if limits is None:
         ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
     if mask is not None and mask.any() and len(mask) == 1:
         ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
     elif mask is not None and mask.any():
-        ax.contour(bearing, height[order], mask[order].astype(float), levels=[0.5], colors="white", linewidths=1)
-    shown, step = np.isfinite(sweep.ranges).any(axis=0), np.ptp(bearing) / max(len(bearing) - 1, 1)
+        ax.contour(
+            bearing,
+            height[order],
+            mask[order].astype(float),
+            levels=[0.5],
+            colors="white",
+            linewidths=1,
+        )
+    shown = np.isfinite(sweep.ranges).any(axis=0)
+    step = np.ptp(bearing) / max(len(bearing) - 1, 1)
     if mask is not None and mask.any():
-        shown &= np.abs(bearing - bearing[mask.any(axis=0)].mean()) < np.ptp(bearing[mask.any(axis=0)]) / 2 + ABOUT
+        shown &= (
+            np.abs(bearing - bearing[mask.any(axis=0)].mean())
+            < np.ptp(bearing[mask.any(axis=0)]) / 2 + ABOUT
+        )
     if shown.any():
         ax.set_xlim(bearing[shown].max() + step, bearing[shown].min() - step)
     ax.grid(False)
@@ -55,15 +83,21 @@ def range_image(ax, sweep, mask=None, limits=None):
 
 
 def scan_line(ax, sweep, line, mask, fitted=None):
-    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on the board.
+    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on
+    the board.
 
     `fitted` (L, B) are the ranges of a fitted line, see BoardScan.
     """
-    points, on = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2], mask[line]
+    points = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2]
+    on = mask[line]
     ax.plot(*points[~on].T, ".", color=COLORS["raw"], label="scene" if on.any() else "returns")
     ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
     if fitted is not None:
-        ax.plot(*polar_to_points(fitted[line], sweep.bearings)[on, :2].T, color=COLORS["fit"], label="fitted line")
+        ax.plot(
+            *polar_to_points(fitted[line], sweep.bearings)[on, :2].T,
+            color=COLORS["fit"],
+            label="fitted line",
+        )
     ax.plot(0, 0, marker="^", color=COLORS["lrf"], markersize=8, linestyle="none", label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
@@ -76,24 +110,50 @@ def to_scale(ax, x, y):
 
 
 def edge_of_line(ax, scan, line, end=1, edges=()):
-    """Where a scan line of a BoardScan leaves the board: raw, filtered and fitted ranges, after figure 5.
+    """Where a scan line of a BoardScan leaves the board: raw, filtered and fitted ranges, after
+    figure 5.
 
-    `end` is +1 for the end at the larger bearings, -1 for the other one. Crossings of this line and end in `edges` (a
-    sequence of ScanEdges) are drawn as upright lines.
+    `end` is +1 for the end at the larger bearings, -1 for the other one. Crossings of this line and
+    end in `edges` (a sequence of ScanEdges) are drawn as upright lines.
     """
     on = np.flatnonzero(scan.mask[line])
     if on.size == 0:
-        raise ValueError(f"no beam of scan line {line} is on the board of placement {scan.placement}")
-    last, beams = on[-1] if end > 0 else on[0], np.arange(scan.mask.shape[1])
+        raise ValueError(
+            f"no beam of scan line {line} is on the board of placement {scan.placement}"
+        )
+    last = on[-1] if end > 0 else on[0]
+    beams = np.arange(scan.mask.shape[1])
     near = np.abs(beams - last) <= BESIDE
-    bearing, board = np.degrees(scan.sweep.bearings), near & scan.mask[line]
-    ax.plot(bearing[near], scan.sweep.ranges[line, near], "o", color=COLORS["raw"], markersize=5, label="raw")
-    ax.plot(bearing[board], scan.filtered[line, board], "o", color=COLORS["filtered"], markersize=3, label="filtered")
-    ax.plot(bearing[board], scan.fitted[line, board], "-", color=COLORS["fit"], label="line fitted to the board")
+    bearing = np.degrees(scan.sweep.bearings)
+    board = near & scan.mask[line]
+    ax.plot(
+        bearing[near],
+        scan.sweep.ranges[line, near],
+        "o",
+        color=COLORS["raw"],
+        markersize=5,
+        label="raw",
+    )
+    ax.plot(
+        bearing[board],
+        scan.filtered[line, board],
+        "o",
+        color=COLORS["filtered"],
+        markersize=3,
+        label="filtered",
+    )
+    ax.plot(
+        bearing[board],
+        scan.fitted[line, board],
+        "-",
+        color=COLORS["fit"],
+        label="line fitted to the board",
+    )
     for index, found in enumerate(edges):
         for x, y, _ in found.points[(found.line == line) & (found.end == end)]:
             style = ("--", "-", ":")[index % 3]
-            at, label = np.degrees(np.arctan2(y, x)), found.variant.replace("_", " ")
+            at = np.degrees(np.arctan2(y, x))
+            label = found.variant.replace("_", " ")
             ax.axvline(at, color=COLORS["lrf"], linestyle=style, label=label)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="range [m]")
@@ -101,10 +161,19 @@ def edge_of_line(ax, scan, line, end=1, edges=()):
 
 
 def crossings(ax, edges):
-    """Edge crossings (ScanEdges) of a sweep over bearing and pitch, one colour a straight side; side -1 crossed out."""
-    points = np.degrees(np.column_stack([np.arctan2(edges.points[:, 1], edges.points[:, 0]), edges.pitch]))
+    """Edge crossings (ScanEdges) of a sweep over bearing and pitch, one colour a straight side;
+    side -1 crossed out.
+    """
+    points = np.degrees(
+        np.column_stack([np.arctan2(edges.points[:, 1], edges.points[:, 0]), edges.pitch])
+    )
     for index, side in enumerate(np.unique(edges.side[edges.side >= 0])):
-        ax.plot(*points[edges.side == side].T, ".", color=SERIES[index % len(SERIES)], label=f"side {side}")
+        ax.plot(
+            *points[edges.side == side].T,
+            ".",
+            color=SERIES[index % len(SERIES)],
+            label=f"side {side}",
+        )
     if (edges.side < 0).any():
         ax.plot(*points[edges.side < 0].T, "x", color=COLORS["outlier"], label="not used")
     ax.legend()
@@ -141,35 +210,63 @@ def projection(ax, edges, plane, lines=None):
 
 
 def picture(ax, image):
-    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes; a dark one brightened."""
+    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes.
+
+    A dark one brightened.
+    """
     gain = np.clip(BRIGHT / max(np.quantile(image[::4, ::4], 0.99), 1.0), 1.0, GAIN)
-    color = np.clip(gain * image[..., ::-1], 0, 255).astype(np.uint8) if image.ndim == 3 else gain * image
-    ax.imshow(color, cmap=None if image.ndim == 3 else "gray", interpolation="antialiased", vmin=0, vmax=255)
+    color = (
+        np.clip(gain * image[..., ::-1], 0, 255).astype(np.uint8)
+        if image.ndim == 3
+        else gain * image
+    )
+    ax.imshow(
+        color,
+        cmap=None if image.ndim == 3 else "gray",
+        interpolation="antialiased",
+        vmin=0,
+        vmax=255,
+    )
     if gain > 1:
-        looks = {"color": "white", "va": "bottom", "bbox": {"facecolor": "#333333", "edgecolor": "none", "pad": 2}}
+        looks = {
+            "color": "white",
+            "va": "bottom",
+            "bbox": {"facecolor": "#333333", "edgecolor": "none", "pad": 2},
+        }
         ax.text(0.01, 0.015, f"brightened {gain:.1f} times", transform=ax.transAxes, **looks)
     ax.set_axis_off()
 
 
 def board_view(ax, image, view, model, margin=60):
-    """An image with the corners and edges that a BoardView found in it, cut to `margin` pixels around the board.
+    """An image with the corners and edges that a BoardView found in it, cut to `margin` pixels
+    around the board.
 
-    The title names edges that were not used. `model` puts edges, which are kept in undistorted pixels, back through the
-    lens.
+    The title names edges that were not used. `model` puts edges, which are kept in undistorted
+    pixels, back through the lens.
     """
     picture(ax, image)
-    color, drawn = color_of(view.camera), []
+    color = color_of(view.camera)
+    drawn = []
     if view.pixels is not None:
         ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8)
         drawn.append(view.pixels)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2", "alpha": 0.85}
-    looks = {"color": "white", "fontsize": 8, "ha": "center", "va": "center", "bbox": box, "clip_on": True}
+    looks = {
+        "color": "white",
+        "fontsize": 8,
+        "ha": "center",
+        "va": "center",
+        "bbox": box,
+        "clip_on": True,
+    }
     for edge in view.edges:
         drawn.append(stretch_in_image(edge, model))
         ax.plot(*drawn[-1].T, "-", color=color, linewidth=1.6)
         ax.text(*drawn[-1].mean(axis=0), edge.name, **looks)
     lost = ", ".join(name for name, _ in view.rejected)
-    ax.set_title(f"{view.camera}, placement {view.placement}" + (f"; not used: {lost}" if lost else ""))
+    ax.set_title(
+        f"{view.camera}, placement {view.placement}" + (f"; not used: {lost}" if lost else "")
+    )
     _cut(ax, drawn, image, margin)
 
 
@@ -193,56 +290,95 @@ def seen_points(ax, view, image, model, points, margin=60, styles=("o", "x", "s"
     picture(ax, image)
     lines = [stretch_in_image(edge, model) for edge in view.edges]
     for index, stretch in enumerate(lines):
-        ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=None if index else "edge in the image")
+        ax.plot(
+            *stretch.T,
+            "-",
+            color="white",
+            linewidth=1.0,
+            label=None if index else "edge in the image",
+        )
     for index, (method, uv) in enumerate(points.items()):
-        looks = {"color": SERIES[(index + 1) % len(SERIES)], "markersize": 4.5, "markerfacecolor": "none"}
+        looks = {
+            "color": SERIES[(index + 1) % len(SERIES)],
+            "markersize": 4.5,
+            "markerfacecolor": "none",
+        }
         ax.plot(*uv.T, styles[index % len(styles)], label=method, **looks)
-    ax.legend(facecolor="#333333", labelcolor="white", frameon=True, framealpha=0.8, edgecolor="none")
+    ax.legend(
+        facecolor="#333333", labelcolor="white", frameon=True, framealpha=0.8, edgecolor="none"
+    )
     _cut(ax, [*points.values(), *lines], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
 
 
 def stretch_in_image(edge, model, count=61):
-    """An image edge as recorded: its stretch of undistorted pixels seen through the lens, shape (count, 2)."""
+    """An image edge as recorded: its stretch of undistorted pixels seen through the lens, shape
+    (count, 2).
+    """
     uv = np.linspace(*edge.ends, count)
-    focal, centre = np.array([model.fx, model.fy]), np.array([model.cx, model.cy])
+    focal = np.array([model.fx, model.fy])
+    centre = np.array([model.cx, model.cy])
     return distort((uv - centre) / focal, model.distortion) * focal + centre
 
 
 def _cut(ax, drawn, image, margin):
     """Limit the axes to what is drawn in them, and to the image."""
-    points, size = np.concatenate([*drawn, np.zeros((0, 2))]), np.array(image.shape[1::-1])
+    points = np.concatenate([*drawn, np.zeros((0, 2))])
+    size = np.array(image.shape[1::-1])
     points = points[np.isfinite(points).all(axis=1)]
-    box = [points.min(axis=0) - margin, points.max(axis=0) + margin] if len(points) else [[-0.5, -0.5], size]
+    box = (
+        [points.min(axis=0) - margin, points.max(axis=0) + margin]
+        if len(points)
+        else [[-0.5, -0.5], size]
+    )
     (left, top), (right, bottom) = np.clip(box, -0.5, size - 0.5)
     ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def board_plan(ax, board):
     """A Board with its sizes, corners A, B, ... and printed squares, in its own frame."""
-    corners, turn = board.known_corners(), outline_lines(board.known_corners())[:, :2]
+    corners = board.known_corners()
+    turn = outline_lines(board.known_corners())[:, :2]
     ax.fill(*corners.T, color="#333333", linewidth=0)
     if board.pattern is not None:
-        size, start = board.pattern.square, np.subtract(board.pattern.origin, board.pattern.square)
+        size = board.pattern.square
+        start = np.subtract(board.pattern.origin, board.pattern.square)
         for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
             if (row + column) % 2:
-                ax.add_patch(Rectangle(start + size * np.array([column, row]), size, size, color="white", linewidth=0))
+                ax.add_patch(
+                    Rectangle(
+                        start + size * np.array([column, row]),
+                        size,
+                        size,
+                        color="white",
+                        linewidth=0,
+                    )
+                )
     for index, (name, length) in enumerate(board.lengths().items()):
         ends = corners[[index, (index + 1) % len(corners)]]
-        at, angle = ends.mean(axis=0) + 0.03 * turn[index], np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1]))
-        looks = {"ha": "center", "va": "center", "rotation": (angle + 90) % 180 - 90, "rotation_mode": "anchor"}
+        at = ends.mean(axis=0) + 0.03 * turn[index]
+        angle = np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1]))
+        looks = {
+            "ha": "center",
+            "va": "center",
+            "rotation": (angle + 90) % 180 - 90,
+            "rotation_mode": "anchor",
+        }
         ax.text(*at, f"{name.upper()} {1000 * length:.1f} mm", **looks)
     ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
     to_scale(ax, "x [m]", "y [m]")
 
 
 def outline(ax, measured, exaggerate=20):
-    """The measured Outline of the board with the spread of each edge over the images, `exaggerate` times larger."""
+    """The measured Outline of the board with the spread of each edge over the images,
+    `exaggerate` times larger.
+    """
     corners = measured.board.known_corners()
     closed = np.vstack([corners, corners[:1]])
     ax.plot(*closed.T, "-", color=COLORS["truth"])
     for index, (name, length) in enumerate(measured.board.lengths().items()):
-        ends, normal = closed[index : index + 2], measured.lines[index, :2]
+        ends = closed[index : index + 2]
+        normal = measured.lines[index, :2]
         if np.isfinite(measured.line_sd[index]):
             away = exaggerate * measured.line_sd[index] * normal
             band = np.vstack([ends - away, ends[::-1] + away])

@@ -6,7 +6,8 @@ import numpy as np
 
 from lrfcal_lib.plots.recording import COLORS, SERIES, color_of
 
-BINS, LEVELS = 8, 5
+BINS = 8
+LEVELS = 5
 LEAST_HEIGHT = 20.0  # degrees of a map: that of a head which hardly moves would be a line
 SPREAD = {"capsize": 2, "error_kw": {"linewidth": 0.9, "ecolor": COLORS["truth"]}}  # of bars
 
@@ -19,12 +20,24 @@ def by_placement(ax, names, label):
 
 
 def residual_strips(ax, residuals, placement, label, color):
-    """Residuals (n,) by placement (n,), with their root mean square as a bar; `label` is the quantity with its unit."""
+    """Residuals (n,) by placement (n,), with their root mean square as a bar.
+
+    `label` is the quantity with its unit.
+    """
     names, column, count = np.unique(placement, return_inverse=True, return_counts=True)
     within = np.argsort(np.argsort(column, kind="stable")) - (np.cumsum(count) - count)[column]
     spread = (within + 0.5) / count[column] - 0.5
     rms = np.sqrt(np.bincount(column, np.square(residuals)) / count)
-    ax.bar(np.arange(len(names)), 2 * rms, bottom=-rms, width=0.8, color=color, alpha=0.2, linewidth=0, label="rms")
+    ax.bar(
+        np.arange(len(names)),
+        2 * rms,
+        bottom=-rms,
+        width=0.8,
+        color=color,
+        alpha=0.2,
+        linewidth=0,
+        label="rms",
+    )
     ax.plot(column + 0.6 * spread, residuals, ".", color=color, markersize=2.5)
     by_placement(ax, names, label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
@@ -32,27 +45,49 @@ def residual_strips(ax, residuals, placement, label, color):
 
 
 def pitch_offsets(ax, placement, offset, sigma, direction):
-    """Pitch offset of each sweep and its sigma (radians), coloured by the direction of the head: +1 (up), -1 or 0."""
-    offset, sigma = np.degrees(offset), np.degrees(sigma)
-    for sign, color, label in ((1, SERIES[0], "upwards"), (-1, SERIES[1], "downwards"), (0, COLORS["raw"], "unknown")):
+    """Pitch offset of each sweep and its sigma (radians), coloured by the direction of the
+    head: +1 (up), -1 or 0.
+    """
+    offset = np.degrees(offset)
+    sigma = np.degrees(sigma)
+    for sign, color, label in (
+        (1, SERIES[0], "upwards"),
+        (-1, SERIES[1], "downwards"),
+        (0, COLORS["raw"], "unknown"),
+    ):
         rows = np.flatnonzero(np.equal(direction, sign))
         if rows.size:
-            ax.bar(rows, offset[rows], yerr=sigma[rows], color=color, width=0.75, label=label, **SPREAD)
+            ax.bar(
+                rows, offset[rows], yerr=sigma[rows], color=color, width=0.75, label=label, **SPREAD
+            )
             ax.axhline(np.median(offset[rows]), color=color, linestyle=":", linewidth=1)
     by_placement(ax, placement, "pitch offset [deg]")
-    ax.legend(title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
+    ax.legend(
+        title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2
+    )
 
 
 def parameter_comparison(ax, values, sigmas, label):
-    """One parameter as each method finds it, with one-sigma bars (none for NaN): values and sigmas by method."""
+    """One parameter as each method finds it, with one-sigma bars (none for NaN): values and
+    sigmas by method.
+    """
     for row, (method, value) in enumerate(values.items()):
         looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
-        ax.errorbar(value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks)
-    ax.set(yticks=np.arange(len(values)), yticklabels=list(values), xlabel=label, ylim=(len(values) - 0.5, -0.5))
+        ax.errorbar(
+            value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks
+        )
+    ax.set(
+        yticks=np.arange(len(values)),
+        yticklabels=list(values),
+        xlabel=label,
+        ylim=(len(values) - 0.5, -0.5),
+    )
 
 
 def edge_errors(ax, errors):
-    """Errors of edge lengths (measured minus true, mm) by rule or method, one dot an edge, the mean as a bar."""
+    """Errors of edge lengths (measured minus true, mm) by rule or method, one dot an edge, the
+    mean as a bar.
+    """
     for row, values in enumerate(errors.values()):
         spread = (np.arange(len(values)) + 0.5) / max(len(values), 1) - 0.5
         color = SERIES[row % len(SERIES)]
@@ -65,23 +100,33 @@ def edge_errors(ax, errors):
 
 
 def method_bars(ax, table, column, label):
-    """One column of a :func:`lrfcal_lib.evaluate.tables.method_comparison`, a bar for each method and camera."""
-    methods, cameras = list(dict.fromkeys(table.method)), list(dict.fromkeys(table.camera))
-    height, rows = 0.8 / len(cameras), np.arange(len(methods))
+    """One column of a :func:`lrfcal_lib.evaluate.tables.method_comparison`, a bar for each
+    method and camera.
+    """
+    methods = list(dict.fromkeys(table.method))
+    cameras = list(dict.fromkeys(table.camera))
+    height = 0.8 / len(cameras)
+    rows = np.arange(len(methods))
     for i, camera in enumerate(cameras):
         part = table[table.camera == camera].set_index("method")[column].reindex(methods)
-        ax.barh(rows + i * height, part, height=0.95 * height, color=color_of(camera, i), label=camera)
+        ax.barh(
+            rows + i * height, part, height=0.95 * height, color=color_of(camera, i), label=camera
+        )
     ticks = rows + height * (len(cameras) - 1) / 2
-    ax.set(yticks=ticks, yticklabels=methods, xlabel=label, ylim=(len(methods) - 0.5 * height, -height))
+    ax.set(
+        yticks=ticks, yticklabels=methods, xlabel=label, ylim=(len(methods) - 0.5 * height, -height)
+    )
     best = table.groupby("method", sort=False)[column].mean()
     ax.set_title(f"least: {best.idxmin()}" if best.notna().any() else "no method could be judged")
     ax.legend()
 
 
 def projection_map(ax, found, index=0, name=""):
-    """Standard deviation over an image of where points of the LRF project, at one of the distances of a map.
+    """Standard deviation over an image of where points of the LRF project, at one of the distances
+    of a map.
 
-    `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN stay white.
+    `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN
+    stay white.
     """
     _sigma_map(ax, found, index, "px", name)
     ax.invert_yaxis()
@@ -89,22 +134,32 @@ def projection_map(ax, found, index=0, name=""):
 
 
 def point_map(ax, found, index=0):
-    """Standard deviation of reconstructed points over the field of view, a SigmaMap of ``uncertainty.point_sigma``."""
+    """Standard deviation of reconstructed points over the field of view, a SigmaMap of
+    ``uncertainty.point_sigma``.
+    """
     _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
-    middle, height = np.mean(ax.get_ylim()), max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
+    middle = np.mean(ax.get_ylim())
+    height = max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
     ax.set_ylim(middle - height / 2, middle + height / 2)
     ax.invert_xaxis()
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]")
 
 
 def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
-    """Colours and labelled lines of equal standard deviation; `angle` and `scale` are factors to the units shown."""
-    at, good = (angle * found.columns, angle * found.rows), np.ma.masked_invalid(scale * found.sigma[index])
-    shading, top = "nearest" if good.count() < good.size else "gouraud", good.max() if good.count() else 1.0
+    """Colours and labelled lines of equal standard deviation.
+
+    `angle` and `scale` are factors to the units shown.
+    """
+    at = (angle * found.columns, angle * found.rows)
+    good = np.ma.masked_invalid(scale * found.sigma[index])
+    shading = "nearest" if good.count() < good.size else "gouraud"
+    top = good.max() if good.count() else 1.0
     mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
     ax.grid(False)
     if good.count() and good.max() > 1.05 * good.min():
-        ax.clabel(ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize=8, fmt="%.3g")
+        ax.clabel(
+            ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize=8, fmt="%.3g"
+        )
     ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8, format="%.3g")
     ax.set_aspect("equal")
     rms = scale * found.rms()[index]
@@ -113,30 +168,53 @@ def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
 
 
 def point_parts(ax, found):
-    """What axis, range offset and pitch add to the error of a point, by distance; SigmaMap of ``point_sigma``."""
-    rows = {k: np.sqrt(np.mean(v**2, axis=(1, 2))) for k, v in found.parts.items()} | {"calibration": found.rms()}
+    """What axis, range offset and pitch add to the error of a point, by distance.
+
+    SigmaMap of ``point_sigma``.
+    """
+    rows = {k: np.sqrt(np.mean(v**2, axis=(1, 2))) for k, v in found.parts.items()} | {
+        "calibration": found.rms()
+    }
     rows = {name: value for name, value in rows.items() if np.any(value > 0)}
     for index, (name, value) in enumerate(rows.items()):
         style = {"range noise": ":", "calibration": "-"}.get(name, "--")
         color = COLORS["truth"] if name == "calibration" else SERIES[index % len(SERIES)]
-        ax.plot(found.distances, 1000 * value, style, marker="o", markersize=3.5, color=color, label=name)
-    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, 1.35 * ax.get_ylim()[1]))
+        ax.plot(
+            found.distances,
+            1000 * value,
+            style,
+            marker="o",
+            markersize=3.5,
+            color=color,
+            label=name,
+        )
+    ax.set(
+        xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, 1.35 * ax.get_ylim()[1])
+    )
     ax.set_title(f"calibration: {1000 * found.rms()[-1]:.2g} mm at {found.distances[-1]:g} m")
     ax.legend(ncols=2, loc="upper left")
 
 
 def observability_bars(ax, directions):
     """The six least known combinations of unknowns, in words (``next_placement.observability``)."""
-    shown, sigma = directions[:6], 1000 * np.array([d.sigma for d in directions[:6]])
+    shown = directions[:6]
+    sigma = 1000 * np.array([d.sigma for d in directions[:6]])
     known = np.isfinite(sigma)
-    longest, colors = 1.15 * sigma[known].max(initial=0.0) or 1.0, np.where(known, COLORS["fit"], COLORS["outlier"])
+    longest = 1.15 * sigma[known].max(initial=0.0) or 1.0
+    colors = np.where(known, COLORS["fit"], COLORS["outlier"])
     ax.barh(np.arange(len(shown)), np.where(known, sigma, longest), color=colors, height=0.6)
     for row, s in enumerate(sigma):
-        text, at, color = (f" {s:.2g} mm", s, "black") if known[row] else (" not determined", 0.0, "white")
+        text, at, color = (
+            (f" {s:.2g} mm", s, "black") if known[row] else (" not determined", 0.0, "white")
+        )
         ax.text(at, row, text, va="center", ha="left", color=color)
     lost = f"{(~known).sum()} motions are not determined"
     ax.set_title(f"least known: {sigma[0]:.2g} mm at 2 m" if known.all() else lost)
-    ax.set(ylim=(len(shown) - 0.5, -0.5), xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
+    ax.set(
+        ylim=(len(shown) - 0.5, -0.5),
+        xlim=(0, 1.12 * longest),
+        xlabel="standard deviation at 2 m [mm]",
+    )
     ax.set_yticks(np.arange(len(shown)), [textwrap.fill(d.words, 64) for d in shown], fontsize=8)
     ax.grid(False, axis="y")
 
@@ -146,9 +224,15 @@ def misfit_bars(ax, misfit, limit=4.0):
 
     Placements above `limit` times the median are drawn as outliers.
     """
-    values, every = np.array(list(misfit.values())), 1 if len(misfit) < 16 else 2
+    values = np.array(list(misfit.values()))
+    every = 1 if len(misfit) < 16 else 2
     bad = values > limit * max(np.median(values), 1.0)
-    ax.bar(np.arange(len(values)), values, color=np.where(bad, COLORS["outlier"], COLORS["lrf"]), width=0.75)
+    ax.bar(
+        np.arange(len(values)),
+        values,
+        color=np.where(bad, COLORS["outlier"], COLORS["lrf"]),
+        width=0.75,
+    )
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     ax.set_xticks(np.arange(len(values))[::every], list(misfit)[::every])
@@ -158,31 +242,50 @@ def misfit_bars(ax, misfit, limit=4.0):
 
 
 def residuals_by_range(ax, distance, residual):
-    """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in bins.
+    """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in
+    bins.
 
-    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.tables.range_residuals`.
+    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.joint_tables.range_residuals`.
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
     limits = np.unique(np.quantile(distance, np.linspace(0, 1, BINS + 1)))
     which = np.clip(np.searchsorted(limits, distance, side="right") - 1, 0, max(len(limits) - 2, 0))
     bins = [which == i for i in np.unique(which)]
-    means = [(distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins]
+    means = [
+        (distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins
+    ]
     x, y, error = np.transpose(means)
-    ax.errorbar(x, y, yerr=error, fmt="o-", color=COLORS["lrf"], capsize=2.5, label="mean and its standard error")
+    ax.errorbar(
+        x,
+        y,
+        yerr=error,
+        fmt="o-",
+        color=COLORS["lrf"],
+        capsize=2.5,
+        label="mean and its standard error",
+    )
     ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
-    limit, title = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9), f"{np.sqrt(np.mean(residual**2)):.2g} mm rms"
-    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit), title=f"ranges: {title}")
+    limit = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9)
+    title = f"{np.sqrt(np.mean(residual**2)):.2g} mm rms"
+    ax.set(
+        xlabel="range [m]",
+        ylabel="predicted - measured [mm]",
+        ylim=(-limit, limit),
+        title=f"ranges: {title}",
+    )
     ax.legend()
 
 
 def residuals_by_region(ax, uv, shift, model, name):
-    """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the image's width.
+    """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the
+    image's width.
 
-    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.tables.view_residuals`. The camera's name is its
-    colour.
+    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.joint_tables.view_residuals`. The
+    camera's name is its colour.
     """
-    length, title = np.linalg.norm(shift, axis=1), f"{name}: no board in any image"
+    length = np.linalg.norm(shift, axis=1)
+    title = f"{name}: no board in any image"
     if len(uv):
         longest = max(length.max(), 1e-9)
         looks = {"angles": "xy", "scale_units": "xy", "width": 0.005, "color": color_of(name)}
@@ -190,7 +293,9 @@ def residuals_by_region(ax, uv, shift, model, name):
         unit = float(f"{longest / 2:.1g}")
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
-    ax.set(xlim=(0, model.width), ylim=(model.height, 0), xlabel="u [px]", ylabel="v [px]", title=title)
+    ax.set(
+        xlim=(0, model.width), ylim=(model.height, 0), xlabel="u [px]", ylabel="v [px]", title=title
+    )
     ax.set_aspect("equal")
 
 
@@ -201,16 +306,32 @@ def board_bend(ax, bends):
     """
     found = [b for b in bends.placements.values() if np.isfinite(b.size)]
     if not found:
-        raise ValueError(f"no bends to draw: none of {len(bends.placements)} placements shows enough of the board")
+        raise ValueError(
+            f"no bends to draw: none of {len(bends.placements)} placements shows enough of the board"
+        )
     values = 1000 * np.array([(b.size, b.sigma, b.sheet, b.sheet_sigma) for b in found])
-    (size, sigma, sheet, sheet_sigma), at = values.T, np.arange(len(found))
+    (size, sigma, sheet, sheet_sigma) = values.T
+    at = np.arange(len(found))
     bent = np.array([b.bends for b in found])
-    for some, color, label in ((bent, "lrf", "scan: bends"), (~bent, "raw", "scan: too little to matter")):
+    for some, color, label in (
+        (bent, "lrf", "scan: bends"),
+        (~bent, "raw", "scan: too little to matter"),
+    ):
         if some.any():
-            ax.bar(at[some], size[some], yerr=sigma[some], color=COLORS[color], label=label, width=0.75, **SPREAD)
+            ax.bar(
+                at[some],
+                size[some],
+                yerr=sigma[some],
+                color=COLORS[color],
+                label=label,
+                width=0.75,
+                **SPREAD,
+            )
     if np.isfinite(sheet).any():
         looks = {"fmt": "D", "color": COLORS["left"], "markersize": 4, "capsize": 2, "linewidth": 1}
-        ax.errorbar(at, sheet, yerr=sheet_sigma, label="images: change of the printed sheet", **looks)
+        ax.errorbar(
+            at, sheet, yerr=sheet_sigma, label="images: change of the printed sheet", **looks
+        )
     by_placement(ax, [b.placement for b in found], "highest to lowest point [mm]")
     many = f"{bent.sum()} of {len(found)} boards bend in the scan, by up to {size[bent].max(initial=0.0):.0f} mm"
     ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=many if bent.any() else "no board bends")
@@ -218,12 +339,17 @@ def board_bend(ax, bends):
 
 
 def over_view(ax, cloud, values, limit):
-    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees; what was drawn.
+    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees;
+    what was drawn.
 
     Colours end at `limit`, and at its negative where there are negative values.
     """
     signed = np.nanmin(values, initial=0.0) < 0
-    shades = {"cmap": "RdBu_r" if signed else "magma", "vmin": -limit if signed else 0.0, "vmax": limit}
+    shades = {
+        "cmap": "RdBu_r" if signed else "magma",
+        "vmin": -limit if signed else 0.0,
+        "vmax": limit,
+    }
     place = np.degrees(cloud.bearing), np.degrees(cloud.pitch)
     drawn = ax.scatter(*place, c=values, s=2.5, marker="s", linewidths=0, rasterized=True, **shades)
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")

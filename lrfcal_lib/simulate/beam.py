@@ -1,4 +1,6 @@
-"""A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and beams one after another."""
+"""A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and
+beams one after another.
+"""
 
 import math
 from dataclasses import dataclass
@@ -11,17 +13,23 @@ from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate.scene import need
 
 NOT_VALID, DAZZLED, WEAK = (REASONS.index(words) for words in ("not valid", "dazzled", "noise"))
-VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))  # deg, 1/100 deg: of telegram 0x3B
+# deg, 1/100 deg: of telegram 0x3B
+VARIANTS = ((100, 25), (100, 50), (100, 100), (180, 50), (180, 100))
 RAYS_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
 class Beam:
-    """Settings of a laser range finder, an outdoor LMS221 by default; ValueError for those that no device has."""
+    """Settings of a laser range finder, an outdoor LMS221 by default.
+
+    ValueError for those that no device has.
+    """
 
     name: str = "LMS221-30206"
-    angles: tuple[int, ...] = (100, 180)  # fields of view it can be set to, degrees (technical description, chapter 12)
-    # diameter of the spot at the window, metres, and its growth with distance, radians (technical description)
+    # fields of view it can be set to, degrees (technical description, chapter 12)
+    angles: tuple[int, ...] = (100, 180)
+    # diameter of the spot at the window, metres, and its growth with distance, radians (technical
+    # description)
     spot_exit: float = 0.016
     divergence: float = 0.0119
     sigma_range: float = 0.010  # statistical error, 1 sigma, metres (technical description)
@@ -32,11 +40,14 @@ class Beam:
     field_of_view: int = 180
     resolution: int = 50
     unit: float = 0.001  # metres a count: 0.001 or 0.01
-    # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2: about 1 m)
+    # surfaces nearer together than this along the beam give one reading (telegram listing, 10.2:
+    # about 1 m)
     pulse: float = 1.0
-    # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range for, there
+    # weakest echo that is a range: the 10 % reflectivity that the maker states the greatest range
+    # for, there
     least_energy: float = 0.1 / 30.0**2
-    # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain follows the strongest
+    # an echo is taken when it has this share of the strongest one. Assumed: the receiver's gain
+    # follows the strongest
     # echo; the maker states nothing. It widens what stands before a brighter background.
     least_share: float = 0.25
     rings: int = 4  # of sub-rays over the spot, 1 + 3 rings (rings + 1) of them
@@ -44,18 +55,23 @@ class Beam:
     def __post_init__(self):
         known = [variant for variant in VARIANTS if variant[0] in self.angles]
         variant = f"{self.field_of_view} deg in steps of {self.resolution / 100:g} deg"
-        words = f"no whole scans of {variant}; it can be set to {', '.join(f'{a}/{s / 100:g}' for a, s in known)}"
+        listed = ", ".join(f"{angle}/{step / 100:g}" for angle, step in known)
+        words = f"no whole scans of {variant}; it can be set to {listed}"
         need((self.field_of_view, self.resolution) in known, f"{self.name} has {words}")
         for name in ("spot_exit", "divergence", "sigma_range", "pulse", "least_energy"):
             value = getattr(self, name)
-            need(0 <= value < math.inf, f"{self.name}: {name} is {value}, it must be zero or positive")
+            need(
+                0 <= value < math.inf,
+                f"{self.name}: {name} is {value}, it must be zero or positive",
+            )
         bound = dict(self.systematic_bound).get(self.unit)
         need(bound, f"{self.name}: the unit is 0.001 or 0.01 m, got {self.unit}")
         offset = f"{self.name}: a systematic error of {self.systematic} m"
         need(abs(self.systematic) <= bound, f"{offset} is beyond the maker's {bound} m")
         share = f"least_share is {self.least_share}, a share lies between 0 and 1"
         need(0 <= self.least_share <= 1, f"{self.name}: {share}")
-        need(self.rings >= 0, f"{self.name}: {self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more")
+        rings = f"{self.rings} rings of rays cannot fill the spot, take 0 (one ray) or more"
+        need(self.rings >= 0, f"{self.name}: {rings}")
 
     @property
     def rays(self):
@@ -68,9 +84,13 @@ class Beam:
         return 100 // self.resolution
 
     def bearings(self):
-        """Bearings of a whole scan, shape (B,), radians; 0 right, pi/2 ahead (40 to 140 deg for 100 deg variants)."""
+        """Bearings of a whole scan, shape (B,), radians.
+
+        0 right, pi/2 ahead (40 to 140 deg for 100 deg variants).
+        """
         count = self.field_of_view * 100 // self.resolution + 1
-        return np.radians(90 - self.field_of_view / 2 + np.arange(count) * self.resolution / 100)
+        first = 90 - self.field_of_view / 2
+        return np.radians(first + np.arange(count) * self.resolution / 100)
 
     @property
     def unit_name(self):
@@ -80,53 +100,70 @@ class Beam:
     def info(self, made):
         """What a session states of it, an LrfInfo; `made` is how ('simulated')."""
         return LrfInfo(
-            f"{self.name} ({made})", tuple(self.bearings()[[0, -1]].tolist()), math.radians(self.resolution / 100),
-            self.sigma_range, range_resolution=self.unit, max_range=MODES[0].largest * self.unit,
-            spot_exit=self.spot_exit, spot_divergence=self.divergence,
-        )  # fmt: skip
+            f"{self.name} ({made})",
+            tuple(self.bearings()[[0, -1]].tolist()),
+            math.radians(self.resolution / 100),
+            self.sigma_range,
+            range_resolution=self.unit,
+            max_range=MODES[0].largest * self.unit,
+            spot_exit=self.spot_exit,
+            spot_divergence=self.divergence,
+        )
 
 
 LMS221 = Beam()
 
 
 def spot_pattern(rings):
-    """Points that stand for equal parts of the unit disc: one in the middle, 6 k on the k-th ring, shape (K, 2).
+    """Points (K, 2) that stand for equal parts of the unit disc: one in the middle, 6 k on ring k.
 
-    Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those of the disc.
+    Turning the pattern by 60 deg changes nothing: its centre and its moments of inertia are those
+    of the disc.
     """
     count = np.r_[1, 6 * np.arange(1, rings + 1)]
     inside = np.cumsum(count)
     radius = np.sqrt((inside - count / 2) / inside[-1])
     radius[0] = 0.0
     turn = np.concatenate([2 * np.pi * np.arange(n) / n for n in count])
-    return np.repeat(radius, count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    unit = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return np.repeat(radius, count)[:, None] * unit
 
 
 def echo(beam, distance, energy):
-    """One reading (n,), NaN without an echo, and the whole energy (n,) out of the sub-rays (n, K) of spots.
+    """Readings (n,), NaN without an echo, and whole energies (n,) out of sub-rays (n, K) of spots.
 
-    Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy (a mixed pixel); what
-    is farther makes an echo of its own. The first echo above both thresholds is the reading.
+    Surfaces within one pulse length of the nearest one blend into its reading, weighted by energy
+    (a mixed pixel); what is farther makes an echo of its own. The first echo above both thresholds
+    is the reading.
     """
-    left, best = np.where(np.isfinite(distance), distance, np.inf), np.zeros(len(distance))
+    left = np.where(np.isfinite(distance), distance, np.inf)
+    best = np.zeros(len(distance))
     echoes = []
     while np.isfinite(left).any():
         near = left.min(axis=1)
-        group = np.isfinite(left) & (left <= near[:, None] + beam.pulse)
+        within = left <= near[:, None] + beam.pulse
+        group = np.isfinite(left) & within
         part = np.where(group, energy, 0.0)
-        strength, mean = part.sum(axis=1), np.sum(part * np.where(group, distance, 0.0), axis=1)
-        echoes.append((np.divide(mean, strength, out=np.full(len(near), np.nan), where=strength > 0), strength))
+        strength = part.sum(axis=1)
+        mean = np.sum(part * np.where(group, distance, 0.0), axis=1)
+        place = np.full(len(near), np.nan)
+        np.divide(mean, strength, out=place, where=strength > 0)
+        echoes.append((place, strength))
         best = np.maximum(best, strength)
         left = np.where(group, np.inf, left)
     reading = np.full(len(distance), np.nan)
-    for place, strength in reversed(echoes):
-        good = (strength >= np.maximum(beam.least_energy, beam.least_share * best)) & np.isfinite(place)
+    threshold = np.maximum(beam.least_energy, beam.least_share * best)
+    total = np.zeros(len(distance))
+    for _, strength in echoes:
+        total = total + strength
+    for place, strength in reversed(echoes):  # the first one that is good comes last
+        good = (strength >= threshold) & np.isfinite(place)
         reading = np.where(good, place, reading)
-    return reading, sum((strength for _, strength in echoes), np.zeros(len(distance)))
+    return reading, total
 
 
 def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
-    """Readings without noise, offset and rounding, of beams at bearings (n,) while the head is at pitch (n,), radians.
+    """Readings without noise, offset and rounding, of beams at bearings and pitch (n,), radians.
 
     Returns
     -------
@@ -136,43 +173,62 @@ def ideal_readings(beam, world, bearings, pitch, T_head_lrf):
 
     Notes
     -----
-    Sub-rays leave a disc of `spot_exit` about the mirror. The energy of one is reflectivity times cosine of incidence
-    over squared distance (a Lambertian surface). The nearer part of a spot on a slanted plane is therefore brighter: at
-    45 deg the reading is 0.09 mm short.
+    Sub-rays leave a disc of `spot_exit` about the mirror. The energy of one is reflectivity times
+    cosine of incidence over squared distance (a Lambertian surface). The nearer part of a spot on a
+    slanted plane is therefore brighter: at 45 deg the reading is 0.09 mm short.
     """
-    c, s = np.cos(bearings), np.sin(bearings)
-    zero, disc = np.zeros_like(c), spot_pattern(beam.rings)
-    across, up = np.stack([-s, c, zero], axis=-1), np.array([0.0, 0.0, 1.0])
-    shift = disc[:, :1] * across[:, None] + disc[:, 1:] * up
-    directions = np.stack([c, s, zero], axis=-1)[:, None] + beam.divergence / 2 * shift
+    c = np.cos(bearings)
+    s = np.sin(bearings)
+    zero = np.zeros_like(c)
+    right, over = np.split(spot_pattern(beam.rings), 2, axis=1)
+    across = np.stack([-s, c, zero], axis=-1)
+    up = np.array([0.0, 0.0, 1.0])
+    shift = right * across[:, None] + over * up
+    middle = np.stack([c, s, zero], axis=-1)
+    directions = middle[:, None] + beam.divergence / 2 * shift
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     rotation = T_head_lrf.rotation.as_matrix().T
-    origins = tilt(beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation, pitch[:, None]).reshape(-1, 3)
+    origins = beam.spot_exit / 2 * shift @ rotation + T_head_lrf.translation
+    origins = tilt(origins, pitch[:, None]).reshape(-1, 3)
     directions = tilt(directions @ rotation, pitch[:, None]).reshape(-1, 3)
     hits = world.cast(origins, directions)
     seen = hits.face >= 0
-    energy, distance = np.zeros(len(seen)), hits.distance[seen]
+    energy = np.zeros(len(seen))
+    distance = hits.distance[seen]
     points = origins[seen] + distance[:, None] * directions[seen]
-    cosine = np.abs(np.sum(world.normals[hits.face[seen]] * directions[seen], axis=1))
-    energy[seen] = world.infrared(points, hits.thing[seen]) * cosine / distance**2 / beam.rays
+    normals = world.normals[hits.face[seen]]
+    cosine = np.abs(np.sum(normals * directions[seen], axis=1))
+    albedo = world.infrared(points, hits.thing[seen])
+    energy[seen] = albedo * cosine / distance**2 / beam.rays
     shape = len(bearings), beam.rays
     reading, total = echo(beam, hits.distance.reshape(shape), energy.reshape(shape))
-    return reading, total, world.dazzling[hits.thing].reshape(shape).any(axis=1)
+    dazzled = world.dazzling[hits.thing].reshape(shape).any(axis=1)
+    return reading, total, dazzled
 
 
 def measured(beam, reading, total, dazzled, rng):
-    """What the device makes of ideal readings: noisy ranges, metres, and why there is none (index into REASONS)."""
-    ranges = reading + beam.systematic + beam.sigma_range * rng.standard_normal(reading.shape)
-    reasons = np.where(np.isfinite(reading), 0, np.where(total > 0, WEAK, NOT_VALID))
+    """Noisy ranges, metres, out of ideal readings, and why there is none (index into REASONS)."""
+    noise = beam.sigma_range * rng.standard_normal(reading.shape)
+    ranges = reading + beam.systematic + noise
+    without = np.where(total > 0, WEAK, NOT_VALID)
+    reasons = np.where(np.isfinite(reading), 0, without)
     return np.clip(ranges, 0, None), np.where(dazzled, DAZZLED, reasons)
 
 
 def scan(beam, world, pitch, T_head_lrf, rng):
-    """Record scan lines, words (L, B) of 13 bits, at the true pitch of the head in each line (L, 1) or beam (L, B)."""
+    """Record scan lines, words (L, B) of 13 bits.
+
+    `pitch` is the true one of the head, radians, in each line (L, 1) or beam (L, B).
+    """
     bearings, pitch = np.broadcast_arrays(beam.bearings(), pitch)
-    flat, step = (bearings.ravel(), pitch.ravel()), max(1, RAYS_AT_ONCE // beam.rays)
-    starts = range(0, bearings.size, step)
-    parts = [ideal_readings(beam, world, *(v[i : i + step] for v in flat), T_head_lrf) for i in starts]
-    ideal = (np.concatenate(part).reshape(bearings.shape) for part in zip(*parts, strict=True))
+    shape = bearings.shape
+    bearings = bearings.ravel()
+    pitch = pitch.ravel()
+    step = max(1, RAYS_AT_ONCE // beam.rays)
+    parts = []
+    for start in range(0, len(bearings), step):
+        rows = slice(start, start + step)
+        parts.append(ideal_readings(beam, world, bearings[rows], pitch[rows], T_head_lrf))
+    ideal = [np.concatenate(part).reshape(shape) for part in zip(*parts, strict=True)]
     ranges, reasons = measured(beam, *ideal, rng)
     return encode_values(ranges, unit=beam.unit_name, reasons=reasons)

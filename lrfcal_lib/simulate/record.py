@@ -15,7 +15,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN, Configuration, encode_configuration, encode_words
+from lrfcal_lib.session.lms2xx_codec import (
+    MIRROR_TURN,
+    Configuration,
+    encode_configuration,
+    encode_words,
+)
 from lrfcal_lib.session.read import PLATFORM_COLUMNS
 from lrfcal_lib.session.stated import transform_to_json
 from lrfcal_lib.session.write import SessionWriter, write_file
@@ -24,9 +29,13 @@ from lrfcal_lib.simulate.rig import held_close, placements_of, random
 from lrfcal_lib.simulate.scene import Imager, board_on_stand, furnished, furnished_room, need
 
 LICENCE = "CC-BY-4.0"
-RECORDING = "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at rest"
+RECORDING = (
+    "stop-and-go: the head rests at every pitch step, one scan line and the images are taken at "
+    "rest"
+)
 SWEEP, STOPS, PHOTO, _, VIEWS = range(5)  # streams of random numbers; rig.PLACES is one more
-REPLY_TIME = 0.0016 + 0.016  # s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
+# s from the end of a scan to the last byte of its telegram at 500 kBd, 812 bytes
+REPLY_TIME = 0.0016 + 0.016
 
 
 class Stops(NamedTuple):
@@ -40,8 +49,8 @@ class Stops(NamedTuple):
 class Shots(NamedTuple):
     """Images of one camera, by its number in the rig, in one arrangement of the room.
 
-    The placement is -1 for the board held close; `T_platform_board` None where there is no board but a table with
-    things; `poses` are ``T_camera_platform``, `key` that of the random numbers.
+    The placement is -1 for the board held close; `T_platform_board` None where there is no board
+    but a table with things; `poses` are ``T_camera_platform``, `key` that of the random numbers.
     """
 
     camera: int
@@ -53,7 +62,10 @@ class Shots(NamedTuple):
 
 
 def world_of(setup, T_platform_board, stand=True):
-    """The room with the board on its stand (or held by nothing); with a laid table where the pose is None."""
+    """The room with the board on its stand (or held by nothing).
+
+    With a laid table where the pose is None.
+    """
     if T_platform_board is None:
         return furnished_room(*furnished("still life"))
     things = board_on_stand(setup.rig.board, T_platform_board, setup.rig.ring)
@@ -61,7 +73,9 @@ def world_of(setup, T_platform_board, stand=True):
 
 
 def step_angles(first, last, step):
-    """Pitch commands of a stop-and-go sweep: multiples of `step` from about `first` to about `last`, radians."""
+    """Pitch commands of a stop-and-go sweep: multiples of `step` from about `first` to about
+    `last`, radians.
+    """
     need(step > 0, f"a pitch step must be positive, got {step} rad")
     low, high = sorted((first, last))
     angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
@@ -71,37 +85,66 @@ def step_angles(first, last, step):
 def stops_of(setup, placement):
     """Where the head stands for the images and for the scan lines of a placement, two Stops."""
     step = setup.step if placement.T_platform_board is not None else setup.room_sweep[2]
-    rng, stops = random(setup, STOPS, placement.number), []
+    rng = random(setup, STOPS, placement.number)
+    stops = []
     for commanded in (np.asarray(placement.image_pitch), step_angles(*placement.sweep, step)):
-        stops.append(Stops(commanded, *setup.rig.platform.stop(commanded, placement.direction, rng)))
+        stops.append(
+            Stops(commanded, *setup.rig.platform.stop(commanded, placement.direction, rng))
+        )
     return tuple(stops)
 
 
 def sweep_of(setup, placement):
-    """The scan lines of a placement, one at every stop of the sweep: words (L, B) as the device sends them."""
-    pitch, world = stops_of(setup, placement)[1].true, world_of(setup, placement.T_platform_board)
-    return scan(setup.rig.beam, world, pitch[:, None], setup.rig.T_head_lrf, random(setup, SWEEP, placement.number))
+    """The scan lines of a placement, one at every stop of the sweep: words (L, B) as the device
+    sends them.
+    """
+    pitch = stops_of(setup, placement)[1].true
+    world = world_of(setup, placement.T_platform_board)
+    return scan(
+        setup.rig.beam,
+        world,
+        pitch[:, None],
+        setup.rig.T_head_lrf,
+        random(setup, SWEEP, placement.number),
+    )
 
 
 def close_views(setup, number):
-    """Poses ``T_platform_board`` of the board held close to a camera, by its number, while the head is at pitch 0."""
-    rig, camera = setup.rig, setup.rig.cameras[number]
+    """Poses ``T_platform_board`` of the board held close to a camera, by its number, while the
+    head is at pitch 0.
+    """
+    rig = setup.rig
+    camera = setup.rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
-    return [still * pose for pose in held_close(rig, camera, setup.intrinsics_views, random(setup, VIEWS, number))]
+    return [
+        still * pose
+        for pose in held_close(rig, camera, setup.intrinsics_views, random(setup, VIEWS, number))
+    ]
 
 
 def shots_of(setup, placements):
     """All images of a setup in the order in which they are written, a list of Shots."""
-    out, rig = [], setup.rig
+    out = []
+    rig = setup.rig
     for number, camera in enumerate(rig.cameras):
         still = [rig.camera_pose(camera, 0.0)]
         for i, pose in enumerate(close_views(setup, number)):
             out.append(Shots(number, -1, "intrinsics", pose, still, (PHOTO, number, 0, i)))
     for placement in placements:
-        pose, purpose = placement.T_platform_board, "scene" if placement.T_platform_board is None else "board"
+        pose = placement.T_platform_board
+        purpose = "scene" if placement.T_platform_board is None else "board"
         for number, camera in enumerate(rig.cameras):
             poses = [rig.camera_pose(camera, pitch) for pitch in stops_of(setup, placement)[0].true]
-            out.append(Shots(number, placement.number, purpose, pose, poses, (PHOTO, number, placement.number)))
+            out.append(
+                Shots(
+                    number,
+                    placement.number,
+                    purpose,
+                    pose,
+                    poses,
+                    (PHOTO, number, placement.number),
+                )
+            )
     return out
 
 
@@ -110,18 +153,24 @@ def photograph(setup, shots):
     camera = setup.rig.cameras[shots.camera]
     imager = Imager(camera.model, camera.exposure)
     world = world_of(setup, shots.T_platform_board, stand=shots.purpose == "board")
-    rng, quality = random(setup, *shots.key), [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
-    return [cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes() for pose in shots.poses]
+    rng = random(setup, *shots.key)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, setup.quality]
+    return [
+        cv2.imencode(".jpg", imager.render(world, pose, rng), quality)[1].tobytes()
+        for pose in shots.poses
+    ]
 
 
 def simulate(path, setup, workers=1):
-    """Simulate a recording and write its session into a new folder; `workers` processes render the images.
+    """Simulate a recording and write its session into a new folder; `workers` processes render the
+    images.
 
     Raises
     ------
     ValueError
-        If the folder exists, the board does not fit into the views, or the session cannot be written (a full disk).
-        The session is made beside its place and moved there when it is complete; nothing is left of a failed one.
+        If the folder exists, the board does not fit into the views, or the session cannot be
+        written (a full disk). The session is made beside its place and moved there when it is
+        complete; nothing is left of a failed one.
     """
     path = Path(path)
     if path.exists():
@@ -131,8 +180,12 @@ def simulate(path, setup, workers=1):
         _record(draft, path.name, setup, workers)
         draft.rename(path)
     except OSError as error:
-        full = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
-        raise ValueError(f"{path}: cannot be written ({error.strerror}){full}; nothing was kept") from error
+        full = (
+            "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
+        )
+        raise ValueError(
+            f"{path}: cannot be written ({error.strerror}){full}; nothing was kept"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     finally:
@@ -140,31 +193,61 @@ def simulate(path, setup, workers=1):
 
 
 def _record(folder, name, setup, workers):
-    rig, placements = setup.rig, placements_of(setup)
+    rig = setup.rig
+    placements = placements_of(setup)
     for placement in placements:
         rig.platform.check(np.array(placement.sweep))
     boards = {p.number: p.T_platform_board for p in placements if p.T_platform_board is not None}
-    reference = {"recording": RECORDING, "scene_placements": [p.number for p in placements if p.number not in boards]}
+    reference = {
+        "recording": RECORDING,
+        "scene_placements": [p.number for p in placements if p.number not in boards],
+    }
     truth = {
-        "simulated": True, "setup": setup.name, "seed": setup.seed, **rig.truth(),
-        "boards": {number: {"T_platform_board": transform_to_json(pose)} for number, pose in boards.items()},
-        "lrf": asdict(rig.beam), "platform": asdict(rig.platform), "sweeps": {}, "images": {},
-    }  # fmt: skip
+        "simulated": True,
+        "setup": setup.name,
+        "seed": setup.seed,
+        **rig.truth(),
+        "boards": {
+            number: {"T_platform_board": transform_to_json(pose)} for number, pose in boards.items()
+        },
+        "lrf": asdict(rig.beam),
+        "platform": asdict(rig.platform),
+        "sweeps": {},
+        "images": {},
+    }
     with SessionWriter(
-        folder, rig.board, rig.beam.info("simulated"), rig.camera_infos(), rig.T_head_lrf_stated, name=name,
-        licence=LICENCE, simulated=True, platform_sigma=rig.stated_sigma, reference=reference,
+        folder,
+        rig.board,
+        rig.beam.info("simulated"),
+        rig.camera_infos(),
+        rig.T_head_lrf_stated,
+        name=name,
+        licence=LICENCE,
+        simulated=True,
+        platform_sigma=rig.stated_sigma,
+        reference=reference,
         source=f"simulated by lrfcal_lib.simulate, setup '{setup.name}', seed {setup.seed}",
-    ) as writer:  # fmt: skip
+    ) as writer:
         log = _add_placements(writer, setup, placements, truth, workers)
-    write_file(folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n", folder)
+    write_file(
+        folder / "platform.csv", "\n".join([",".join(PLATFORM_COLUMNS), *log]) + "\n", folder
+    )
     write_file(folder / "truth.json", json.dumps(truth, indent=1) + "\n", folder)
 
 
 def _add_placements(writer, setup, placements, truth, workers):
-    """Write the images for the intrinsics, then images and sweep of each placement; rows of the platform's log."""
-    beam, pause, clock, log = setup.rig.beam, setup.rig.platform.settle, 0.0, []
-    took, unit = beam.turns * MIRROR_TURN, beam.unit_name
-    writer.add_telegrams(-1, [encode_configuration(Configuration().changed(measuring_mode=0, unit=unit))], time_s=0.0)
+    """Write the images for the intrinsics, then images and sweep of each placement.
+
+    Rows of the platform's log.
+    """
+    beam = setup.rig.beam
+    pause = setup.rig.platform.settle
+    clock = 0.0
+    log = []
+    took = beam.turns * MIRROR_TURN
+    unit = beam.unit_name
+    configuration = Configuration().changed(measuring_mode=0, unit=unit)
+    writer.add_telegrams(-1, [encode_configuration(configuration)], time_s=0.0)
     shots = shots_of(setup, placements)
     files = _photographs(setup, shots, workers)
     _add_images(writer, setup, [s for s in shots if s.placement < 0], files, truth)
@@ -173,19 +256,23 @@ def _add_placements(writer, setup, placements, truth, workers):
         shot_at = clock + pause * np.arange(1, len(images.true) + 1)
         own = [s for s in shots if s.placement == placement.number]
         _add_images(writer, setup, own, files, truth, images, shot_at)
-        began = shot_at[-1] + pause + (pause + took) * np.arange(len(lines.true))
+        first = shot_at[-1] + pause
+        began = first + (pause + took) * np.arange(len(lines.true))
         telegrams = [encode_words(words, unit=unit) for words in sweep_of(setup, placement)]
-        writer.add_telegrams(placement.number, telegrams, lines.measured, np.round(began + took + REPLY_TIME, 4))
+        arrived = np.round(began + took + REPLY_TIME, 4)
+        writer.add_telegrams(placement.number, telegrams, lines.measured, arrived)
         for stops, times in ((images, shot_at), (lines, began)):
-            rows = zip(times, np.degrees(stops.commanded), np.degrees(stops.measured), strict=True)
-            log += [f"{t:.4f},{c:.4f},{m:.4f}" for t, c, m in rows]
+            commanded = np.degrees(stops.commanded)
+            measured = np.degrees(stops.measured)
+            for t, c, m in zip(times, commanded, measured, strict=True):
+                log.append(f"{t:.4f},{c:.4f},{m:.4f}")
         truth["sweeps"][placement.number] = {"pitch_rad": lines.true.tolist()}
         clock = float(began[-1] + took + pause)
     return log
 
 
 def _photographs(setup, shots, workers):
-    """The images of all shots in order, an iterator of lists of files, rendered ahead by worker processes."""
+    """The images of all shots in order, lists of files, rendered ahead by worker processes."""
     if workers <= 1:
         yield from (photograph(setup, item) for item in shots)
         return
@@ -194,14 +281,21 @@ def _photographs(setup, shots, workers):
 
 
 def _add_images(writer, setup, shots, files, truth, stops=None, times=None):
-    """Write the next images, with where the head then stood: at pitch 0 where no stops are given."""
+    """Write the next images, with where the head then stood: at pitch 0 without stops."""
     for shot, images in zip(shots, files, strict=False):
         name = setup.rig.cameras[shot.camera].name
         for i, data in enumerate(images):
-            pitch, true = (0.0, 0.0) if stops is None else (float(stops.measured[i]), float(stops.true[i]))
-            time = math.nan if times is None else float(np.round(times[i], 4))
-            writer.add_image(name, data, shot.placement, pitch=pitch, time_s=time, purpose=shot.purpose)
+            pitch = true = 0.0
+            time = math.nan
+            if stops is not None:
+                pitch = float(stops.measured[i])
+                true = float(stops.true[i])
+                time = float(np.round(times[i], 4))
+            writer.add_image(
+                name, data, shot.placement, pitch=pitch, time_s=time, purpose=shot.purpose
+            )
             known = {"pitch_rad": true}
             if shot.T_platform_board is not None:
                 known["T_camera_board"] = transform_to_json(shot.poses[i] * shot.T_platform_board)
-            truth["images"][f"images/{name}/{writer.shots[name]:04d}.jpg"] = known
+            file = f"images/{name}/{writer.shots[name]:04d}.jpg"
+            truth["images"][file] = known

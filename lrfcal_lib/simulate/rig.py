@@ -1,4 +1,6 @@
-"""The simulated rig, the set-ups by name (``setups.json``), and the places that the board is put."""
+"""The simulated rig, the set-ups by name (``setups.json``), and the places that the board is
+put.
+"""
 
 import json
 import math
@@ -11,10 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel, project
-from lrfcal_lib.model.geometry import apply_pose, pose_array, tilt
+from lrfcal_lib.model.geometry import AHEAD, apply_pose, pose_array, tilt
 from lrfcal_lib.session.stated import CameraInfo, board_to_json, model_to_json, transform_to_json
 from lrfcal_lib.simulate.beam import LMS221, Beam
-from lrfcal_lib.simulate.draw import AHEAD
 from lrfcal_lib.simulate.scene import Exposure, need
 
 MOST_TRIES = 4000
@@ -27,43 +28,57 @@ PLACES = 3  # stream of random numbers
 
 @dataclass(frozen=True)
 class Platform:
-    """A pitching platform that lies a little about its pitch; ValueError for impossible settings."""
+    """A pitching platform that lies a little about its pitch.
+
+    ValueError for impossible settings.
+    """
 
     # play of the gear, radians: the head hangs back by half of it against the direction of motion
     backlash: float = 0.0
     stretch: float = 0.0  # the head turns 1 + stretch times as far as the platform says
     latency: float = 0.0  # seconds by which the measured pitch is older than its time stamp
-    noise: float = 0.0  # standard deviation of where the head comes to rest about where it should, radians
+    # standard deviation of where the head comes to rest about where it should, radians
+    noise: float = 0.0
     encoder_step: float = 0.0  # of the measured pitch, radians; 0 for none
     speed: float = math.radians(5.0)  # of continuous motion, radians a second
     settle: float = 0.4  # seconds from a command to rest in stop-and-go
-    limits: tuple[float, float] = (-math.radians(60), math.radians(60))  # least and greatest pitch, radians
+    # least and greatest pitch, radians
+    limits: tuple[float, float] = (-math.radians(60), math.radians(60))
 
     def __post_init__(self):
         for name in ("backlash", "latency", "noise", "encoder_step", "settle"):
             value = getattr(self, name)
             need(0 <= value < math.inf, f"platform: {name} is {value}, it must be zero or positive")
-        need(0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive")
+        need(
+            0 < self.speed < math.inf, f"platform: speed is {self.speed} rad/s, it must be positive"
+        )
         share = f"stretch is {self.stretch}, a share of the angle (0.01 is one per cent)"
         need(abs(self.stretch) < 0.5, f"platform: {share}")
 
     def stop(self, commanded, direction, rng):
-        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or from above (-1).
+        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or above.
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
         """
-        commanded, step = np.asarray(commanded, float), self.encoder_step
+        commanded = np.asarray(commanded, float)
+        step = self.encoder_step
         self.check(commanded)
         motor = commanded + self.noise * rng.standard_normal(commanded.shape)
-        head = (1 + self.stretch) * motor - np.asarray(direction) * self.backlash / 2
-        return head, np.rint(motor / step) * step if step else motor
+        behind = np.asarray(direction) * self.backlash / 2
+        head = (1 + self.stretch) * motor - behind
+        if step:
+            return head, np.rint(motor / step) * step
+        return head, motor
 
     def check(self, pitch):
         """Refuse angles beyond the limits."""
-        low, high = min(pitch, default=0.0), max(pitch, default=0.0)
-        (first, last), has = (np.round(np.degrees(ends), 2) for ends in ((low, high), self.limits))
-        words = f"platform: pitch {first} to {last} deg is asked for, it turns {has[0]} to {has[1]} deg"
-        need(self.limits[0] <= low and high <= self.limits[1], words)
+        low = min(pitch, default=0.0)
+        high = max(pitch, default=0.0)
+        first, last = np.round(np.degrees([low, high]), 2)
+        lowest, highest = np.round(np.degrees(self.limits), 2)
+        asked = f"platform: pitch {first} to {last} deg is asked for"
+        good = self.limits[0] <= low and high <= self.limits[1]
+        need(good, f"{asked}, it turns {lowest} to {highest} deg")
 
 
 @dataclass(frozen=True)
@@ -88,55 +103,76 @@ class Rig:
     T_head_lrf_stated: RigidTransform
     cameras: tuple[RigCamera, ...]
     board: Board  # with corners
-    ring: float = 0.65  # width of the outermost squares of the board's pattern as a share of a square
+    # width of the outermost squares of the board's pattern as a share of a square
+    ring: float = 0.65
     # how well the stated transform is said to be known: direction (radians) and offset (metres)
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch (or at many), radians."""
-        back = RigidTransform.from_rotation(Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0])))
+        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch (or at
+        many), radians.
+        """
+        back = RigidTransform.from_rotation(
+            Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
+        )
         return camera.mounting * self.T_head_lrf.inv() * back
 
     def camera_infos(self):
         """What a session states of the cameras, a list of CameraInfo."""
-        return [CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess) for c in self.cameras]
+        return [
+            CameraInfo(c.name, "head", c.model.width, c.model.height, None, c.guess)
+            for c in self.cameras
+        ]
 
     def truth(self):
         """Mountings, intrinsics and board as only the simulator knows them, as JSON."""
         cameras = {
-            c.name: {"T_camera_lrf": transform_to_json(c.mounting), "intrinsics": model_to_json(c.model),
-                     "exposure": asdict(c.exposure)}
+            c.name: {
+                "T_camera_lrf": transform_to_json(c.mounting),
+                "intrinsics": model_to_json(c.model),
+                "exposure": asdict(c.exposure),
+            }
             for c in self.cameras
-        }  # fmt: skip
-        head, board = transform_to_json(self.T_head_lrf), board_to_json(self.board)
+        }
+        head = transform_to_json(self.T_head_lrf)
+        board = board_to_json(self.board)
         return {"T_head_lrf": head, "cameras": cameras, "board": board}
 
     def sweep_pitch(self, p_platform):
         """Pitch (n,) at which the scan plane meets points (n, 3), and their bearing there, radians.
 
-        With n the third row of the rotation of ``T_head_lrf.inv()`` and h its shift, the point p lies in the scan plane
-        where ``n . Rx(-pitch) p + h = 0``; of the two solutions the one ahead is taken.
+        With n the third row of the rotation of ``T_head_lrf.inv()`` and h its shift, the point p
+        lies in the scan plane where ``n . Rx(-pitch) p + h = 0``; of the two solutions the one
+        ahead is taken.
         """
         back = self.T_head_lrf.inv()
-        n, h = back.rotation.as_matrix()[2], back.translation[2]
+        n = back.rotation.as_matrix()[2]
+        h = back.translation[2]
         x, y, z = np.asarray(p_platform, float).T
-        along, across = n[1] * y + n[2] * z, n[1] * z - n[2] * y
+        along = n[1] * y + n[2] * z
+        across = n[1] * z - n[2] * y
         turn = np.arctan2(across, along)
-        lift = np.arccos(np.clip(-(n[0] * x + h) / np.hypot(along, across), -1, 1))
-        both = [np.angle(np.exp(1j * (turn + s * lift))) for s in (1, -1)]
-        pitch = np.where(np.abs(both[0]) < np.abs(both[1]), *both)
+        cosine = -(n[0] * x + h) / np.hypot(along, across)
+        lift = np.arccos(np.clip(cosine, -1, 1))
+        first, second = np.angle(np.exp(1j * np.stack([turn + lift, turn - lift])))
+        pitch = np.where(np.abs(first) < np.abs(second), first, second)
         p_lrf = back.apply(tilt(p_platform, -pitch))
         return pitch, np.arctan2(p_lrf[:, 1], p_lrf[:, 0])
 
     def shows(self, camera, T_camera_board, points=None, margin=12.0):
-        """Whether a camera sees points of the board (corners by default) inside the image by a margin in pixels.
+        """Whether a camera sees points of the board (corners by default) well inside the image.
 
-        For a pose, or each of a stack of poses.
+        For a pose, or each of a stack of poses; the margin is in pixels.
         """
-        p = apply_pose(pose_array(T_camera_board), self.board.points() if points is None else points)
-        uv, size = project(p, camera.model), np.array([camera.model.width, camera.model.height])
-        ahead = (p[..., 2] >= 0.1) & (np.abs(p[..., :2]) <= p[..., 2:]).all(axis=-1)
-        return np.all(ahead & ((uv > margin) & (uv < size - 1 - margin)).all(axis=-1), axis=-1)
+        if points is None:
+            points = self.board.points()
+        p = apply_pose(pose_array(T_camera_board), points)
+        uv = project(p, camera.model)
+        size = np.array([camera.model.width, camera.model.height])
+        within_45_deg = np.abs(p[..., :2]) <= p[..., 2:]
+        ahead = (p[..., 2] >= 0.1) & within_45_deg.all(axis=-1)
+        inside = (uv > margin) & (uv < size - 1 - margin)
+        return np.all(ahead & inside.all(axis=-1), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -156,51 +192,84 @@ class Setup:
     quality: int = 95  # of JPEG, 1 to 100
 
     def __post_init__(self):
-        name, views, sweep = f"setup '{self.name}'", self.intrinsics_views, self.room_sweep
+        name = f"setup '{self.name}'"
+        views = self.intrinsics_views
+        sweep = self.room_sweep
         need(self.step > 0, f"{name}: the pitch step is {self.step} rad, it must be positive")
         need(1 <= self.quality <= 100, f"{name}: JPEG quality is 1 to 100, got {self.quality}")
         need(views >= 0, f"{name}: {views} intrinsics views; 0 or more are possible")
-        need(len(sweep) in (0, 3), f"{name}: room_sweep is (first, last, step) or empty, got {sweep}")
+        need(
+            len(sweep) in (0, 3), f"{name}: room_sweep is (first, last, step) or empty, got {sweep}"
+        )
 
 
 def printed_triangle():
-    """The paper's triangle (315 and 380 mm at an exact right angle) with 4 x 5 inner corners beside the right angle."""
-    return triangle_board(name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885)))
+    """The paper's triangle (315 and 380 mm at an exact right angle) with 4 x 5 inner corners
+    beside the right angle.
+    """
+    return triangle_board(
+        name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
+    )
 
 
 SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
 
 
 def load_setup(name):
-    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is like.
+    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is
+    like.
 
     ValueError for a name that is not there.
     """
     need(name in SETUPS, f"no set-up '{name}'; there are {', '.join(SETUPS)}")
     row = _radians(SETUPS[SETUPS[name].get("like", name)] | SETUPS[name])
-    names = ("seed", "pairs", "distances", "step", "intrinsics_views", "room_sweep", "room_images", "quality")
+    names = (
+        "seed",
+        "pairs",
+        "distances",
+        "step",
+        "intrinsics_views",
+        "room_sweep",
+        "room_images",
+        "quality",
+    )
     cameras = []
     for camera, c in row["cameras"].items():
-        scale, turn = row["image_width"] / c["size"][0], Rotation.from_rotvec(c["turn"], degrees=True) * AHEAD
+        scale = row["image_width"] / c["size"][0]
+        turn = Rotation.from_rotvec(c["turn"], degrees=True) * AHEAD
         mounting = RigidTransform.from_components(-turn.apply(c["centre"]), turn)
         off = Rotation.from_rotvec(c["guess"]["turn"], degrees=True) * mounting.rotation
-        guess = RigidTransform.from_components(mounting.translation + np.array(c["guess"]["shift"]), off)
-        size, pinhole = (round(v * scale) for v in c["size"]), (v * scale for v in c["pinhole"])
+        guess = RigidTransform.from_components(
+            mounting.translation + np.array(c["guess"]["shift"]), off
+        )
+        size = (round(v * scale) for v in c["size"])
+        pinhole = (v * scale for v in c["pinhole"])
         model = CameraModel(*size, *pinhole, np.array(c["distortion"]))
-        cameras.append(RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"])))
+        cameras.append(
+            RigCamera(camera, model, mounting, guess, exposure=Exposure(**c["exposure"]))
+        )
     heads = (
-        RigidTransform.from_components(row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True))
+        RigidTransform.from_components(
+            row[k]["shift"], Rotation.from_rotvec(row[k]["turn"], degrees=True)
+        )
         for k in ("head", "head_stated")
     )
-    beam, platform = replace(LMS221, **row["beam"]), Platform(**_radians(row["platform"]))
+    beam = replace(LMS221, **row["beam"])
+    platform = Platform(**_radians(row["platform"]))
     rig = Rig(beam, platform, *heads, tuple(cameras), printed_triangle())
     return Setup(name, rig=rig, **{k: row[k] for k in names})
 
 
 def _radians(row):
     """A row with what ends in _deg in radians, and no lists."""
-    turned = {k.removesuffix("_deg"): np.radians(v).tolist() if k.endswith("_deg") else v for k, v in row.items()}
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in turned.items()}
+    turned = {}
+    for key, value in row.items():
+        if key.endswith("_deg"):
+            value = np.radians(value).tolist()
+        if isinstance(value, list):
+            value = tuple(value)
+        turned[key.removesuffix("_deg")] = value
+    return turned
 
 
 @dataclass(frozen=True)
@@ -208,9 +277,11 @@ class Placement:
     """The board at one place, and what is recorded of it."""
 
     number: int
-    T_platform_board: RigidTransform | None  # None for a sweep of the room, with a laid table near the rig
+    # None for a sweep of the room, with a laid table near the rig
+    T_platform_board: RigidTransform | None
     sweep: tuple[float, float]  # pitch commands of the first and the last scan line, radians
-    image_pitch: tuple[float, ...]  # pitch commands of the images in the order in which they are taken, radians
+    # pitch commands of the images in the order in which they are taken, radians
+    image_pitch: tuple[float, ...]
 
     @property
     def direction(self):
@@ -219,26 +290,31 @@ class Placement:
 
 
 def random(setup, *key):
-    """Random numbers that depend on the setup's seed and a key alone, whatever else is simulated."""
+    """Random numbers that depend on a setup's seed and a key, whatever else is simulated."""
     return np.random.default_rng([setup.seed, *key])
 
 
 def placements_of(setup):
-    """The placements of a setup, a list: those of the board, then the sweep of the room where there is one."""
-    room = [Placement(2 * setup.pairs + 1, None, setup.room_sweep[:2], setup.room_images)] if setup.room_sweep else []
-    return pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES)) + room
+    """The placements of a setup, a list: those of the board, then a sweep of the room if any."""
+    out = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES))
+    if setup.room_sweep:
+        number = 2 * setup.pairs + 1
+        out.append(Placement(number, None, setup.room_sweep[:2], setup.room_images))
+    return out
 
 
 def check_size(rig, nearest):
-    """Refuse a board that does not fit into the view of the LRF or of a camera at a distance, metres."""
+    """Refuse a board that does not fit into a view of LRF or camera at a distance, metres."""
     length = pdist(rig.board.known_corners()).max()
     angle = np.degrees(2 * np.arctan(length / 2 / nearest))
     views = {rig.beam.name: float(rig.beam.field_of_view)}
     for camera in rig.cameras:
         m = camera.model
-        views[f"camera '{camera.name}'"] = np.degrees(2 * np.arctan(min(m.width / m.fx, m.height / m.fy) / 2))
+        narrow = min(m.width / m.fx, m.height / m.fy)
+        views[f"camera '{camera.name}'"] = np.degrees(2 * np.arctan(narrow / 2))
+    board = f"board '{rig.board.name}' is {length:.3g} m long"
+    large = f"{board}: {angle:.0f} deg at {nearest:g} m"
     for name, view in views.items():
-        large = f"board '{rig.board.name}' is {length:.3g} m long: {angle:.0f} deg at {nearest:g} m"
         seen = f"{name} sees {view:.0f} deg; take a smaller board or a greater distance"
         need(angle <= 0.9 * view, f"{large}, but {seen}")
 
@@ -246,16 +322,21 @@ def check_size(rig, nearest):
 def pairs(rig, count, distances, rng, margin=OUTSIDE):
     """Placements in pairs: at one place, turned by about a right angle and tilted otherwise.
 
-    Boards stand at `distances` (least and greatest, metres) from the platform; a sweep begins and ends `margin`
-    (radians) outside of them. Placements are numbered from 1. The first of each pair has images at three pitch angles,
-    the second at one. Sweeps go upwards at odd placements and downwards at even ones. ValueError if the board does not
-    fit into a view, or no place is found that everything sees.
+    Boards stand at `distances` (least and greatest, metres) from the platform; a sweep begins and
+    ends `margin` (radians) outside of them. Placements are numbered from 1. The first of each pair
+    has images at three pitch angles, the second at one. Sweeps go upwards at odd placements and
+    downwards at even ones. ValueError if the board does not fit into a view, or no place is found
+    that everything sees.
     """
     asked = f"{count} pairs at {distances} m"
-    need(count >= 1 and 0.3 <= distances[0] <= distances[1], f"{asked}: at least one pair, at 0.3 m or more, is needed")
+    need(
+        count >= 1 and 0.3 <= distances[0] <= distances[1],
+        f"{asked}: at least one pair, at 0.3 m or more, is needed",
+    )
     check_size(rig, distances[0])
     out = []
-    for i, distance in enumerate(rng.permutation(np.linspace(*distances, count))):
+    shuffled = rng.permutation(np.linspace(*distances, count))
+    for i, distance in enumerate(shuffled):
         turn = -135.0 + 90.0 * (i % 4)  # which way the right angle points: up, left, down, right
         for _ in range(MOST_TRIES):
             poses = _pair(rig, distance, turn, rng)
@@ -263,55 +344,88 @@ def pairs(rig, count, distances, rng, margin=OUTSIDE):
             if all(spans):
                 break
         else:
-            raise ValueError(f"no place at {distance:.2f} m where the LRF and all cameras see board '{rig.board.name}'")
-        for k, (pose, (sweep, seen)) in enumerate(zip(poses, spans, strict=True)):
-            middle, half = np.mean(seen), min(np.ptp(seen) * 0.4, np.radians(9.0))
-            angles = middle + half * np.array([[-1.0, 0.0, 1.0], [0.0]][k])
-            angles, way = np.radians(np.round(np.degrees(angles), 2)), (1, -1)[k]
-            out.append(Placement(2 * i + k + 1, pose, sweep[::way], tuple(angles[::way])))
+            raise ValueError(
+                f"no place at {distance:.2f} m where the LRF and all cameras see board "
+                f"'{rig.board.name}'"
+            )
+        upward, downward = zip(poses, spans, strict=True)
+        out.append(_placement(2 * i + 1, *upward, [-1.0, 0.0, 1.0], 1))
+        out.append(_placement(2 * i + 2, *downward, [0.0], -1))
     return out
+
+
+def _placement(number, pose, spans, image_shares, way):
+    """A Placement swept upwards (1) or downwards (-1), images at shares of the pitch that shows it."""
+    sweep, seen = spans
+    half = min(np.ptp(seen) * 0.4, np.radians(9.0))
+    angles = np.mean(seen) + half * np.array(image_shares)
+    angles = np.radians(np.round(np.degrees(angles), 2))
+    return Placement(number, pose, sweep[::way], tuple(angles[::way]))
 
 
 def _pair(rig, distance, turn, rng):
     """Two poses about one middle; boards face the rig up to 35 deg."""
-    azimuth, height = np.radians(rng.uniform(-24, 24)), rng.uniform(-0.22, 0.28) * distance / 1.6
+    azimuth = np.radians(rng.uniform(-24, 24))
+    height = rng.uniform(-0.22, 0.28) * distance / 1.6
     middle = np.array([distance * np.sin(azimuth), distance * np.cos(azimuth), height])
     centre = rig.board.points().mean(axis=0)
     out = []
     for more in (0.0, 90.0):
-        angles = [rng.uniform(-35, 35), rng.uniform(-28, 28), turn + more + rng.uniform(-12, 12)]
-        turned = Rotation.from_euler("z", -azimuth) * AHEAD * Rotation.from_euler("YXZ", angles, degrees=True)
+        lean = [rng.uniform(-35, 35), rng.uniform(-28, 28)]
+        angles = [*lean, turn + more + rng.uniform(-12, 12)]
+        leant = Rotation.from_euler("YXZ", angles, degrees=True)
+        turned = Rotation.from_euler("z", -azimuth) * AHEAD * leant
         out.append(RigidTransform.from_components(middle - turned.apply(centre), turned))
     return out
 
 
 def _spans(rig, pose, margin):
-    """First and last pitch of a sweep, and at which all cameras see the whole board; None where that is too little."""
-    shown = np.all([rig.shows(c, rig.camera_pose(c, PITCH_GRID) * pose) for c in rig.cameras], axis=0)
-    seen, (pitch, bearing) = PITCH_GRID[shown], rig.sweep_pitch(pose.apply(rig.board.points()))
-    beside = np.abs(bearing - np.pi / 2).max() >= np.radians(rig.beam.field_of_view / 2) - 2 * margin
-    if beside or not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
+    """First and last pitch of a sweep, and at which all cameras see the whole board.
+
+    None where that is too little.
+    """
+    shown = np.ones(len(PITCH_GRID), bool)
+    for camera in rig.cameras:
+        shown &= rig.shows(camera, rig.camera_pose(camera, PITCH_GRID) * pose)
+    seen = PITCH_GRID[shown]
+    if not len(seen) or not seen[-1] - seen[0] > LEAST_SPAN:
         return None
-    return (pitch.min() - margin, pitch.max() + margin), (seen[0], seen[-1])
+    pitch, bearing = rig.sweep_pitch(pose.apply(rig.board.points()))
+    half_field = np.radians(rig.beam.field_of_view / 2)
+    if np.abs(bearing - np.pi / 2).max() >= half_field - 2 * margin:
+        return None
+    sweep = pitch.min() - margin, pitch.max() + margin
+    return sweep, (seen[0], seen[-1])
 
 
 def held_close(rig, camera, count, rng):
-    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list of RigidTransform.
+    """Poses ``T_camera_board`` of the board held in front of a RigCamera, tilted every way, a list.
 
-    The whole pattern is inside the image, spread over all of it by the poses together; ValueError if it does not fit.
+    The whole pattern is inside the image, spread over all of it by the poses together; ValueError
+    if it does not fit.
     """
-    m, pattern, out = camera.model, rig.board.pattern, []
-    need(pattern or not count, f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics")
-    size, columns = np.array([m.width, m.height]), int(np.ceil(np.sqrt(count * 4 / 3)))
+    m = camera.model
+    pattern = rig.board.pattern
+    out = []
+    need(
+        pattern or not count,
+        f"board '{rig.board.name}' has no pattern: it cannot serve for the intrinsics",
+    )
+    size = np.array([m.width, m.height])
+    columns = int(np.ceil(np.sqrt(count * 4 / 3)))
+    to_camera = Rotation.from_euler("x", 180, degrees=True)
+    rows = np.ceil(count / max(columns, 1))
     for i in range(count):
-        points, rows = pattern.points(), np.ceil(count / columns)
-        pixel = np.array([(i % columns + 0.5) / columns, (i // columns + 0.5) / rows]) * size
+        points = pattern.points()
+        row, column = divmod(i, columns)
+        pixel = np.array([(column + 0.5) / columns, (row + 0.5) / rows]) * size
         for attempt in range(MOST_TRIES):
-            uv = pixel + (size / 2 - pixel) * attempt / MOST_TRIES + rng.normal(0, 15, 2)
+            inwards = (size / 2 - pixel) * attempt / MOST_TRIES
+            u, v = pixel + inwards + rng.normal(0, 15, 2)
             z = rng.uniform(*CLOSE)
-            angles = [rng.uniform(-42, 42), rng.uniform(-42, 42), rng.uniform(-180, 180)]
-            turn = Rotation.from_euler("x", 180, degrees=True) * Rotation.from_euler("YXZ", angles, degrees=True)
-            place = z * np.array([(uv[0] - m.cx) / m.fx, (uv[1] - m.cy) / m.fy, 1.0])
+            angles = rng.uniform([-42, -42, -180], [42, 42, 180])
+            turn = to_camera * Rotation.from_euler("YXZ", angles, degrees=True)
+            place = z * np.array([(u - m.cx) / m.fx, (v - m.cy) / m.fy, 1.0])
             pose = RigidTransform.from_components(place - turn.apply(points.mean(axis=0)), turn)
             if rig.shows(camera, pose, points, margin=18.0):
                 break

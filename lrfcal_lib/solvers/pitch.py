@@ -10,13 +10,27 @@ from scipy.special import fdtrc
 from lrfcal_lib.fit.least_squares import Block, solve
 from lrfcal_lib.fit.residuals import pad, sight_normals
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, gradient_by_pose, pose_array, pose_transform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    gradient_by_pose,
+    pose_array,
+    pose_transform,
+)
 from lrfcal_lib.solvers.planes import start_from_planes
 
-ERRORS = ("direction", "offset", "stretch")  # of the pitch: the first is shared, the others each sweep's own
-MODELS = {"none": (), "direction": ("direction",), "sweep": ("offset",), "sweep_stretch": ("offset", "stretch")}
-PLANE_NUMBERS, EDGE_NUMBERS = 3, 2  # independent numbers: a plane's distance and two angles; an edge's offset and angle
-PRIOR = np.array([np.radians(5.0), 0.5])  # offset, stretch: hold what one sweep cannot show (and the common offset)
+# of the pitch: the first is shared, the others each sweep's own
+ERRORS = ("direction", "offset", "stretch")
+MODELS = {
+    "none": (),
+    "direction": ("direction",),
+    "sweep": ("offset",),
+    "sweep_stretch": ("offset", "stretch"),
+}
+# independent numbers: a plane's distance and two angles; an edge's offset and angle
+PLANE_NUMBERS = 3
+EDGE_NUMBERS = 2
+# offset, stretch: hold what one sweep cannot show (and the common offset)
+PRIOR = np.array([np.radians(5.0), 0.5])
 SIGMA = 0.003  # metres, of one independent number; the level of the noise comes from the residuals
 LEVEL = 0.01  # a larger model must beat the last one wanted with this p-value
 
@@ -25,9 +39,10 @@ LEVEL = 0.01  # a larger model must beat the last one wanted with this p-value
 class PitchData:
     """All observations by placement, padded to (p, n).
 
-    `faces` holds ``points`` (platform frame, at the recorded pitch), ``pitch``, ``used``, and ``weight``: root of a
-    point's share in the mean square of its placement's face, or of its edge. `edges` the same of each camera's
-    crossings, and ``sight``, unit normals of the planes of sight. `boards` (c, p, 3, 4) are ``T_camera_board``.
+    `faces` holds ``points`` (platform frame, at the recorded pitch), ``pitch``, ``used``, and
+    ``weight``: root of a point's share in the mean square of its placement's face, or of its edge.
+    `edges` the same of each camera's crossings, and ``sight``, unit normals of the planes of sight.
+    `boards` (c, p, 3, 4) are ``T_camera_board``.
     """
 
     placements: np.ndarray
@@ -40,7 +55,9 @@ class PitchData:
 
     @property
     def n_numbers(self):
-        """Independent numbers in the data: the LRF's errors are the same for all cameras, so they count once."""
+        """Independent numbers in the data: the LRF's errors are the same for all cameras, so
+        they count once.
+        """
         edges = max(np.round(np.sum(e["weight"] ** 2)) for e in self.edges)
         return int(PLANE_NUMBERS * len(self.placements) + EDGE_NUMBERS * edges)
 
@@ -53,14 +70,18 @@ def gather(cameras, direction, middle):
             raise ValueError(
                 f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to the platform"
             )
-    placements = reduce(np.intersect1d, [every[0].plane_placement, *(obs.placements for obs in every)])
+    placements = reduce(
+        np.intersect1d, [every[0].plane_placement, *(obs.placements for obs in every)]
+    )
     if len(placements) < 4:
         raise DegenerateGeometry(
             f"{len(placements)} placements seen by the LRF and all cameras: at least 4 needed to compare sweeps"
         )
 
     def shared_out(obs, name, parts, **more):
-        """A group padded by placement, all rows of a part (a face, an edge of a placement) together with weight 1."""
+        """A group padded by placement, all rows of a part (a face, an edge of a placement)
+        together with weight 1.
+        """
         group = {"points": obs.group(name)["points"], "pitch": obs.group(name)["pitch"]} | more
         place = obs.group(name)["placement"]
         keep = np.isin(place, placements)
@@ -69,14 +90,23 @@ def gather(cameras, direction, middle):
         group = {key: value[keep] for key, value in group.items()}
         return pad(group | {"weight": 1 / np.sqrt(number[index])}, len(placements))
 
-    edges, boards = [], []
+    edges = []
+    boards = []
     for obs in every:
         sides = np.unique(obs.crossing_edge, return_inverse=True)[1]
         parts = obs.crossing_placement * (len(sides) + 1) + sides
-        edges.append(shared_out(obs, "crossing", parts, sight=sight_normals(obs.crossing_lines, obs.model)[0]))
+        edges.append(
+            shared_out(
+                obs, "crossing", parts, sight=sight_normals(obs.crossing_lines, obs.model)[0]
+            )
+        )
         order = np.argsort(obs.placements)
-        boards.append(obs.board_poses[order[np.searchsorted(obs.placements, placements, sorter=order)], :3])
-    direction, middle = (np.array([known[p] for p in placements.tolist()]) for known in (direction, middle))
+        boards.append(
+            obs.board_poses[order[np.searchsorted(obs.placements, placements, sorter=order)], :3]
+        )
+    direction, middle = (
+        np.array([known[p] for p in placements.tolist()]) for known in (direction, middle)
+    )
     faces = shared_out(every[0], "plane", every[0].plane_placement)
     return PitchData(placements, direction, middle, faces, edges, np.array(boards), tuple(cameras))
 
@@ -84,21 +114,30 @@ def gather(cameras, direction, middle):
 def corrected_points(group, data, state):
     """Platform points with the recorded pitch corrected, and their derivative by the pitch."""
     _, direction, offset, stretch = state
-    change = (direction * data.direction + offset)[:, None] + stretch[:, None] * (group["pitch"] - data.middle[:, None])
+    change = (direction * data.direction + offset)[:, None] + stretch[:, None] * (
+        group["pitch"] - data.middle[:, None]
+    )
     q = geometry.tilt(group["points"], change)
     return q, np.stack([0 * change, -q[..., 2], q[..., 1]], axis=-1)
 
 
 def plane_distances(state, data):
-    """Distances (p, n) of every camera's face points from its boards' planes and of its crossings from their sights.
+    """Distances (p, n) of every camera's face points from its boards' planes and of its crossings
+    from their sights.
 
-    Yields for each camera twice: group, distances, and Jacobian by the poses of all cameras 6 c and by `ERRORS` 3.
+    Yields for each camera twice: group, distances, and Jacobian by the poses of all cameras 6 c and
+    by `ERRORS` 3.
     """
     cameras = len(state[0])
     for i, pose in enumerate(state[0]):
         board = data.boards[i][:, None]
-        for group, normal, point in ((data.faces, board[..., 2], board[..., 3]), (data.edges[i], None, 0.0)):
-            normal = group["sight"] if normal is None else np.broadcast_to(normal, group["points"].shape)
+        for group, normal, point in (
+            (data.faces, board[..., 2], board[..., 3]),
+            (data.edges[i], None, 0.0),
+        ):
+            normal = (
+                group["sight"] if normal is None else np.broadcast_to(normal, group["points"].shape)
+            )
             q, by_pitch = corrected_points(group, data, state)
             rotated = q @ pose[:, :3].T
             r = np.sum(normal * (rotated + pose[:, 3] - point), axis=-1)
@@ -111,17 +150,23 @@ def plane_distances(state, data):
 
 
 def pitch_blocks(state, data, name):
-    """Residuals in metres by placement with analytic Jacobian, and weak priors, for one of `MODELS`.
+    """Residuals in metres by placement with analytic Jacobian, and weak priors, for one of
+    `MODELS`.
 
-    The state are camera poses (c, 3, 4), offset by direction, offsets (p,), stretches (p,). Unknowns are 6 of each
-    camera and the model's; what belongs to single sweeps is their own.
+    The state are camera poses (c, 3, 4), offset by direction, offsets (p,), stretches (p,).
+    Unknowns are 6 of each camera and the model's; what belongs to single sweeps is their own.
     """
-    cameras, own = len(state[0]), [e for e in MODELS[name] if e != "direction"]
+    cameras = len(state[0])
+    own = [e for e in MODELS[name] if e != "direction"]
     columns = [*range(6 * cameras), *(6 * cameras + ERRORS.index(error) for error in MODELS[name])]
     sigma = SIGMA * np.sqrt(cameras)
-    blocks = [Block(r, J[..., columns], group["weight"] / sigma) for group, r, J in plane_distances(state, data)]
+    blocks = [
+        Block(r, J[..., columns], group["weight"] / sigma)
+        for group, r, J in plane_distances(state, data)
+    ]
     if own:
-        values, k = np.stack(state[2:], axis=1)[:, : len(own)], len(columns)
+        values = np.stack(state[2:], axis=1)[:, : len(own)]
+        k = len(columns)
         J = np.broadcast_to(np.eye(k)[k - len(own) :], values.shape + (k,))
         blocks.append(Block(values, J, np.broadcast_to(1 / PRIOR[: len(own)], values.shape)))
     return blocks
@@ -129,7 +174,8 @@ def pitch_blocks(state, data, name):
 
 def move_pitch_state(state, step, name):
     """Retraction of the pitch models."""
-    poses, cameras = state[0], len(state[0])
+    poses = state[0]
+    cameras = len(state[0])
     common, own = step
     steps = dict(zip(MODELS[name], [*common[6 * cameras :], *own.T], strict=True))
     moved = [value + steps.get(error, 0.0) for error, value in zip(ERRORS, state[1:], strict=True)]
@@ -137,23 +183,33 @@ def move_pitch_state(state, step, name):
 
 
 def misfit(data, state):
-    """What the models are compared by (m^2), and rms distances of face points from the boards by camera, metres.
+    """What the models are compared by (m^2), and rms distances of face points from the boards by
+    camera, metres.
 
-    Sum over the placements of the mean square distance of the fitted scan plane from the camera's plane, and over
-    their edges of the mean square distance of the crossings from the planes of sight; mean over the cameras.
+    Sum over the placements of the mean square distance of the fitted scan plane from the camera's
+    plane, and over their edges of the mean square distance of the crossings from the planes of
+    sight; mean over the cameras.
     """
     q, _ = corrected_points(data.faces, data, state)
     used = data.faces["used"]
     count = used.sum(axis=1)
-    away = (q - np.sum(q * used[..., None], axis=1, keepdims=True) / count[:, None, None]) * used[..., None]
+    away = (q - np.sum(q * used[..., None], axis=1, keepdims=True) / count[:, None, None]) * used[
+        ..., None
+    ]
     flat = np.linalg.svd(away, full_matrices=False)[2][:, 2]
-    own = np.sum(flat[:, None] * away, axis=-1)  # what the scan scatters about its own plane tells nothing of the pitch
-    total, rms, found = 0.0, {}, plane_distances(state, data)
+    # what the scan scatters about its own plane tells nothing of the pitch
+    own = np.sum(flat[:, None] * away, axis=-1)
+    total = 0.0
+    rms = {}
+    found = plane_distances(state, data)
     for name, pose, board in zip(data.cameras, state[0], data.boards, strict=True):
-        r, (edges, d, _) = next(found)[1] * used, next(found)
+        r = next(found)[1] * used
+        (edges, d, _) = next(found)
         rms[name] = float(np.sqrt(np.sum(r**2) / used.sum()))
         aligned = own * np.sign(np.sum((board[..., 2] @ pose[:, :3]) * flat, axis=1))[:, None]
-        total += np.sum(np.sum(((r - aligned) * used) ** 2, axis=1) / count) + np.sum((d * edges["weight"]) ** 2)
+        total += np.sum(np.sum(((r - aligned) * used) ** 2, axis=1) / count) + np.sum(
+            (d * edges["weight"]) ** 2
+        )
     return float(total) / len(state[0]), rms
 
 
@@ -164,11 +220,11 @@ class PitchModel:
     Attributes
     ----------
     name : str
-        'none', 'direction' (+offset for sweeps with direction +1, -offset for -1), 'sweep' (an offset each), or
-        'sweep_stretch' (an offset and a stretch about the middle each).
+        'none', 'direction' (+offset for sweeps with direction +1, -offset for -1), 'sweep' (an
+        offset each), or 'sweep_stretch' (an offset and a stretch about the middle each).
     offset, offset_sigma, stretch : ndarray, shape (p,)
-        Radians to *add* to the recorded pitch of each placement, and relative: the corrected pitch is
-        ``pitch + offset + stretch (pitch - middle)``.
+        Radians to *add* to the recorded pitch of each placement, and relative: the corrected pitch
+        is ``pitch + offset + stretch (pitch - middle)``.
     transforms : dict of str to RigidTransform
         ``T_camera_platform``.
     misfit, rms
@@ -190,10 +246,13 @@ class PitchModel:
     p_value: float = np.nan
 
     def tested(self, small, numbers):
-        """The model with F and its p-value against a smaller one, of so many independent numbers."""
+        """The model with F and its p-value against a smaller one, of so many independent
+        numbers.
+        """
         if small is None or self.n_parameters <= small.n_parameters or numbers <= self.n_parameters:
             return self
-        more, free = self.n_parameters - small.n_parameters, numbers - self.n_parameters
+        more = self.n_parameters - small.n_parameters
+        free = numbers - self.n_parameters
         F = (small.misfit - self.misfit) / more / (self.misfit / free)
         return replace(self, F=float(F), p_value=float(fdtrc(more, free, max(F, 0.0))))
 
@@ -207,12 +266,13 @@ class PitchErrors:
     placements : ndarray of int, shape (p,)
     direction : ndarray of int, shape (p,)
     direction_offset, direction_sigma : float
-        Radians to add to the recorded pitch of sweeps with direction +1 (and to subtract for -1), with its standard
-        deviation (`Solution.trusted`, with the noise at the level of the residuals). nan where the sweeps all go
-        one way.
+        Radians to add to the recorded pitch of sweeps with direction +1 (and to subtract for -1),
+        with its standard deviation (`Solution.trusted`, with the noise at the level of the
+        residuals). nan where the sweeps all go one way.
     models : dict of str to PitchModel
     wanted : str
-        The model that the data ask for: each larger one must beat the last one wanted with p < 0.01.
+        The model that the data ask for: each larger one must beat the last one wanted with p <
+        0.01.
     """
 
     placements: np.ndarray
@@ -229,8 +289,8 @@ def estimate_pitch_errors(cameras, direction, middle):
     Parameters
     ----------
     cameras : dict of str to CameraObservations
-        Cameras fixed to the platform (``source='platform'``), with recorded pitch; their board poses are used, their
-        crossings, and the face points of the first.
+        Cameras fixed to the platform (``source='platform'``), with recorded pitch; their board
+        poses are used, their crossings, and the face points of the first.
     direction : dict of int to int
         Sweep direction (+1 or -1; 0 for a single shot) of each placement.
     middle : dict of int to float
@@ -247,9 +307,15 @@ def estimate_pitch_errors(cameras, direction, middle):
     ValueError
         When a camera is not fixed to the platform.
     """
-    data, models, turn, before, wanted = gather(cameras, direction, middle), {}, (np.nan, np.nan), None, None
-    poses, zeros = [pose_array(start_from_planes(obs))[0] for obs in cameras.values()], 0.0 * data.middle
-    state, numbers = (np.array(poses), 0.0, zeros, zeros), data.n_numbers
+    data = gather(cameras, direction, middle)
+    models = {}
+    turn = (np.nan, np.nan)
+    before = None
+    wanted = None
+    poses = [pose_array(start_from_planes(obs))[0] for obs in cameras.values()]
+    zeros = 0.0 * data.middle
+    state = (np.array(poses), 0.0, zeros, zeros)
+    numbers = data.n_numbers
     for name in MODELS:
         if name == "direction" and not {-1, 1} <= set(data.direction.tolist()):
             continue
@@ -259,7 +325,9 @@ def estimate_pitch_errors(cameras, direction, middle):
         if name == "direction":
             turn = float(state[1]), sigma
         models[name] = before = model.tested(before, numbers)
-        wanted = before if wanted is None or before.tested(wanted, numbers).p_value < LEVEL else wanted
+        wanted = (
+            before if wanted is None or before.tested(wanted, numbers).p_value < LEVEL else wanted
+        )
     return PitchErrors(data.placements, data.direction, *turn, models, wanted.name)
 
 
@@ -271,20 +339,44 @@ def _solve_model(name, data, state):
     names = [f"{c}_{n}" for c in data.cameras for n in geometry.POSE_NAMES]
     names += ["direction_offset"] * (name == "direction")
     found = solve(
-        lambda s: pitch_blocks(s, data, name), state, lambda s, step: move_pitch_state(s, step, name), names=names,
-        read=lambda s: (None, np.r_[geometry.pose_parameters(s[0]).ravel(), s[1]][: len(names)]), required=False,
-        method=f"pitch_{name}", shared=len(names), limit=10.0, freedom=data.n_numbers - 6,
+        lambda s: pitch_blocks(s, data, name),
+        state,
+        lambda s, step: move_pitch_state(s, step, name),
+        names=names,
+        read=lambda s: (None, np.r_[geometry.pose_parameters(s[0]).ravel(), s[1]][: len(names)]),
+        required=False,
+        method=f"pitch_{name}",
+        shared=len(names),
+        limit=10.0,
+        freedom=data.n_numbers - 6,
     )
-    (poses, direction, offset, stretch), p = found.state, len(data.placements)
+    (poses, direction, offset, stretch) = found.state
+    p = len(data.placements)
     total, rms = misfit(data, found.state)
     level = total / max(data.n_numbers - 6, 1) / SIGMA**2 / found.inflation
     sigma = float(replace(found, covariance=level * found.covariance).trusted_sigma[-1])
     parameters = 6 + {"none": 0, "direction": 1, "sweep": p - 1, "sweep_stretch": 2 * p - 1}[name]
-    offset, offset_sigma = direction * data.direction + offset, np.full(p, sigma if name == "direction" else 0.0)
+    offset = direction * data.direction + offset
+    offset_sigma = np.full(p, sigma if name == "direction" else 0.0)
     if name.startswith("sweep"):  # from the scatter of the residuals, what is shared held
-        offset, own = offset - offset.mean(), found.jacobian[..., 6 * len(poses) :]
+        offset = offset - offset.mean()
+        own = found.jacobian[..., 6 * len(poses) :]
         inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own)
-        offset_sigma = np.sqrt(inverse[:, 0, 0] * total / max(data.n_numbers - parameters, 1)) / SIGMA
-    transforms = {camera: pose_transform(pose) for camera, pose in zip(data.cameras, poses, strict=True)}
-    model = PitchModel(name, offset, offset_sigma, stretch, transforms, total, rms, parameters, bool(found.converged))
+        offset_sigma = (
+            np.sqrt(inverse[:, 0, 0] * total / max(data.n_numbers - parameters, 1)) / SIGMA
+        )
+    transforms = {
+        camera: pose_transform(pose) for camera, pose in zip(data.cameras, poses, strict=True)
+    }
+    model = PitchModel(
+        name,
+        offset,
+        offset_sigma,
+        stretch,
+        transforms,
+        total,
+        rms,
+        parameters,
+        bool(found.converged),
+    )
     return found.state, sigma, model

@@ -1,4 +1,7 @@
-"""The tilt axis from edges swept at known pitch angles (eqs. 1-15): in space, and projected as printed."""
+"""The tilt axis from edges swept at known pitch angles (eqs.
+
+1-15): in space, and projected as printed.
+"""
 
 from dataclasses import dataclass
 from functools import partial
@@ -10,11 +13,22 @@ from lrfcal_lib.fit.least_squares import Block, name_words, solve
 from lrfcal_lib.fit.residuals import AXIS_COLUMNS, SIGMA_FLOOR, chart_parameters, move_head, pad
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, axis_of, fit_line, hat, head_from_axis, lrf_to_platform, tilt
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    axis_of,
+    fit_line,
+    hat,
+    head_from_axis,
+    lrf_to_platform,
+    tilt,
+)
 
-SIGMA_SKEW, SIGMA_GAP = np.radians(0.2), 0.002  # of boards: the right angle of the two edges, their distance (metres)
+# of boards: the right angle of the two edges, their distance (metres)
+SIGMA_SKEW = np.radians(0.2)
+SIGMA_GAP = 0.002
 LEAST_SLOPE = 0.1  # nearer to a coordinate plane (6 degrees) a projected fit is useless
-WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)  # a combination of the four motions of the axis
+# a combination of the four motions of the axis
+WORDS = partial(name_words, names=AXIS_WORDS, share=0.3)
 TINY = 1e-30  # of a complex step: derivatives without rounding
 
 
@@ -22,9 +36,9 @@ TINY = 1e-30  # of a complex step: derivatives without rounding
 class PlatformSolution:
     """The estimated tilt axis.
 
-    `solution` has the four unknowns ``(w_y, w_z, v_y, v_z)`` of T_head_lrf; `skew` and `gap` are the deviation of the
-    two edges from a right angle (radians) and their distance (metres) at each placement used; `skipped` names the
-    others with the reason.
+    `solution` has the four unknowns ``(w_y, w_z, v_y, v_z)`` of T_head_lrf; `skew` and `gap` are
+    the deviation of the two edges from a right angle (radians) and their distance (metres) at each
+    placement used; `skipped` names the others with the reason.
     """
 
     solution: Solution
@@ -33,7 +47,8 @@ class PlatformSolution:
     gap: np.ndarray
     skipped: dict[int, str]
 
-    gauge = ("rotation about the tilt axis", "translation along the tilt axis")  # what no pitching data can show
+    # what no pitching data can show
+    gauge = ("rotation about the tilt axis", "translation along the tilt axis")
 
     @property
     def T_head_lrf(self):
@@ -81,42 +96,62 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
 
     Notes
     -----
-    Equations (1) to (15) with total least squares lines instead of projected fits: every placement has a board of its
-    own (pose, skew, gap: 8 unknowns, eliminated by a Schur complement), an edge point has two distances from its edge,
-    a face point one from the plane. The perpendicularity and coplanarity of equations (13) and (14) are residuals with
-    the tolerances of the board. A placement with one edge serves too when it has face points.
+    Equations (1) to (15) with total least squares lines instead of projected fits: every placement
+    has a board of its own (pose, skew, gap: 8 unknowns, eliminated by a Schur complement), an edge
+    point has two distances from its edge, a face point one from the plane. The perpendicularity and
+    coplanarity of equations (13) and (14) are residuals with the tolerances of the board. A
+    placement with one edge serves too when it has face points.
     """
-    gauge, earlier = start_head(T0), []
+    gauge = start_head(T0)
+    earlier = []
     for final in (False, True):  # the second time in the gauge of the axis that was found
         edge, face, boards, skipped = prepare_boards(obs, gauge)
-        number, p = int(edge["used"].sum()), len(boards)
+        number = int(edge["used"].sum())
+        p = len(boards)
         points = number + int(face["used"].sum())
         state = geometry.pose_array(gauge), np.array(list(boards.values())), np.zeros((p, 2))
         found = solve(
-            partial(platform_blocks, edge=edge, face=face, sigma_pitch=sigma_pitch), state, move_platform,
-            names=AXIS_NAMES, method="platform_3d", words=WORDS, shared=4,
+            partial(platform_blocks, edge=edge, face=face, sigma_pitch=sigma_pitch),
+            state,
+            move_platform,
+            names=AXIS_NAMES,
+            method="platform_3d",
+            words=WORDS,
+            shared=4,
             read=lambda state: (geometry.pose_transform(state[0]), chart_parameters(state[0])),
-            freedom=points + number + 2 * p - 4 - 8 * p, limit=0.5, max_iterations=100,
-            n_observations=points, required=final, earlier=earlier,
+            freedom=points + number + 2 * p - 4 - 8 * p,
+            limit=0.5,
+            max_iterations=100,
+            n_observations=points,
+            required=final,
+            earlier=earlier,
         )
-        gauge, earlier = head_from_axis(axis_of(found.transform)), [found.cost_history]
+        gauge = head_from_axis(axis_of(found.transform))
+        earlier = [found.cost_history]
     return PlatformSolution(found, np.array(list(boards)), *found.state[2].T, skipped)
 
 
 def prepare_boards(obs, T_head_lrf):
-    """Edge and face points padded by placement, a start board by placement, and why some placements are skipped.
+    """Edge and face points padded by placement, a start board by placement, and why some placements
+    are skipped.
 
-    `second` is 1 for points of edge 2 and 0 for others, those of a lone edge, too. Boards are pose arrays (3, 4),
-    ``T_platform_board``, with x along edge 1 and z along the normal.
+    `second` is 1 for points of edge 2 and 0 for others, those of a lone edge, too. Boards are pose
+    arrays (3, 4), ``T_platform_board``, with x along edge 1 and z along the normal.
     """
     groups = obs.group("edge"), obs.group("face")
-    p_edge, p_face = (lrf_to_platform(group["points"], group["pitch"], T_head_lrf) for group in groups)
-    boards, skipped, second = {}, {}, np.full(len(p_edge), -1.0)
+    p_edge, p_face = (
+        lrf_to_platform(group["points"], group["pitch"], T_head_lrf) for group in groups
+    )
+    boards = {}
+    skipped = {}
+    second = np.full(len(p_edge), -1.0)
     for placement in np.unique(obs.edge_placement).tolist():
         edges = [(obs.edge_placement == placement) & (obs.edge_number == e) for e in (1, 2)]
         edges = [rows for rows in edges if rows.sum() >= 2]
         try:
-            boards[placement] = _start_board([p_edge[rows] for rows in edges], p_face[obs.face_placement == placement])
+            boards[placement] = _start_board(
+                [p_edge[rows] for rows in edges], p_face[obs.face_placement == placement]
+            )
         except DegenerateGeometry as error:
             skipped[placement] = str(error)
             continue
@@ -124,11 +159,14 @@ def prepare_boards(obs, T_head_lrf):
             second[rows] = number
     if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    padded, numbers = [], list(boards)
+    padded = []
+    numbers = list(boards)
     for group, number in zip(groups, (second, np.zeros(len(p_face))), strict=True):
         kept = np.isin(group["placement"], numbers) & (number >= 0)
         group = {key: value[kept] for key, value in (group | {"second": number}).items()}
-        padded.append(pad(group | {"placement": np.searchsorted(numbers, group["placement"])}, len(numbers)))
+        padded.append(
+            pad(group | {"placement": np.searchsorted(numbers, group["placement"])}, len(numbers))
+        )
         padded[-1]["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
     return *padded, boards, skipped
 
@@ -140,9 +178,13 @@ def _start_board(edges, face):
     point, x, _ = fit_line(edges[0])
     if len(edges) == 2:
         point2, second, _ = fit_line(edges[1])
-        z, cosine, between = np.cross(x, second), x @ second, point2 - point
+        z = np.cross(x, second)
+        cosine = x @ second
+        between = point2 - point
         if np.linalg.norm(z) < np.sin(np.radians(30)):
-            raise DegenerateGeometry("the two edges are nearly parallel: edges 1 and 2 must be perpendicular")
+            raise DegenerateGeometry(
+                "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
+            )
         # the origin is where edge 1 comes nearest to edge 2
         point = point + x * (between @ x - cosine * (between @ second)) / (1 - cosine**2)
     elif len(face) >= 3:
@@ -155,39 +197,55 @@ def _start_board(edges, face):
 
 
 def board_coordinates(head, boards, points, pitch):
-    """Board coordinates (p, n, 3) of LRF points; Jacobians by axis 4 and board's pose 6, by LRF point 3, by pitch."""
+    """Board coordinates (p, n, 3) of LRF points.
+
+    Jacobians by axis 4 and board's pose 6, by LRF point 3, by pitch.
+    """
     rotated = points @ head[:, :3].T
     q = tilt(rotated + head[:, 3], pitch)
-    lever, to_board = q - boards[:, None, :, 3], np.swapaxes(boards[:, None, :, :3], -1, -2)
+    lever = q - boards[:, None, :, 3]
+    to_board = np.swapaxes(boards[:, None, :, :3], -1, -2)
     turned = to_board @ np.swapaxes(tilt(np.eye(3), pitch[..., None]), -1, -2)  # B^T Rx(pitch)
     eye = np.broadcast_to(np.eye(3), turned.shape)
     axis = (turned @ np.concatenate([-hat(rotated), eye], axis=-1))[..., AXIS_COLUMNS]
     board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
     by_pitch = (to_board @ geometry.cross(np.array([1.0, 0.0, 0.0]), q)[..., None])[..., 0]
-    return lever @ boards[:, :, :3], np.concatenate([axis, board], axis=-1), turned @ head[:, :3], by_pitch
+    return (
+        lever @ boards[:, :, :3],
+        np.concatenate([axis, board], axis=-1),
+        turned @ head[:, :3],
+        by_pitch,
+    )
 
 
 def distances(state, group):
-    """Distances of points from their edge, in the board's plane and across it, (p, n, 2), and their Jacobians.
+    """Distances of points from their edge, in the board's plane and across it, (p, n, 2), and their
+    Jacobians.
 
-    Edge 1 lies along x of the board, edge 2 along y but for the skew and the gap. The second distance serves for points
-    on the face, too.
+    Edge 1 lies along x of the board, edge 2 along y but for the skew and the gap. The second
+    distance serves for points on the face, too.
     """
     head, boards, bends = state
     b, J, by_point, by_pitch = board_coordinates(head, boards, group["points"], group["pitch"])
-    second, skew, gap = group["second"], bends[:, :1], bends[:, 1:]
-    c, s = second * np.cos(skew), second * np.sin(skew)
+    second = group["second"]
+    skew = bends[:, :1]
+    gap = bends[:, 1:]
+    c = second * np.cos(skew)
+    s = second * np.sin(skew)
     inside = np.stack([c, 1 - second + s, 0 * c], axis=-1)
     normals = np.stack([inside, np.broadcast_to([0.0, 0.0, 1.0], inside.shape)], axis=-2)
     r = (normals @ b[..., None])[..., 0] - np.stack([0 * second, second * gap], axis=-1)
     bend = np.zeros(r.shape + (2,))
-    bend[..., 0, 0], bend[..., 1, 1] = c * b[..., 1] - s * b[..., 0], -second
+    bend[..., 0, 0] = c * b[..., 1] - s * b[..., 0]
+    bend[..., 1, 1] = -second
     by_pitch = (normals @ by_pitch[..., None])[..., 0]
     return r, np.concatenate([normals @ J, bend], axis=-1), normals @ by_point, by_pitch
 
 
 def distance_block(state, group, sigma_pitch, which):
-    """Some of the :func:`distances` of a group's points, whitened by the noise of points and pitch."""
+    """Some of the :func:`distances` of a group's points, whitened by the noise of points and
+    pitch.
+    """
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
     pull = group["covariance"] @ np.swapaxes(by_point, -1, -2)
     by_pitch = sigma_pitch * by_pitch
@@ -198,15 +256,20 @@ def distance_block(state, group, sigma_pitch, which):
     corrected = distances(state, group | {"points": points, "pitch": pitch})[1][:, :, which]
     whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
     p = len(r)
-    return Block(r.reshape(p, -1), J.reshape(p, -1, 12), whitener, corrected=corrected.reshape(p, -1, 12))
+    return Block(
+        r.reshape(p, -1), J.reshape(p, -1, 12), whitener, corrected=corrected.reshape(p, -1, 12)
+    )
 
 
 def platform_blocks(state, edge, face, sigma_pitch):
     """All residuals by placement; unknowns: axis 4, then board pose 6, skew and gap."""
     head, boards, bends = state
-    p, used, lone = len(boards), edge["used"][..., None], ~np.any(edge["second"], axis=1)
+    p = len(boards)
+    used = edge["used"][..., None]
+    lone = ~np.any(edge["second"], axis=1)
     tolerance = np.broadcast_to(np.eye(12)[10:], (p, 2, 12))
-    # a board seen with one edge may slide along it: its origin is held at the middle of that edge's points
+    # a board seen with one edge may slide along it: its origin is held at the middle of that edge's
+    # points
     b, J, _, _ = board_coordinates(head, boards, edge["points"], edge["pitch"])
     along = np.concatenate([b[..., :1], J[..., 0, :]], axis=-1) * used
     middle = np.sum(along, axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
@@ -214,69 +277,104 @@ def platform_blocks(state, edge, face, sigma_pitch):
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
         distance_block(state, face, sigma_pitch, slice(1, 2)),
         Block(bends, tolerance, np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))),
-        Block(middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), lone[:, None] * 100.0),
+        Block(
+            middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), lone[:, None] * 100.0
+        ),
     ]
 
 
 def move_platform(state, step):
     """Retraction of axis, boards, and their skew and gap."""
     common, own = step
-    return move_head(state[0], common), geometry.move_pose(state[1], own[:, :6]), state[2] + own[:, 6:]
+    return (
+        move_head(state[0], common),
+        geometry.move_pose(state[1], own[:, :6]),
+        state[2] + own[:, 6:],
+    )
 
 
 def solve_projected(obs, T0=None, *, printed=False):
-    """The tilt axis by the paper's projected line fits; for parameters and errors see :func:`solve_platform`.
+    """The tilt axis by the paper's projected line fits; for parameters and errors see
+    :func:`solve_platform`.
 
-    Of the observations the edge points are used, without their covariance; that of the result comes from the scatter of
-    the residuals. Placements with an edge parallel to a coordinate plane are skipped: their projected fits would divide
-    by zero. Which planes these are is a matter of the chart: of that of this repository, where the LRF is turned least,
-    or (`printed`) of the paper's, where it lies on the y axis of the head, ``t = (0, t_y, 0)``.
+    Of the observations the edge points are used, without their covariance; that of the result comes
+    from the scatter of the residuals. Placements with an edge parallel to a coordinate plane are
+    skipped: their projected fits would divide by zero. Which planes these are is a matter of the
+    chart: of that of this repository, where the LRF is turned least, or (`printed`) of the paper's,
+    where it lies on the y axis of the head, ``t = (0, t_y, 0)``.
 
     Notes
     -----
-    Equation (15) is garbled; it is read as the sum over the placements of the squares of six terms: the root mean
-    square errors of the four projected fits (each point's error over the root of their number enters, which has the
-    same sum of squares and stays smooth), ``|u1 . u2|`` of the unit directions (unit vectors, because the paper's (9)
-    and (10) grow beyond bounds for level edges) and the gap D in metres. These have different units and no weights: the
-    result depends on that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
+    Equation (15) is garbled; it is read as the sum over the placements of the squares of six terms:
+    the root mean square errors of the four projected fits (each point's error over the root of
+    their number enters, which has the same sum of squares and stays smooth), ``|u1 . u2|`` of the
+    unit directions (unit vectors, because the paper's (9) and (10) grow beyond bounds for level
+    edges) and the gap D in metres. These have different units and no weights: the result depends on
+    that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
     turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real if printed else 0.0
-    groups, skipped = _slanted(obs, tilt(lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge), turn))
+    groups, skipped = _slanted(
+        obs, tilt(lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge), turn)
+    )
     if not groups:
-        raise DegenerateGeometry(f"projected fits: no placement can be used: {skipped}; use the 3D fits instead")
+        raise DegenerateGeometry(
+            f"projected fits: no placement can be used: {skipped}; use the 3D fits instead"
+        )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
 
     def solved(head, scatter, **earlier):
         """The fits with a given scatter about the lines."""
         return solve(
-            partial(projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed),
-            geometry.pose_array(head), move_head, names=AXIS_NAMES, method="platform_projected", words=WORDS,
-            groups=np.repeat(list(groups), rows), limit=np.inf,
+            partial(
+                projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed
+            ),
+            geometry.pose_array(head),
+            move_head,
+            names=AXIS_NAMES,
+            method="platform_projected",
+            words=WORDS,
+            groups=np.repeat(list(groups), rows),
+            limit=np.inf,
             read=lambda head: (geometry.pose_transform(head), chart_parameters(head)),
-            max_iterations=100, **earlier,
-        )  # fmt: skip
+            max_iterations=100,
+            **earlier,
+        )
 
     first = solved(gauge, 1.0)
     scatter = max(np.sqrt(np.sum(first.residuals**2) / max(len(first.residuals) - 4, 1)), 1e-6)
     found = solved(head_from_axis(axis_of(first.transform)), scatter, earlier=[first.cost_history])
-    cosine, gap = scatter * found.residuals[np.cumsum(rows) - [[2], [1]]]  # the last two of every placement
-    return PlatformSolution(found, np.array(list(groups)), np.arcsin(np.clip(cosine, -1, 1)), gap, skipped)
+    # the last two of every placement
+    cosine, gap = scatter * found.residuals[np.cumsum(rows) - [[2], [1]]]
+    return PlatformSolution(
+        found, np.array(list(groups)), np.arcsin(np.clip(cosine, -1, 1)), gap, skipped
+    )
 
 
 def _slanted(obs, p_platform):
-    """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate planes, and why not others."""
-    groups, skipped = {}, {}
+    """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate
+    planes, and why not others.
+    """
+    groups = {}
+    skipped = {}
     for placement in np.unique(obs.edge_placement).tolist():
-        edges = [np.flatnonzero((obs.edge_placement == placement) & (obs.edge_number == e)) for e in (1, 2)]
+        edges = [
+            np.flatnonzero((obs.edge_placement == placement) & (obs.edge_number == e))
+            for e in (1, 2)
+        ]
         reasons = []
         for number, rows in enumerate(edges, start=1):
             if len(rows) < 3:
                 reasons.append(f"edge {number} has {len(rows)} points, at least 3 needed")
                 continue
             direction = np.abs(fit_line(p_platform[rows])[1])
-            level = [plane for axis, plane in ((2, "xy"), (1, "xz")) if direction[axis] < LEAST_SLOPE]
-            reasons += [f"edge {number} is parallel to the {p} plane: its projected fits divide by zero" for p in level]
+            level = [
+                plane for axis, plane in ((2, "xy"), (1, "xz")) if direction[axis] < LEAST_SLOPE
+            ]
+            reasons += [
+                f"edge {number} is parallel to the {p} plane: its projected fits divide by zero"
+                for p in level
+            ]
         if reasons:
             skipped[placement] = reasons[0]
         else:
@@ -285,29 +383,39 @@ def _slanted(obs, p_platform):
 
 
 def projected_block(head, obs, groups, scatter=1.0, printed=False):
-    """The six terms of equation (15) of every placement (rows of edge 1, rows of edge 2) over their common scatter.
+    """The six terms of equation (15) of every placement (rows of edge 1, rows of edge 2) over their
+    common scatter.
 
     The Jacobian by the axis chart comes from complex steps, exact but for rounding.
     """
     rotated = obs.edge_points @ head[:, :3].T
-    by_axis = np.concatenate([-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1)
+    by_axis = np.concatenate(
+        [-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1
+    )
     by_axis = np.moveaxis(by_axis[..., AXIS_COLUMNS], -1, 0)
     q = tilt(rotated + head[:, 3], obs.edge_pitch) + TINY * 1j * tilt(by_axis, obs.edge_pitch)
     if printed:
-        q = tilt(q, _to_printed_chart(head[:, 3] + TINY * 1j * np.eye(6)[AXIS_COLUMNS, 3:])[:, None])
+        q = tilt(
+            q, _to_printed_chart(head[:, 3] + TINY * 1j * np.eye(6)[AXIS_COLUMNS, 3:])[:, None]
+        )
     terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1) / scatter
     return Block(terms[0].real, terms.imag.T / TINY, np.ones(terms.shape[1]))
 
 
 def _to_printed_chart(t):
-    """Angle about the tilt axis that turns shifts (..., 3) of the LRF from it into the paper's t = (0, t_y, 0)."""
+    """Angle about the tilt axis that turns shifts (..., 3) of the LRF from it into the paper's
+    t = (0, t_y, 0).
+    """
     y, z = np.moveaxis(t[..., 1:], -1, 0)  # of an axis through the LRF's origin: none
     change = (z.real * y.imag - y.real * z.imag) / np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
     return -np.arctan2(z.real, y.real) + 1j * change
 
 
 def _six_terms(first, second):
-    """Errors of the four projected fits, ``u1 . u2``, and the gap D of equation (14) of one placement, (4, m)."""
+    """Errors of the four projected fits, ``u1 .
+
+    U2``, and the gap D of equation (14) of one placement, (4, m).
+    """
     (errors1, u1, p1), (errors2, u2, p2) = (_projected_line(q) for q in (first, second))
     normal = geometry.cross(u1, u2)
     gap = _dot(normal, p1 - p2) / np.sqrt(_dot(normal, normal))
@@ -315,13 +423,15 @@ def _six_terms(first, second):
 
 
 def _projected_line(q):
-    """Fit ``x = a z + b`` and ``z = c y + d`` (equations (7), (8)) to the points (4, n, 3) of one edge.
+    """Fit ``x = a z + b`` and ``z = c y + d`` (equations (7), (8)) to the points (4, n, 3) of one
+    edge.
 
-    Returns the errors (4, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~ (a, 1 / c, 1)`` as
-    a unit vector and the point ``p = (b, -d / c, 0)``.
+    Returns the errors (4, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~
+    (a, 1 / c, 1)`` as a unit vector and the point ``p = (b, -d / c, 0)``.
     """
     x, y, z = np.moveaxis(q, -1, 0)
-    (e1, a, b), (e2, c, d) = _regression(z, x), _regression(y, z)
+    (e1, a, b) = _regression(z, x)
+    (e2, c, d) = _regression(y, z)
     u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
     errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
     return errors, u / np.sqrt(_dot(u, u)), np.concatenate([b, -d / c, 0 * b], axis=-1)

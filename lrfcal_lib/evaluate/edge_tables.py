@@ -1,0 +1,150 @@
+"""Tables of the board's edges in the cloud: how far points of them are off, and how long they are."""
+
+from contextlib import suppress
+from itertools import product
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtri
+
+from lrfcal_lib.calibrate.combined import combined_outlines
+from lrfcal_lib.calibrate.outline import outline_of
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.preprocess.prepared import VARIANTS
+
+# Li et al. 2009, section V.A: stated and reconstructed edges of their board, millimetres
+PAPER_EDGES_MM = {"ab": (315.0, 300.3633), "ca": (380.0, 373.4127), "bc": (491.0, 496.2991)}
+# what decides the ends of edges (images, beams, the pitch): of most, and of those with a weak side
+ENDS = {
+    "last_beam": ("scan", "pitch"),
+    "half_step": ("scan", "pitch"),
+    "combined": ("image", "scan"),
+}
+LENGTH_COLUMNS = (
+    "source",
+    "placement",
+    "edge",
+    "ends",
+    "variant",
+    "true_mm",
+    "measured_mm",
+    "sigma_mm",
+)
+
+
+def edge_point_table(prepared, truth):
+    """Bias of each rule for the edge point against the true edge, across it within the plane.
+
+    Columns variant, edge, n, bias_mm (positive outside the board), sd_mm.
+    """
+    rows = []
+    lines = dict(zip(truth.board.edges, truth.board.lines(), strict=True))
+    for variant in VARIANTS:
+        misses = {edge: [np.zeros(0)] for edge in lines}
+        for placement, names in prepared.names.items():
+            found = prepared.edges[variant][placement]
+            pitch = truth.pitch[placement][found.line]
+            p_platform = geometry.lrf_to_platform(found.points, pitch, truth.T_head_lrf)
+            p_board = truth.boards[placement].inv().apply(p_platform)
+            for side, edge in names.items():
+                p_side = p_board[found.side == side, :2]
+                misses[edge].append(p_side @ lines[edge][:2] + lines[edge][2])
+        for edge, parts in misses.items():
+            miss = pd.Series(1000 * np.concatenate(parts))
+            mean = miss.mean() if len(miss) > 1 else np.nan
+            rows.append((variant, edge, len(miss), mean, miss.std()))
+    return pd.DataFrame(rows, columns=["variant", "edge", "n", "bias_mm", "sd_mm"])
+
+
+def edge_lengths(prepared, T_head_lrf=None, joint=None):
+    """Edges of the board measured in the cloud of every placement, beside the paper's own row.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    T_head_lrf : RigidTransform, optional
+        For the least-squares variants; the session's own platform when left out.
+    joint : JointCalibration, optional
+        With its estimates without each placement. Adds 'combined', the one answer: all that is
+        known, each weighted by what it is worth. It does not know the board's size, and its
+        calibration has not seen the placement.
+
+    Returns
+    -------
+    DataFrame
+        source, placement, edge, ends, variant, true_mm, measured_mm, sigma_mm, error_mm. One row
+        for every edge that some camera sees at a placement; NaN where the cloud does not show both
+        its ends. `ends` is 'scan' where beams decide both ends of the edge, 'pitch' where one hangs
+        on the recorded pitch (the edge runs across the scan lines), 'image' where images show both
+        ('combined'). `sigma_mm` holds all that is known to be uncertain for 'combined', and only
+        the scatter of points about the sides for the others.
+    """
+
+    known = {}
+    if prepared.board.corners is not None:
+        known = prepared.board.lengths()
+    measured = {}
+    for variant in VARIANTS:
+        measured[variant] = _outlines(prepared, variant, T_head_lrf)
+    if joint is not None and known:
+        combined = combined_outlines(joint)
+        measured["combined"] = {p: combined[p] for p in prepared.names if p in combined}
+    rows = []
+    for variant, placement in product(measured, prepared.session.board_placements):
+        board, weak = measured[variant].get(placement, (None, frozenset()))
+        views = [views[placement] for views in prepared.views.values() if placement in views]
+        for name, true in known.items():
+            if all(view.edge(name) is None for view in views):
+                continue
+            length = np.nan
+            sigma = np.nan
+            if board is not None and name in board.lengths:
+                length = board.lengths[name]
+                sigma = board.sigma.get(name, np.nan)
+            ends = "not measured"
+            if np.isfinite(length):
+                hangs = not neighbours(prepared.board.edges, name).isdisjoint(weak)
+                ends = ENDS[variant][hangs]
+            where = prepared.session.name, placement, name, ends, variant
+            rows.append((*where, 1000 * true, 1000 * length, 1000 * sigma))
+    for name, (true, length) in PAPER_EDGES_MM.items():
+        rows.append(("paper", np.nan, name, "scan", "last_beam", true, length, np.nan))
+    table = pd.DataFrame(rows, columns=LENGTH_COLUMNS).astype({"placement": "Int64"})
+    return table.assign(error_mm=table.measured_mm - table.true_mm)
+
+
+def _outlines(prepared, variant, T_head_lrf):
+    """Outlines and their weak sides (see :func:`outline_of`) by placement, as far as they exist."""
+    out = {}
+    for placement in prepared.names:
+        with suppress(DegenerateGeometry):
+            out[placement] = outline_of(prepared, placement, variant, T_head_lrf)
+    return out
+
+
+def neighbours(edges, name):
+    """The edges that meet the edge of this name; `edges` stand in order around the board."""
+    i = edges.index(name)
+    return {edges[i - 1], edges[(i + 1) % len(edges)]}
+
+
+def edge_summary(table):
+    """Errors of an :func:`edge_lengths` table, of measured edges only.
+
+    Columns source, ends, variant, n, mean_abs_error_mm, median_abs_error_mm, mean_error_mm,
+    within_90_percent (share of the errors inside their 90 % intervals; NaN where nothing is said
+    about them).
+    """
+    table = table[table.measured_mm.notna()]
+    size = table.error_mm.abs()
+    within = (size < ndtri(0.95) * table.sigma_mm).where(table.sigma_mm.notna())
+    table = table.assign(size=size, within=100 * within.astype(float))
+    summary = table.groupby(["source", "ends", "variant"], sort=False).agg(
+        n=("size", "size"),
+        mean_abs_error_mm=("size", "mean"),
+        median_abs_error_mm=("size", "median"),
+        mean_error_mm=("error_mm", "mean"),
+        within_90_percent=("within", "mean"),
+    )
+    return summary.reset_index()

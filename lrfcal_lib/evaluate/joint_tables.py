@@ -1,0 +1,220 @@
+"""Tables that judge the joint estimate."""
+
+import numpy as np
+import pandas as pd
+
+from lrfcal_lib.evaluate.next_placement import outline
+from lrfcal_lib.evaluate.tables import rms, unit_of
+from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
+from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.camera import project
+from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.solvers.joint import solve_again
+from lrfcal_lib.solvers.joint_noise import on_board
+
+ALL = 10**9  # crossings
+NOISE_WORDS = {
+    "face_scale": "scatter of ranges, in stated standard deviations",
+    "view_scale": "scatter of board poses in images, in stated standard deviations",
+    "face_share": "independent errors per range",
+    "beam_share": "independent errors per beam at an edge",
+    "sigma_pitch": "error of the pitch of single images [deg]",
+    "side_sigma": "spread of the edge bias from side to side [log odds]",
+}
+HALVES_COLUMNS = (
+    "pair",
+    "camera",
+    "rotation_deg",
+    "translation_mm",
+    "predicted_rotation_deg",
+    "predicted_translation_mm",
+)
+
+
+def range_residuals(solution):
+    """Ranges (n,) on the boards' faces as measured, and predicted minus measured, metres."""
+    return solution.observations.face_range, solution.residuals("face")[:, 0]
+
+
+def view_residuals(solution, camera, model):
+    """Where the boards' middles were seen in a camera's images, and predicted minus seen.
+
+    Pixels, shapes (n, 2). A ValueError if there is no such camera.
+    """
+    if camera not in solution.transforms:
+        cameras = ", ".join(solution.transforms) or "none"
+        raise ValueError(f"cameras are {cameras}; got '{camera}'")
+    mine = solution.observations.view_camera == list(solution.transforms).index(camera)
+    pose = solution.observations.view_pose[mine]
+    turn, shift = np.split(solution.residuals("view")[mine], 2, axis=1)
+    turned = pose[:, :3, :3] @ outline(solution).mean(axis=0)
+    at = pose[:, :3, 3]
+    seen = project(turned + at, model)
+    moved = (geometry.exp_rotation(turn) @ turned[..., None])[..., 0]
+    return seen, project(moved + at + shift, model) - seen
+
+
+def joint_table(joint):
+    """Every shared unknown of the joint estimate (JointCalibration).
+
+    Columns parameter, unit, value, sigma_noise (propagated), sigma_placements (scatter over the
+    placements, model errors included; NaN where unknown), sigma (of both, see `Solution.trusted`).
+    """
+    solution = joint.solution.solution
+    units, factors = zip(*map(unit_of, solution.names), strict=True)
+    return pd.DataFrame(
+        {
+            "parameter": solution.names,
+            "unit": units,
+            "value": factors * solution.parameters,
+            "sigma_noise": factors * solution.sigma,
+            "sigma_placements": factors * solution.sigma_placements,
+            "sigma": factors * solution.trusted_sigma,
+        }
+    )
+
+
+def noise_table(joint):
+    """Noise levels that the estimate took from the data, in words."""
+    rows = []
+    for name, value in joint.solution.noise.items():
+        if name == "sigma_pitch":
+            value = np.rad2deg(value)
+        rows.append((NOISE_WORDS[name], value))
+    return pd.DataFrame(rows, columns=["what", "value"])
+
+
+def edge_bias_mm(joint):
+    """By how much boards look larger at each side: mean over the beams of every edge, millimetres.
+
+    Columns placement, edge, distance_m, bias_mm (positive outwards), bias_radii.
+    """
+    solution = joint.solution
+    obs = joint.observations
+    sensor = solution.sensor["edge_log_odds"]
+    distance = np.linalg.norm(solution.state.boards[:, :, 3], axis=1)
+    odds = obs.beam_background + solution.state.sides[obs.beam_placement, obs.beam_edge]
+    columns = {
+        "placement": obs.placements[obs.beam_placement],
+        "edge": np.array(obs.edges)[obs.beam_edge],
+        "distance_m": distance[obs.beam_placement],
+        "bias_mm": 1000 * edge_shift(sensor, obs.beam_radius, odds)[0],
+        "bias_radii": disc_edge(sensor + odds)[0],
+    }
+    order = np.lexsort((obs.beam_edge, obs.beam_placement))
+    sides = pd.DataFrame(columns).iloc[order].groupby(list(columns)[:3], sort=False)
+    return sides.mean().reset_index()
+
+
+def joint_fit(joint, cameras=None):
+    """How well ranges and edges fit the joint estimate: ``plane_rms_mm`` and ``edge_rms_px``.
+
+    Of face points from their boards, and of all half-step crossings of scan lines from the image
+    edges, the estimated edge bias taken off, over all cameras or those named.
+    """
+    solution = joint.solution
+    height = on_board(solution.state, solution.data)[..., 2]
+    height = height[solution.data.face["used"]]
+    cameras = cameras or joint.observations.cameras
+    edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
+    return {"plane_rms_mm": 1000 * rms(height), "edge_rms_px": rms(edges)}
+
+
+def edge_misses_px(joint, camera):
+    """Distances (n,) of crossings of scan lines from one camera's edges without the edge bias.
+
+    Undistorted pixels.
+    """
+    solution = joint.solution
+    edges = list(joint.observations.edges)
+    placements = list(joint.solution.boards)
+    obs = joint.seen_by(camera, crossings=ALL, faces=0).along().select(placements)
+    pose = solution.transforms[camera]
+    if len(obs.crossing_points) == 0:
+        return np.zeros(0)
+    row = [placements.index(p) for p in obs.crossing_placement]
+    side = [edges.index(e) for e in obs.crossing_edge]
+    odds = obs.crossing_background + solution.state.sides[row, side]
+    shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
+    depth = pose.apply(obs.crossing_points)[:, 2]
+    return edge_residuals_px(obs, pose) - shift * obs.model.fx / depth
+
+
+def random_halves(joint, pairs=8):
+    """How far estimates from two random halves of the placements differ, beside their sigmas.
+
+    Columns pair, camera, rotation_deg, translation_mm (differences), predicted_rotation_deg,
+    predicted_translation_mm (root mean square difference that the sigma of the whole estimate,
+    model error included, predicts: twice that sigma, without the part of the intrinsics, which the
+    halves share). Splits of which a half leaves something open are missing.
+    """
+    rng = np.random.default_rng(0)
+    numbers = np.array(list(joint.solution.boards))
+    rows = []
+    if len(numbers) <= 4:  # two placements determine no rig
+        pairs = 0
+    for pair in range(pairs):
+        parts = np.array_split(rng.permutation(numbers), 2)
+        try:
+            first, second = (_estimate_from(joint, part) for part in parts)
+        except DegenerateGeometry:
+            continue
+        for camera in joint.observations.cameras:
+            one = first.transforms[camera]
+            other = second.transforms[camera]
+            turn, shift = geometry.transform_difference(one, other)
+            row = {
+                "pair": pair,
+                "camera": camera,
+                "rotation_deg": np.rad2deg(turn),
+                "translation_mm": 1000 * shift,
+            }
+            rows.append(row | _predicted(joint.solution, camera))
+    return pd.DataFrame(rows, columns=HALVES_COLUMNS)
+
+
+def _estimate_from(joint, placements):
+    """The joint estimate from some placements (of several, in any order)."""
+    return solve_again(joint.observations.select(np.sort(placements)), joint.solution)
+
+
+def _predicted(solution, camera):
+    """Root mean square difference of two halves of the placements as sigma predicts it."""
+    lens = np.diag(solution.lens)[solution.columns(f"{camera}_")]
+    variances = solution.camera(camera).trusted_sigma ** 2 - lens
+    turn, shift = np.split(2 * np.sqrt(np.maximum(variances, 0.0)), 2)
+    return {
+        "predicted_rotation_deg": np.rad2deg(np.linalg.norm(turn)),
+        "predicted_translation_mm": 1000 * np.linalg.norm(shift),
+    }
+
+
+def joint_errors(joint, truth):
+    """Errors of axis and cameras against the Truth, beside their predicted sigmas.
+
+    Columns what, rotation_error_deg, rotation_sigma_deg, translation_error_mm,
+    translation_sigma_mm; no axis where it was not estimated.
+    """
+    solution = joint.solution
+    rows = []
+    if joint.settings["axis"]:
+        turn, shift = axis_errors(solution.T_head_lrf, truth)
+        rows.append(_error_row("tilt axis", turn, shift, solution.covariance("axis_", "offset_")))
+    for camera in solution.transforms:
+        turn, shift = camera_errors(solution.camera(camera), truth, camera).values()
+        covariance = solution.covariance(f"{camera}_")
+        rows.append(_error_row(f"camera {camera}", turn, shift, covariance))
+    return pd.DataFrame(rows)
+
+
+def _error_row(what, turn_deg, shift_mm, covariance):
+    """Errors of a pose, or of an axis, beside the sigma of both from its covariance (2 k, 2 k)."""
+    turn_variance, shift_variance = np.diag(covariance).reshape(2, -1).sum(axis=1)
+    return {
+        "what": what,
+        "rotation_error_deg": turn_deg,
+        "rotation_sigma_deg": np.rad2deg(np.sqrt(turn_variance)),
+        "translation_error_mm": shift_mm,
+        "translation_sigma_mm": 1000 * np.sqrt(shift_variance),
+    }

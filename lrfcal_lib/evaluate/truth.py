@@ -1,0 +1,70 @@
+"""What a simulated session was made with, and the errors of calibrations against it."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.board import Board
+from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulated session was made with.
+
+    `cameras` are ``T_camera_lrf`` of a camera on the head, ``T_camera_platform`` of one on the
+    base; `boards` ``T_platform_board`` by placement, `pitch` that of every scan line by placement,
+    radians.
+    """
+
+    T_head_lrf: RigidTransform
+    cameras: dict
+    board: Board
+    boards: dict
+    pitch: dict
+
+
+def read_truth(session):
+    """The :class:`Truth` of a session, None for a recording.
+
+    A SessionError if ``truth.json`` is damaged.
+    """
+    file = session.path / "truth.json"
+    if not os.path.lexists(file):
+        return None
+    data = read_json(file, session.path)
+    with naming(f"{file} (simulate the session again)"):
+        cameras = {}
+        for name, entry in data["cameras"].items():
+            on_head = "T_camera_lrf" in entry
+            pose = entry["T_camera_lrf"] if on_head else entry["T_camera_platform"]
+            cameras[name] = transform_from_json(pose)
+        boards = {}
+        for number, entry in data["boards"].items():
+            boards[int(number)] = transform_from_json(entry["T_platform_board"])
+        pitch = {}
+        for number, entry in data["sweeps"].items():
+            pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
+        head = transform_from_json(data["T_head_lrf"])
+        return Truth(head, cameras, board_from_json(data["board"]), boards, pitch)
+
+
+def camera_errors(solution, truth, camera):
+    """Rotation (degrees) and translation error (millimetres) of a camera, by column.
+
+    None without truth.
+    """
+    if truth is None:
+        return {}
+    angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
+    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+
+
+def axis_errors(T_head_lrf, truth):
+    """Direction (degrees) and offset error (millimetres) of a tilt axis."""
+    true = geometry.axis_of(truth.T_head_lrf)
+    angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), true)
+    return np.rad2deg(angle), 1000 * offset
