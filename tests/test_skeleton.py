@@ -6,22 +6,47 @@ import subprocess
 import tomllib
 
 import pytest
+import yaml
 from shared import ROOT
 
 LISTED = (ROOT / "environment.txt").read_text()
-PINS = [line.split("#")[0].strip() for line in LISTED.splitlines() if line.split("#")[0].strip()]
+REASONS = dict(re.findall(r"^#   (\S+) +(\w+)$", LISTED, re.MULTILINE))
+PINS = re.sub(r"^#.*\n|\\\n", "", LISTED, flags=re.MULTILINE).split("\n")[1:-1]
+WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text())
 
 
 def normal(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_every_package_is_pinned_exactly_and_once_and_direct_ones_say_why():
-    assert [line for line in PINS if not re.fullmatch(r"[A-Za-z0-9._-]+==\d[\w.]*", line)] == []
-    names = [normal(line.split("==")[0]) for line in PINS]
-    assert len(names) == len(set(names)) and len(names) > 100
-    lines = [line for line in LISTED.split("# What those need in turn")[0].splitlines() if "==" in line]
-    assert len(lines) >= 15 and all(re.search(r"==\S+\s+# \w+$", line) for line in lines)
+def test_every_package_is_pinned_with_its_sums_once_and_direct_ones_say_why():
+    pin = re.compile(r"[A-Za-z0-9._-]+==\d[\w.]*( +--hash=sha256:[0-9a-f]{64}){1,4}")
+    assert [line for line in PINS if not pin.fullmatch(line)] == []
+    names = [line.split("==")[0] for line in PINS]
+    assert len(set(map(normal, names))) == len(names) > 100
+    assert len(REASONS) >= 15 and REASONS.keys() <= set(names)
+
+
+def test_pip_takes_no_file_without_a_listed_sum():
+    installs = [line for line in (ROOT / ".ci" / "setup").read_text().splitlines() if "pip install" in line]
+    own = [line for line in installs if line.endswith(" -e .")]
+    assert len(own) == 1 and len(installs) == 3
+    assert all("--require-hashes" in line for line in installs if line not in own)
+
+
+@pytest.mark.parametrize("job", WORKFLOW["jobs"])
+def test_the_workflow_runs_fixed_actions_without_rights(job):
+    assert WORKFLOW["permissions"] == {"contents": "read"} and "permissions" not in WORKFLOW["jobs"][job]
+    actions = [step for step in WORKFLOW["jobs"][job]["steps"] if "uses" in step]
+    assert actions and all(re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in actions)
+    assert actions[0]["with"] == {"persist-credentials": False}
+
+
+def test_the_workflow_runs_what_takes_long_once_a_week():
+    assert WORKFLOW[True]["schedule"]  # YAML reads "on" so
+    runs = " ".join(step.get("run", "") for step in WORKFLOW["jobs"]["long"]["steps"])
+    targets = WORKFLOW["jobs"]["long"]["strategy"]["matrix"]["command"]
+    assert targets == ["make campaign", "make fuzz", ".ci/recordings"] and "${{ matrix.command }}" in runs
 
 
 def test_what_the_package_needs_is_pinned():
