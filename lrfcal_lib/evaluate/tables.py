@@ -22,7 +22,7 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.prepared import VARIANTS
-from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
+from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 from lrfcal_lib.solvers import METHODS, solve_camera
 from lrfcal_lib.solvers.joint import solve_again
 from lrfcal_lib.solvers.joint_noise import on_board
@@ -80,12 +80,12 @@ def read_truth(session):
         return None
     data = read_json(file, session.path)
     with naming(f"{file} (simulate the session again)"):
-        mounts, cameras = ("T_camera_lrf", "T_camera_platform"), data["cameras"].items()
+        cameras = {c: e.get("T_camera_lrf") or e["T_camera_platform"] for c, e in data["cameras"].items()}
         return Truth(
-            transform_from_json(data["T_head_lrf"]),
-            {c: transform_from_json(next(e[mount] for mount in mounts if mount in e)) for c, e in cameras},
+            from_json(TransformStated, data["T_head_lrf"]).made(),
+            {camera: from_json(TransformStated, transform).made() for camera, transform in cameras.items()},
             board_from_json(data["board"]),
-            {int(n): transform_from_json(entry["T_platform_board"]) for n, entry in data["boards"].items()},
+            {int(n): from_json(TransformStated, e["T_platform_board"]).made() for n, e in data["boards"].items()},
             {int(n): np.asarray(entry["pitch_rad"], float) for n, entry in data["sweeps"].items()},
         )
 
