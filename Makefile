@@ -1,5 +1,6 @@
 # Every target does its own set-up (.ci/setup). Two commands matter: make report [SESSION=path] and make test.
-SESSION ?=
+# as it was typed: a name like 'cost$5' or 'a$(shell ...)' is a folder, nothing that make works out
+override SESSION := $(value SESSION)
 export SESSION
 PYTHON ?= python3
 RUN := .venv/bin/python

@@ -17,9 +17,10 @@ def run(args):
             print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
         case "check":
             from lrfcal_lib.session.read import open_session, validate
+            from lrfcal_lib.session.stated import printable
 
             problems = validate(args.session)
-            print("\n".join(problems) or f"{args.session}: nothing to complain about")
+            print("\n".join(problems) or f"{printable(args.session)}: nothing to complain about")
             if problems:
                 return 1
             count = len(open_session(args.session).board_placements)

@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 from fake_rig import rig_data
 from scipy.spatial.transform import RigidTransform, Rotation
+from tiny_import import write_source
 
 from lrfcal_lib.drivers.port import PortError, open_port
 from lrfcal_lib.drivers.rig_file import HeadSettings, RigFileError, read_rig_file
@@ -35,6 +36,7 @@ from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
+from lrfcal_lib.session.importers import import_lasersetero
 from lrfcal_lib.session.lms2xx_codec import encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
@@ -44,6 +46,7 @@ SEED, MEMORY, LONGEST_S = 11, 500_000_000, 20.0
 LIBRARY = str(Path(read_rig_file.__code__.co_filename).parents[1])
 READ = (sys.prefix, sys.base_prefix, LIBRARY, __file__, "/proc/self", "/proc/cpuinfo")  # by Python itself
 BATCH, SURVEYED = 2000, 0.02  # cases of a process; share of the cases in which the images are looked at, which is slow
+BOMBED = 0.0005  # share of the damages that unpack to much or take long to read; they take seconds to make
 MODEL = CameraModel(160, 120, 150.0, 150.0, 79.5, 59.5, np.zeros(5))
 LRF = LrfInfo("made up", (0.0, np.pi), np.radians(1.0), 0.005)
 HEAD = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([0.1, -0.2, 0.3]))
@@ -99,6 +102,7 @@ def make_sessions(folder):
     rig["devices"]["head"] |= HeadSettings(degrees_per_second=4.0, repeat_s=0.5).model_dump(mode="json")
     rig["devices"]["cameras"]["left"] |= {"exposure": 0.01, "fps": 10, "silence_s": 10}
     (folder / "rig" / "rig.json").write_text(json.dumps(rig))
+    write_source(folder / "import", np.random.default_rng(0))
     (folder / "outside").mkdir()
     for name in ("secret", "secret.png"):
         (folder / "outside" / name).write_bytes(cv2.imencode(".png", picture(0))[1].tobytes())
@@ -131,15 +135,109 @@ def any_of(rng, *values):
     return values[rng.integers(len(values))]
 
 
+def header_bomb(path):
+    """An array whose header is 900 MB of blanks."""
+    with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with archive.open("ranges.npy", "w", force_zip64=True) as member:
+            member.write(b"\x93NUMPY\2\0" + struct.pack("<I", 900_000_000))
+            for _ in range(45):
+                member.write(b" " * 20_000_000)
+
+
+def packed_bomb(path):
+    """An array and 600 MB of zeros, packed as numpy does not."""
+    with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_BZIP2, compresslevel=1) as archive:
+        with archive.open("ranges.npy", "w", force_zip64=True) as member:
+            member.write(array_of(header_of("(6, 61)", "<f8")))
+            for _ in range(30):
+                member.write(bytes(20_000_000))
+
+
+def directory_bomb(path):
+    """An archive with a million entries of no content behind those of a session."""
+    file = path / "lrf" / "scans.npz"
+    data, entries = file.read_bytes(), 1_000_000
+    end = data.rfind(b"PK\5\6")
+    (first,) = struct.unpack("<I", data[end + 16 : end + 20])
+    entry = b"PK\1\2" + bytes(24) + struct.pack("<H", 7) + bytes(16)
+    table = data[first:end] + b"".join(entry + b"%07d" % number for number in range(entries))
+    large = b"PK\6\6" + struct.pack("<Q2H2L4Q", 44, 45, 45, 0, 0, entries + 6, entries + 6, len(table), first)
+    where = b"PK\6\7" + struct.pack("<LQL", 0, first + len(table), 1)
+    file.write_bytes(data[:first] + table + large + where + b"PK\5\6" + struct.pack("<4H2LH", *OVER))
+
+
+OVER = (0, 0, 2**16 - 1, 2**16 - 1, 2**32 - 1, 2**32 - 1, 0)  # end of an archive: larger numbers stand before it
+
+
+def as_jpeg(path, size, change, **options):
+    """A black JPEG of a size instead of the first image of the left camera, changed, and all that names it."""
+    old = path / "images" / "left" / "0001.png"
+    new = old.with_suffix(".jpg")
+    old.unlink()
+    black = np.zeros((size[1], size[0], 3), np.uint8)
+    data = cv2.imencode(".jpg", black, [x for pair in options.items() for x in (getattr(cv2, pair[0]), pair[1])])[1]
+    new.write_bytes(change(data.tobytes()))
+    for table in (path / "images.csv", path / "edges.csv"):
+        table.write_text(table.read_text().replace("left/0001.png", "left/0001.jpg"))
+    state_size(new, size)
+    first = next(line for line in (path / "images.csv").read_text().splitlines() if "0001.jpg" in line)
+    others = [line for line in (path / "images.csv").read_text().splitlines() if "left/" not in line]
+    (path / "images.csv").write_text("\n".join([*others, first]) + "\n")
+
+
+def segments_bomb(path, mark=b"\xff\xe5"):
+    """A JPEG with twelve million empty segments before its size."""
+    as_jpeg(path, (160, 120), lambda data: data[:2] + 12_000_000 * (mark + b"\0\2") + data[2:])
+
+
+def remarks_bomb(path):
+    """The same with segments of the kind that OpenCV keeps."""
+    segments_bomb(path, b"\xff\xe1")
+
+
+def scans_bomb(path):
+    """A JPEG of 30 megapixels whose last scan stands there 5000 times."""
+
+    def repeat(data):
+        last = data[data.rindex(b"\xff\xda") : -2]
+        return data[:-2] + 5000 * last + data[-2:]
+
+    as_jpeg(path, (6000, 5000), repeat, IMWRITE_JPEG_PROGRESSIVE=1)
+
+
+def chunks_bomb(path):
+    """A PNG with four million empty chunks before its pixels."""
+    file = path / "images" / "left" / "0001.png"
+    data, chunk = file.read_bytes(), b"abCd"
+    chunk = bytes(4) + chunk + struct.pack(">I", zipfile.crc32(chunk))
+    file.write_bytes(data[:33] + 4_000_000 * chunk + data[33:])
+
+
+def rows_bomb(path):
+    """One image of 30 megapixels, named 10 000 times."""
+    as_jpeg(path, (6000, 5000), lambda data: data)
+    with (path / "images.csv").open("r+") as table:
+        table.write(10_000 * table.readlines()[-1])
+
+
+BOMBS = (
+    header_bomb, packed_bomb, directory_bomb, segments_bomb, remarks_bomb, scans_bomb, chunks_bomb, rows_bomb,
+)  # fmt: skip
+
+
 def damage(rng, path):
     """Damage one file of a session."""
+    if rng.random() < BOMBED and (path / "edges.csv").is_file():
+        with suppress(Exception):  # another damage was there before
+            return any_of(rng, *BOMBS)(path)
     files = sorted(p for p in path.rglob("*") if not p.is_symlink() and p.is_file() and p.stat().st_size < 100_000_000)
     if not files:
         return
     file = any_of(rng, *files)
     if file.suffix in (".png", ".jpg") and rng.random() < 0.6:  # small tables and statements matter as much
         file = any_of(rng, *files)
-    kind = {".json": text, ".csv": any_of(rng, text, rows), ".npz": arrays, ".bin": raw}.get(file.suffix, pixels)
+    kinds = {".json": text, ".csv": any_of(rng, text, rows), ".npz": arrays, ".bin": raw, ".pcd": points, ".m": text}
+    kind = kinds.get(file.suffix, pixels)
     try:
         any_of(rng, kind, kind, kind, kind, raw, other)(rng, file)
     except Exception:
@@ -161,6 +259,15 @@ def text(rng, file):
     first = int(rng.integers(len(ends) - 1))
     last = int(rng.integers(first + 1, len(ends))) if rng.random() < 0.2 else first + 1
     file.write_bytes((words[: ends[first] + 1] + any_of(rng, *NASTY) + words[ends[last] :]).encode("utf-8", "replace"))
+
+
+def points(rng, file):
+    """Another word somewhere in a cloud, or as many scan lines as there is room for."""
+    if rng.random() < 0.98:
+        return text(rng, file)
+    n = 200_000
+    rows = "".join(f"0 {1 + k % 2} 0.5\n" for k in range(n))
+    file.write_text(f"FIELDS x y z\nPOINTS {n}\nDATA ascii\n{rows}")
 
 
 def rows(rng, file):
@@ -253,23 +360,34 @@ def other(rng, file):
 # ---------------------------------------------------------------------------------------------- what is done with it
 
 
-def use(rng, path):
+def use(rng, path, kind):
     """Everything that reads a session, and some that writes; the errors that came out."""
-    if (path / "rig.json").exists():
-        return [_caught(_open_rig, path / "rig.json")]  # what it names belongs to who wrote it
+    if kind in OWN:
+        return [_caught(OWN[kind], path)]
     read = any_of(rng, validate, _survey if rng.random() < SURVEYED else read_all)
     return [_caught(work, path) for work in (read, *[any_of(rng, _go_on, finish)] * (rng.random() < 0.3))]
 
 
-def _open_rig(file):
+def _open_rig(path):
     """What is stated can be asked of the drivers, and no time is endless."""
-    devices = read_rig_file(file).devices
+    devices = read_rig_file(path / "rig.json").devices
     for one in (devices.lrf, devices.head, *devices.cameras.values()):
         times = [value for name, value in vars(one).items() if name.endswith("_s") and value is not None]
         assert max(times, default=0) <= 3600
     for one in (devices.lrf, devices.head):
         with suppress(PortError):
             open_port(f"/nowhere{one.port}", devices.head.baudrate, timeout=0.1)
+
+
+def _import(path):
+    """A message names the file that is wrong, be it in the source or in what was made of it."""
+    try:
+        import_lasersetero(path, path / "made", intrinsics="published")
+    except SessionError as error:
+        assert str(path) in str(error), error
+
+
+OWN = {"rig": _open_rig, "import": _import}  # what these name belongs to who wrote them, and may lie anywhere
 
 
 def _survey(path):
@@ -340,12 +458,13 @@ def run_case(number, seed, sound, folder, watch):
     """One case; the findings as (kind, text, traceback)."""
     rng, case = np.random.default_rng([seed, number]), folder / "case"
     shutil.rmtree(case, ignore_errors=True)
-    shutil.copytree(sound / ("scans", "telegrams", "telegrams", "scans", "rig")[number % 5], case, symlinks=True)
+    kind = ("scans", "telegrams", "telegrams", "scans", "rig", "import")[number % 6]
+    shutil.copytree(sound / kind, case, symlinks=True)
     for _ in range(any_of(rng, 1, 1, 1, 2, 3)):
         damage(rng, case)
     with watch:
-        found = [f for f in use(rng, case) if f]
-    return found + [("outside", text, "") for text in watch.seen if not (case / "rig.json").exists()]
+        found = [f for f in use(rng, case, kind) if f]
+    return found + [("outside", text, "") for text in watch.seen if kind not in OWN]
 
 
 def _batch(numbers, seed, base, at):

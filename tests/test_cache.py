@@ -97,6 +97,36 @@ def test_a_folder_that_others_may_write_to_is_refused(folder, session, mode):
     assert stage.calls == 1
 
 
+def owned_by_nobody(kept, patch):
+    if os.geteuid():
+        pytest.skip("only root can give files away")
+    os.chown(kept, 65534, 65534)
+
+
+def linked(kept, patch):
+    kept.rename(kept.parents[1] / "elsewhere")
+    kept.symlink_to(kept.parents[1] / "elsewhere")
+
+
+FOREIGN = {
+    "others may write to .*owner 65534": owned_by_nobody, "is a link, not a file": linked,
+    "others may write to .*mode 666.*chmod go-w": lambda kept, patch: kept.chmod(0o666),
+    "others may write to .*mode 620.*chmod go-w": lambda kept, patch: kept.chmod(0o620),
+    "others may rename what is in .*mode 777.*chmod go-w": lambda kept, patch: kept.parents[1].chmod(0o777),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("told", FOREIGN)
+def test_what_is_not_ours_is_not_unpickled(folder, session, monkeypatch, told):
+    stage = Stage()
+    stage.run(session)
+    (kept,) = folder.glob("*.pickle")
+    kept.write_bytes(b"cos\nabort\n(tR.")  # ends this process where it is unpickled
+    FOREIGN[told](kept, monkeypatch)
+    with pytest.raises(ValueError, match=told):
+        stage.run(session)
+
+
 def test_of_two_at_the_same_time_the_second_waits(folder, session):
     stage = Stage()
     slow = cache.cached(lambda of: time.sleep(0.2) or stage.run.__wrapped__(of))

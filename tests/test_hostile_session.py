@@ -1,19 +1,26 @@
 """Sessions of strangers: what they name is not followed out of their folder, and what they promise is not unpacked."""
 
 import contextlib
+import fcntl
 import json
+import multiprocessing
 import os
 import re
 import shutil
+import subprocess
+import sys
 import zipfile
+from pathlib import Path
 
 import fuzz
 import numpy as np
 import pytest
+from shared import campaign
 
+from lrfcal_lib.__main__ import main
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.stated import SessionError, alone
 
 SCANS = ["session.json", "lrf/scans.npz", "images.csv", "edges.csv", "images/left/0001.png", "truth.json"]
 FILES = [f"scans/{name}" for name in SCANS]
@@ -52,15 +59,26 @@ def test_only_plain_files_of_a_size_are_read(folder, name, told):
         fuzz.read_all(folder / name.partition("/")[0])
 
 
+LINKS = {"is a link": Path.symlink_to, r"has another name elsewhere \(a hard link\); copy": Path.hardlink_to}
+
+
+WRITTEN_ANEW = ("images.csv", "lrf/index.csv")  # as a draft, when a recording goes on, without what was broken off
+
+
+@pytest.mark.parametrize("link", LINKS)
 @pytest.mark.parametrize("name", ["session.json.draft", "images.csv.draft", "lrf/index.csv.draft", "writer.lock",
                                   "platform.csv", "images.csv", "lrf/index.csv", "lrf/telegrams.bin"])  # fmt: skip
-def test_nothing_is_written_behind_a_link(folder, name):
-    secret, path = folder / "outside" / "secret", folder / "telegrams"
-    (path / name).unlink(missing_ok=True)
-    (path / name).symlink_to(secret)
-    before, told = secret.read_bytes(), contextlib.nullcontext()
-    if not name.endswith(".draft"):  # drafts are replaced
-        told = pytest.raises(SessionError, match=rf"{re.escape(name)}: is a link")
+def test_nothing_is_written_behind_a_link(folder, name, link):
+    path = folder / "telegrams"
+    secret = folder / "outside" / "secret"
+    if (path / name).exists():
+        (path / name).replace(secret)  # so that it can be read, and would be written to
+    LINKS[link](path / name, secret)
+    before = secret.read_bytes()
+    told = contextlib.nullcontext()
+    anew = LINKS[link] is Path.hardlink_to and name in WRITTEN_ANEW
+    if not anew and not name.endswith(".draft"):  # drafts are replaced
+        told = pytest.raises(SessionError, match=rf"{re.escape(name)}: {link}")
     with told, fuzz.recorder(path) as writer:
         fuzz.add(writer, 7)
     assert secret.read_bytes() == before
@@ -73,6 +91,39 @@ def lying(path, shape, kind="<f8"):
     """An archive whose ranges state a shape, and are few bytes."""
     with zipfile.ZipFile(path / "lrf" / "scans.npz", "w") as archive:
         archive.writestr("ranges.npy", fuzz.array_of(fuzz.header_of(shape, kind)))
+
+
+def stated_header(path):
+    """Ranges whose header would be 896 MB long, of which a few are there."""
+    with zipfile.ZipFile(path / "lrf" / "scans.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("ranges.npy", b"\x93NUMPY\2\0" + (896_000_000).to_bytes(4, "little") + b" " * 1_000_000)
+
+
+def many_members(path):
+    """An archive with more files than a session has arrays."""
+    with zipfile.ZipFile(path / "lrf" / "scans.npz", "a") as archive:
+        for number in range(200):
+            archive.writestr(f"{number}", b"")
+
+
+def repacked(path):
+    """The arrays packed by LZMA, which is not unpacked in steps."""
+    file = path / "lrf" / "scans.npz"
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+
+
+def jpeg(change, **options):
+    """A JPEG as first image, with other bytes."""
+    return lambda path: fuzz.as_jpeg(path, (160, 120), change, **options)
+
+
+def scans_again(data):
+    """The last scan of a JPEG a hundred times more."""
+    return data[:-2] + 100 * data[data.rindex(b"\xff\xda") : -2] + data[-2:]
 
 
 def bomb(path):
@@ -93,11 +144,26 @@ def replaced(name, old, new):
     return replace
 
 
+def named_again(path):
+    """An image that the table names a second time, in other words."""
+    with (path / "images.csv").open("a") as table:
+        table.write(",left,images//left/./0001.png,2,,board\n")
+
+
 DEEP, LONG = "[" * 100_000, "9" * 5000
 DAMAGE = {
     "scans.npz: 10000000000 values of scan lines, more than": lambda p: lying(p, "(100000, 100000)"),
     "scans.npz: ranges cannot be read: it holds [|]V1000000": lambda p: lying(p, "(6, 61)", "|V1000000"),
     "scans.npz: cannot be read .*; truncated": lambda p: lying(p, "(6, 61"),
+    "scans.npz: cannot be read .*expected 896000000 bytes got 9988": stated_header,
+    "scans.npz: holds 206 files, more than 100; write it again": many_members,
+    "scans.npz: ranges is packed in another way than numpy does; write it again": repacked,
+    "0001.jpg: a JPEG of 110 scans, more than 100; write": jpeg(scans_again, IMWRITE_JPEG_PROGRESSIVE=1),
+    "0001.jpg: a JPEG of 11000 segments of remarks, more than 10000": jpeg(
+        lambda data: data[:2] + 11_000 * b"\xff\xe1\0\2" + data[2:]
+    ),
+    "0001.jpg: the image is truncated after": jpeg(lambda data: data[:2] + 10_000 * b"\xff\xe5\0\2" + data[2:]),
+    "images.csv line 7: 'images//left/./0001.png' stands in line 4 already; remove one": lambda p: named_again(p),
     "left.height is 30000: at most 30000000 pixels": bomb,
     "session.json: not JSON .*recursion": replaced("session.json", '"source": ""', f'"source": {DEEP}'),
     "session.json: not JSON .*integer": replaced("session.json", '"source": ""', f'"source": {LONG}'),
@@ -107,11 +173,36 @@ DAMAGE = {
     "truth.json .*simulate the session again.* 'items'": lambda p: (p / "truth.json").write_text(
         json.dumps(json.loads((p / "truth.json").read_text()) | {"cameras": []})
     ),
+    "truth.json .*key 'T_camera_platform' is missing": replaced("truth.json", '{"T_camera_lrf"', '{"pose"'),
+    "truth.json .*it is None: an object is needed": lambda p: (p / "truth.json").write_text(
+        json.dumps(json.loads((p / "truth.json").read_text()) | {"T_head_lrf": None})
+    ),
     "truth.json: not JSON": lambda p: (p / "truth.json").write_text(DEEP),
     "index.csv: line 2, offset 9223372036854775803.*restore the file": replaced(
         "../telegrams/lrf/index.csv", ",0,", f",{2**63 - 5},"
     ),
 }
+
+
+LIMITED = """import resource, sys
+import fuzz
+from lrfcal_lib.session.read import validate
+resource.setrlimit(resource.RLIMIT_DATA, (fuzz.MEMORY, fuzz.MEMORY))
+resource.setrlimit(resource.RLIMIT_CPU, (int(fuzz.LONGEST_S), int(fuzz.LONGEST_S)))
+print(*validate(sys.argv[1]))"""
+BOMBS = dict(zip(fuzz.BOMBS, (
+    "cannot be read .*expected 900000000 bytes", "packed in another way", "holds 1000003 files", "truncated after 48",
+    "12000000 segments of remarks", "JPEG of 5010 scans", "^$", "stands in line .* already",
+), strict=True))  # fmt: skip
+
+
+@campaign
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_little_becomes_neither_much_nor_long(folder, bomb):
+    bomb(folder / "scans")
+    command = [sys.executable, "-c", LIMITED, str(folder / "scans")]
+    told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    assert re.search(BOMBS[bomb], told), told
 
 
 @pytest.mark.parametrize("message", DAMAGE)
@@ -140,6 +231,60 @@ def test_a_second_writer_is_told_who_writes(folder):
     assert not (path / "writer.lock").exists()
     fuzz.recorder(path).finish()
     assert open_session(path).placements == (1,)
+
+
+def test_a_lock_whose_file_was_removed_is_not_held(folder, monkeypatch):
+    """Who opened the file before its holder let go of it has locked a file that nobody else can see."""
+    lock = fcntl.flock
+    with contextlib.ExitStack() as first, contextlib.ExitStack() as second:
+        first.enter_context(alone(folder / "scans"))
+
+        def late(*arguments):
+            monkeypatch.undo()
+            first.close()
+            second.enter_context(alone(folder / "scans"))
+            return lock(*arguments)
+
+        monkeypatch.setattr(fcntl, "flock", late)
+        with pytest.raises(SessionError, match="writes this session"), alone(folder / "scans"):
+            pytest.fail("two hold it")
+
+
+def take(path, times, both):
+    """Take the lock of a session so many times; `both` counts how often somebody else had it as well."""
+    while times:
+        with contextlib.suppress(SessionError), alone(path):
+            times -= 1
+            try:
+                os.close(os.open(path / "held", os.O_CREAT | os.O_EXCL))
+                os.unlink(path / "held")
+            except FileExistsError:
+                both.value += 1
+
+
+@pytest.mark.parametrize("times", [300, pytest.param(100_000, marks=campaign)])
+def test_never_two_hold_the_lock(tmp_path, times):
+    fork = multiprocessing.get_context("fork")
+    both = fork.Value("i", 0)
+    takers = [fork.Process(target=take, args=(tmp_path, times // 3, both)) for _ in range(3)]
+    for taker in takers:
+        taker.start()
+    for taker in takers:
+        taker.join()
+    assert [taker.exitcode for taker in takers] == [0, 0, 0] and both.value == 0
+
+
+def test_names_of_a_stranger_do_not_steer_the_terminal(folder, capsys):
+    names = "images/left/\x1b]0;owned\x07.png", "images/left/\u202egnp.png"
+    shutil.copytree(folder / "scans", sound := folder / "\x1b[31msound")
+    assert main(["check", str(sound)]) == 0 and "\\x1b[31msound: nothing" in capsys.readouterr().out
+    for name in names:
+        shutil.copytree(folder / "scans", path := folder / f"\x1b[31m{names.index(name)}")
+        replaced("images.csv", "images/left/0001.png", name)(path)
+        assert main(["check", str(path)]) == 1
+        told = capsys.readouterr()
+        assert (told.out + told.err).replace("\n", "").isprintable()
+        assert "must be printable" in told.out and ascii(name)[1:-1] in told.out and "\\x1b[31m" in told.out
 
 
 def test_check_finds_what_two_writers_or_hands_do_to_tables(folder):

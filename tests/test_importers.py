@@ -1,9 +1,12 @@
 """Other people's recordings become sessions without loss."""
 
-import cv2
+import os
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tiny_import import BOUGUET, authors_points, write_source
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
@@ -11,51 +14,6 @@ from lrfcal_lib.session import importers
 from lrfcal_lib.session.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError, transform_from_json
-
-BOUGUET = """
-fc = [ 700.5 ; 701.5 ];
-cc = [ 15.25 ; 11.75 ];
-alpha_c = 0.000000000000000;
-kc = [ -0.17 ; 0.02 ; -0.0003 ; 0.0004 ; 0.0 ];
-fc_error = [ 3.0 ; 6.0 ];
-cc_error = [ 0.3 ; 0.6 ];
-kc_error = [ 0.003 ; 0.0 ; 0.0 ; 0.0 ; 0.0 ];
-%-- Image size:
-nx = 32;
-ny = 24;
-omc_1 = [ -7.4e-01 ; -3.0e-01 ; 1.4e+00 ];
-Tc_1  = [ -1.428e+02 ; 9.8e+01 ; 1.3e+03 ];
-"""
-
-
-def authors_points(ranges, bearing_deg, p):
-    """The README's formulas of the authors' platform, point by point; their bearing and pitch angle."""
-    b = np.radians(bearing_deg)
-    X, S = ranges * np.sin(b) - 0.038, ranges * np.cos(b) + 0.0045
-    y, z = 0.157 * np.cos(p) + S * np.sin(p), 0.157 * np.sin(p) - S * np.cos(p) + 0.2
-    return np.round(np.stack([X, y, z], axis=-1), 6)
-
-
-def polar(rng, lines=6):
-    """Ranges (whole millimetres), the authors' bearings and pitch of a few scan lines in acquisition order."""
-    rows = [np.arange(*np.sort(rng.choice(np.arange(-300, 301), 2, replace=False)) + [0, 9]) / 10 for _ in range(lines)]
-    ranges = [np.round(1.5 + 0.3 * rng.random(len(row)), 3) for row in rows]
-    return ranges, rows, np.linspace(1.0, 1.4, lines)
-
-
-def write_source(folder, rng):
-    folder.mkdir()
-    for n in (1, 2):
-        ranges, bearings, pitch = polar(rng)
-        points = np.concatenate([authors_points(r, b, p) for r, b, p in zip(ranges, bearings, pitch, strict=True)])
-        header = f"# .PCD v.7\nFIELDS x y z\nPOINTS {len(points)}\nDATA ascii\n"
-        rows = "\n".join(" ".join(f"{v:.6f}" for v in p) for p in points)
-        (folder / f"plane_{n:02d}.pcd").write_text(header + rows)
-    for name in ("left", "right"):
-        (folder / f"Calib_Results_{name}.m").write_text(BOUGUET)
-        for n in (1, 2):
-            cv2.imwrite(str(folder / f"{name}_{n:02d}.png"), rng.integers(0, 255, (24, 32, 3)).astype(np.uint8))
-    return folder
 
 
 @pytest.fixture
@@ -85,14 +43,45 @@ def cloud(change):
     return lambda folder: read_pcd(written(folder / "a.pcd", change((folder / "plane_01.pcd").read_text())))
 
 
+def no_file(name, make):
+    """Import a folder in which something else has the name of a file."""
+
+    def work(folder):
+        (folder / name).unlink()
+        make(folder / name)
+        import_lasersetero(folder, folder.parent / "other")
+
+    return work
+
+
+def long(file):
+    file.touch()
+    os.truncate(file, 3_000_000_000)
+
+
+def results(old, new):
+    """Read results of a calibration with another text."""
+    return lambda folder: read_bouguet(written(folder / "c.m", BOUGUET.replace(old, new)))
+
+
+def scattered(lines):
+    """Points of which each begins a scan line."""
+    return authors_points(np.full(lines, 1.5), np.where(np.arange(lines) % 2, 5.0, 5.1), np.arange(lines) % 7 / 100 + 1)
+
+
 def line(first):
     return authors_points(np.full(50, 1.5), first + np.arange(50) / 10, 1.2)
 
 
 REFUSED = [
     (lambda _: recover_polar(line(0) + [0, 0, 4e-4], "c 7"), r"c 7: rebuilding the points misses by 0\.\d+ mm, more"),
-    (lambda _: recover_polar(line(39.6)), r"bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55 \.\. 125"),
+    (lambda _: recover_polar(line(39.6), "c 8"), r"c 8: bearings reach 45\.5 \.\. 50\.4 deg, the LMS400 sees 55"),
     (lambda folder: read_bouguet(written(folder / "c.m", "fc = [ 1 ; 2 ];\n")), r"c\.m: no value of cc, kc"),
+    (results("-0.17 ;", ""), r"c\.m: no value of kc"),
+    (results("32", "1e999"), r"c\.m: values of nx are not finite"),
+    (results("32", "3-2"), r"c\.m: could not convert"),
+    (results("1.3e+03", "1.3e+03 ; 1"), r"c\.m: .*shape"),
+    (lambda _: recover_polar(scattered(20_000), "c 9"), "c 9: 14020000 values of scan lines, more than 12000000"),
     (lambda folder: read_pcd(folder / "none.pcd"), r"none\.pcd: No such file"),
     (lambda folder: import_lasersetero(folder, folder / "dst", intrinsics="best"), "'own' or 'published', got 'best'"),
     (without("plane_*"), "plane_.*"),
@@ -100,6 +89,13 @@ REFUSED = [
     (cloud(lambda text: text[: len(text) // 2].rpartition("\n")[0]), "truncated"),
     (cloud(lambda text: text.replace("0.", "0,", 40)), "could not convert"),
     (cloud(lambda text: text.replace("x y z", "x y z rgb")), "ASCII PCD file with the fields x y z"),
+    (cloud(lambda text: re.sub("POINTS .*", "POINTS many", text)), "a.pcd: invalid literal .*; damaged"),
+    (cloud(lambda text: re.sub(r"\n[-.\d]+ ", "\nnan ", text)), "a.pcd: .*not finite"),
+    (no_file("plane_02.pcd", os.mkfifo), "plane_02.pcd: is a named pipe, not a file"),
+    (no_file("left_02.png", os.mkdir), "left_02.png: is a folder, not a file"),
+    (no_file("Calib_Results_left.m", lambda file: file.symlink_to("/dev/zero")), "zero: is a device, not a file"),
+    (no_file("plane_01.pcd", lambda file: file.symlink_to(file)), "plane_01.pcd: is a link, not a file"),
+    (no_file("plane_01.pcd", long), "plane_01.pcd: 3000 MB, more than 8 MB"),
 ]
 
 

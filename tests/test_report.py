@@ -2,6 +2,7 @@
 
 import html
 import json
+import multiprocessing
 import os
 import re
 import select
@@ -9,13 +10,14 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pandas as pd
 import pytest
-from shared import ROOT, campaign
+from shared import ROOT, campaign, until
 from test_session import CAMERAS, HEAD, LRF, wall
 
 from lrfcal_lib.model.board import triangle_board
@@ -237,10 +239,52 @@ def test_a_folder_that_cannot_be_written_is_named(session, tmp_path, capsys):
     assert re.search(r"file/out: cannot write the report .*--out names another folder", capsys.readouterr().err)
 
 
-def test_make_takes_a_session_with_a_space():
-    command = ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'", 'SESSION=a "b c']
-    shown = subprocess.run(command, cwd=report.ROOT, capture_output=True, text=True, check=True)
-    assert shown.stdout == '<-m><lrfcal_lib><report><a "b c>'
+NAMES = ['a "b c', "cost$5", "$(shell echo ran >&2)", "$(PYTHON)", "`echo ran >&2`", "${HOME}"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("how", ["argument", "environment"])
+def test_make_takes_any_name_of_a_session(name, how):
+    command = ["make", "-s", "-o", "setup", "report", "RUN=printf '<%s>'"]
+    command += [f"SESSION={name}"] if how == "argument" else []
+    own = {**os.environ, "SESSION": name} if how == "environment" else None
+    shown = subprocess.run(command, cwd=report.ROOT, env=own, capture_output=True, text=True, check=True)
+    assert shown.stdout == f"<-m><lrfcal_lib><report><{name}>" and shown.stderr == ""
+
+
+def replace(out, until):
+    """Put one report after the other in the place of one."""
+    while not until.is_set():
+        with report.in_place_of(out) as new:
+            (new / "index.html").write_text("new")
+            (new / "tables").mkdir()
+            (new / "tables" / "errors.csv").write_text("new")
+
+
+@pytest.mark.parametrize("exchange", [report.EXCHANGE, 1 << 20], ids=["exchange", "not known here"])
+@pytest.mark.parametrize("looks", [1000, pytest.param(20_000, marks=campaign)])
+def test_a_report_that_is_replaced_is_never_missing(tmp_path, monkeypatch, looks, exchange):
+    monkeypatch.setattr(report, "EXCHANGE", exchange)  # another flag is refused
+    (out := tmp_path / "wall").mkdir()
+    for name in ("index.html", "notes.txt", "00_old.html"):
+        (out / name).write_text("old")
+    fork = multiprocessing.get_context("fork")
+    end = fork.Event()
+    writers = [fork.Process(target=replace, args=(out, end)) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    until(lambda: not (out / "00_old.html").exists())
+    there = 0
+    for _ in range(looks):
+        there += (out / "index.html").exists()
+        time.sleep(1e-4)  # so that the writers get on
+    end.set()
+    for writer in writers:
+        writer.join()
+    assert there == looks and [writer.exitcode for writer in writers] == [0, 0]
+    found = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
+    assert found == ["wall/index.html", "wall/notes.txt", "wall/tables/errors.csv"]
+    assert (out / "notes.txt").read_text() == "old"
 
 
 def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
+from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,15 @@ def read_truth(session):
     with naming(f"{file} (simulate the session again)"):
         cameras = {}
         for name, entry in data["cameras"].items():
-            on_head = "T_camera_lrf" in entry
-            pose = entry["T_camera_lrf"] if on_head else entry["T_camera_platform"]
-            cameras[name] = transform_from_json(pose)
+            pose = entry.get("T_camera_lrf") or entry["T_camera_platform"]
+            cameras[name] = from_json(TransformStated, pose).made()
         boards = {}
         for number, entry in data["boards"].items():
-            boards[int(number)] = transform_from_json(entry["T_platform_board"])
+            boards[int(number)] = from_json(TransformStated, entry["T_platform_board"]).made()
         pitch = {}
         for number, entry in data["sweeps"].items():
             pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
-        head = transform_from_json(data["T_head_lrf"])
+        head = from_json(TransformStated, data["T_head_lrf"]).made()
         return Truth(head, cameras, board_from_json(data["board"]), boards, pitch)
 
 

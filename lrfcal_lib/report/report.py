@@ -1,5 +1,6 @@
 """Execute the notebooks on a session and write what they found to ``reports/<session>/``."""
 
+import ctypes
 import hashlib
 import json
 import os
@@ -38,6 +39,7 @@ OWN_FILES = (  # folders, files to link to, the page itself
     "findings.json", "index.html",
 )  # fmt: skip
 BESIDE = ("Expected error", "In the image of")  # begin sentences of a verdict that the first screen tells in numbers
+AT_WORKING_FOLDER, EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux, see renameat2(2)
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
@@ -84,7 +86,8 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session = open_session(session_path)
     out = Path(out or ROOT / "reports" / session_path.name).resolve()
     paths = sorted(NOTEBOOKS.glob(NUMBERED) if notebooks is None else map(Path, notebooks))
-    with _beside(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:  # fresh: a report stands for its session
+    # a fresh cache: a report stands for its session
+    with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
         runs = _execute_all(paths, environment, jobs)
         found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
@@ -190,7 +193,7 @@ def _store_all(session):
 
 
 @contextmanager
-def _beside(out):
+def in_place_of(out):
     """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -204,16 +207,43 @@ def _beside(out):
 
 
 def _take_place(new, out):
-    """Exchange two folders; files in the old one that are no report's come along."""
+    """Exchange two folders; files in the old one that are no report's come along.
+
+    At every moment, also that of a kill, there is a report: the old one or the new one. Where the system cannot
+    exchange folders (file systems over a network, macOS), each file of the new one takes the place of an old one.
+    """
 
     def ours(folder, names):
-        pages = (name for name in names if re.fullmatch("[0-9]{2}_.*[.]html", name))
-        return {*OWN_FILES, *pages} if folder == str(out) else ()
+        return filter(_is_ours, names) if folder == str(out) else ()
 
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
-    out.rename(new.with_name("old"))
-    new.rename(out)
+    if not _exchanged(new, out):
+        _move_files(new, out)
+
+
+def _is_ours(name):
+    """Whether a file or folder of a report was written by one."""
+    return name in OWN_FILES or re.fullmatch("[0-9]{2}_.*[.]html", name)
+
+
+def _exchanged(one, other):
+    """Whether the system has exchanged two folders, at once."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    return rename(AT_WORKING_FOLDER, os.fsencode(one), AT_WORKING_FOLDER, os.fsencode(other), EXCHANGE) == 0
+
+
+def _move_files(new, out):
+    """Move every file of a folder into another one, the first page last; then remove a report's files that are old."""
+    files = sorted(file.relative_to(new) for file in new.rglob("*") if not file.is_dir())
+    for file in sorted(files, key=lambda file: file == Path("index.html")):
+        (out / file.parent).mkdir(parents=True, exist_ok=True)
+        (new / file).replace(out / file)
+    for file in (file.relative_to(out) for file in out.rglob("*") if not file.is_dir()):
+        if _is_ours(file.parts[0]) and file not in files:
+            (out / file).unlink(missing_ok=True)
 
 
 def _execute_all(paths, environment, jobs):

@@ -3,7 +3,8 @@
 Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there for
 whoever asks for the same again. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs.
 Results are pickles: they hold nested dataclasses with arrays and transforms of SciPy, for which no plain format is as
-short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root).
+short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root), or
+may put another one in the place of; so is a file in it, and a link.
 """
 
 import fcntl
@@ -11,6 +12,7 @@ import hashlib
 import os
 import pickle
 import signal
+import stat
 import sys
 import threading
 from contextlib import contextmanager, suppress
@@ -22,7 +24,11 @@ import cv2
 import numpy as np
 import scipy
 
+from lrfcal_lib.session.stated import opened
+
 VARIABLE = "LRFCAL_CACHE"
+REMEDY = "and what lies there is run; chmod go-w, or name a folder of your own"
+LARGEST_RESULT = 4_000_000_000  # bytes that are read; the largest are clouds of some 100 MB
 _processes = 1  # that share a loop
 
 
@@ -49,10 +55,8 @@ def cached(stage):
         if not os.environ.get(VARIABLE):
             return stage(of, *args, **options)
         folder, session = Path(os.environ[VARIABLE]), getattr(getattr(of, "prepared", of), "session", of)
-        found = folder.stat() if folder.exists() else None
-        if found and (found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o022):
-            may = f"others may write to '{folder}' (owner {found.st_uid}, mode {found.st_mode & 0o7777:o})"
-            raise ValueError(f"{VARIABLE}: {may}, and what lies there is run; chmod go-w, or name a folder of your own")
+        if folder.exists():
+            _refuse_shared(folder)
         key = hashlib.sha256(pickle.dumps((stage.__qualname__, of, args, sorted(options.items()))))
         for file in (Path(record.file) for record in session.image_records):
             key.update(file.read_bytes() if file.is_file() else b"missing")
@@ -60,16 +64,35 @@ def cached(stage):
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with open(file.with_suffix(".lock"), "w") as lock:
+            with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
                 if not file.is_file():
                     result = pickle.dumps(stage(of, *args, **options))
                     with NamedTemporaryFile(dir=folder, delete=False) as part:
                         part.write(result)
                     os.replace(part.name, file)  # whole or not at all
-        return pickle.loads(file.read_bytes())  # only we write there, see above
+        with opened(file, folder, most=LARGEST_RESULT) as stream:
+            _refuse_others(file, os.fstat(stream.fileno()))  # of what is open: the name may be another's file by now
+            return pickle.load(stream)
 
     return look_first
+
+
+def _refuse_shared(folder):
+    """Refuse a folder that others may write to, or put another one in the place of."""
+    _refuse_others(folder, folder.stat())
+    for above in folder.resolve().parents:
+        mode = above.stat().st_mode
+        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            may = f"others may rename what is in '{above}' (mode {mode & 0o7777:o})"
+            raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
+
+
+def _refuse_others(place, status):
+    """Refuse a file or folder that is somebody else's, but for root's, or that somebody else may write to."""
+    if status.st_uid not in (os.geteuid(), 0) or status.st_mode & 0o022:
+        may = f"others may write to '{place}' (owner {status.st_uid}, mode {status.st_mode & 0o7777:o})"
+        raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
 
 
 @lru_cache

@@ -1,5 +1,6 @@
 """Other people's recordings as sessions."""
 
+import math
 import re
 from pathlib import Path
 
@@ -10,7 +11,18 @@ from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session.read import image_size
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, read_bytes, reading, transform_to_json
+from lrfcal_lib.session.stated import (
+    LARGEST_TEXT,
+    CameraInfo,
+    LrfInfo,
+    SessionError,
+    check_amount,
+    naming,
+    read_bytes,
+    reading,
+    short,
+    transform_to_json,
+)
 from lrfcal_lib.session.write import SessionWriter
 
 # LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder ZED_STEREO_LASER_SWEEP.
@@ -73,9 +85,13 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     about["platform_sigma"] = LASERSETERO_PLATFORM_SIGMA
     with SessionWriter(dst, board, lrf, cameras, LASERSETERO_HEAD, **about) as writer:
         misses = []
+        values = 0
         for placement, file in clouds.items():
-            *sweep, miss = recover_polar(read_pcd(file), file)
-            writer.add_sweep(placement, *sweep)
+            ranges, bearings, pitch, miss = recover_polar(read_pcd(file), file)
+            values += ranges.size
+            with naming(file):
+                check_amount(values)
+            writer.add_sweep(placement, ranges, bearings, pitch)
             misses.append(miss)
         for name, files in images.items():
             for placement, file in files.items():
@@ -137,18 +153,18 @@ def recover_polar(points, name="points"):
     low, high = steps.min(), steps.max()
     if low < FIRST or high > LAST:
         reach = f"{STEP_DEG * low:.1f} .. {STEP_DEG * high:.1f} deg"
-        raise SessionError(f"bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
-    grid = np.full((line[-1] + 1, LAST - FIRST + 1), np.nan)
+        raise SessionError(f"{name}: bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
+    shape = (line[-1] + 1, LAST - FIRST + 1)
+    with naming(name):
+        check_amount(math.prod(shape))  # scan lines of few points are long as well
+    grid = np.full(shape, np.nan)
     grid[line, steps.astype(int) - FIRST] = ranges
     return grid, np.radians(np.arange(FIRST, LAST + 1) * STEP_DEG), pitch, miss
 
 
 def source_text(file):
     """Text of somebody else's file."""
-    try:
-        return Path(file).read_text(errors="replace")
-    except OSError as error:
-        raise SessionError(f"{file}: {error.strerror}") from error
+    return read_bytes(file, most=LARGEST_TEXT).decode(errors="replace")
 
 
 def read_pcd(file):
@@ -162,8 +178,11 @@ def read_pcd(file):
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
     with reading(file, "{}; damaged?"):
         points = np.array(body.split(), dtype=float)
-    if points.size != 3 * int(count[1]) or points.size == 0:
-        raise SessionError(f"{file}: {points.size / 3:g} points, the header states {count[1]}; truncated?")
+        promised = int(count[1])
+    if points.size != 3 * promised or points.size == 0:
+        raise SessionError(f"{file}: {points.size / 3:g} points, the header states {promised}; truncated?")
+    if not np.isfinite(points).all():
+        raise SessionError(f"{file}: holds coordinates that are not finite; damaged?")
     return points.reshape(-1, 3)
 
 
@@ -174,10 +193,18 @@ def read_bouguet(file):
     and ``reference``, the same as plain numbers, with ``T_camera_board`` by image number (millimetres became metres).
     """
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
-    values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
-    need = ("fc", "cc", "kc", "nx", "ny", "fc_error", "cc_error", "kc_error")
-    if lacking := [key for key in need if key not in values]:
-        raise SessionError(f"{file}: no value of {', '.join(lacking)}; is this a Calib_Results.m?")
+    with naming(file):
+        values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
+        return _from_bouguet(values)
+
+
+def _from_bouguet(values):
+    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a missing or impossible one."""
+    lengths = {"fc": 2, "cc": 2, "kc": 5, "nx": 1, "ny": 1, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+    if lacking := [key for key, length in lengths.items() if len(values.get(key, ())) != length]:
+        raise ValueError(f"no value of {', '.join(lacking)}; is this a Calib_Results.m?")
+    if endless := [key for key, array in values.items() if not np.isfinite(array).all()]:
+        raise ValueError(f"values of {short(endless)} are not finite; damaged?")
     intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
     model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
     poses = {}

@@ -2,14 +2,15 @@
 
 import math
 import os
+import struct
 from dataclasses import dataclass, field
+from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from zipfile import ZipFile
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import cv2
 import numpy as np
-from PIL import Image
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
@@ -33,6 +34,10 @@ PLATFORM_COLUMNS = ("t_s", "commanded_deg", "measured_deg")
 PURPOSES = ("intrinsics", "board", "scene")
 DROPPED = "dropped"  # purpose of an image of a placement that was recorded again, or never finished
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
+ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
+MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
+PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; of bzip2 and LZMA, zipfile unpacks as much as there is at once
+LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, but reads them first
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -90,22 +95,48 @@ def read_npz(file, within):
     """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
     if not os.path.lexists(file):
         raise SessionError(f"{file}: no such file; a session needs the scan lines")
-    scans, values = {}, 0
-    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream, ZipFile(stream) as archive:
-        for key in (key for key in ARRAYS if f"{key}.npy" in archive.namelist()):
-            with archive.open(f"{key}.npy") as member:
-                old = np.lib.format.read_magic(member) == (1, 0)
-                header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-                shape, _, kind = header(member)
-            values += abs(math.prod(shape))
-            with naming(file):
-                if kind.kind not in "fiub" or kind.itemsize > 8:
-                    raise ValueError(f"{key} cannot be read: it holds {kind}, not numbers; write it without pickles")
-                stated.check_amount(values)
-            with archive.open(f"{key}.npy") as member:
-                scans[key] = np.lib.format.read_array(member, allow_pickle=False)
+    with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
+        _check_entries(file, stream)
+        with ZipFile(stream) as archive:
+            scans = _read_arrays(file, archive)
     with naming(file):
         return check_scans(scans)
+
+
+def _check_entries(file, stream):
+    """Refuse an archive with a long table of contents, of which ZipFile makes objects before it can be asked."""
+    parts = iter(partial(stream.read, 1_000_000), b"")
+    entries = sum(part.count(ENTRY) for part in parts)
+    if entries > MOST_ENTRIES:
+        remedy = f"write it again with the arrays {short(ARRAYS)} only"
+        raise SessionError(f"{file}: holds {entries} files, more than {MOST_ENTRIES}; {remedy}")
+
+
+def _read_arrays(file, archive):
+    """The arrays that a session may have, each checked by its header before it is unpacked."""
+    scans = {}
+    values = 0
+    for key in ARRAYS:
+        name = f"{key}.npy"
+        if name not in archive.namelist():
+            continue
+        if archive.getinfo(name).compress_type not in PACKED:
+            remedy = "write it again with numpy.savez_compressed"
+            raise SessionError(f"{file}: {key} is packed in another way than numpy does; {remedy}")
+        with archive.open(name) as member:
+            beginning = BytesIO(member.read(LONGEST_HEADER))
+        old = np.lib.format.read_magic(beginning) == (1, 0)
+        header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+        shape, _, kind = header(beginning)
+        if kind.kind not in "fiub" or kind.itemsize > 8:
+            words = f"it holds {kind}, not numbers; write it without pickles"
+            raise SessionError(f"{file}: {key} cannot be read: {words}")
+        values += abs(math.prod(shape))
+        with naming(file):
+            stated.check_amount(values)
+        with archive.open(name) as member:
+            scans[key] = np.lib.format.read_array(member, allow_pickle=False)
+    return scans
 
 
 def check_scans(scans):
@@ -163,6 +194,8 @@ def inside(path, name, where):
     windows, posix = PureWindowsPath(name), PurePosixPath(name)
     if windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts:
         raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
+    if not name.isprintable():
+        raise SessionError(f"{path}: {where} must be printable, got '{name}': rename it")
     return path / name
 
 
@@ -174,7 +207,7 @@ def read_images(path, facts, unfinished=None):
     file, cameras = path / "images.csv", facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
-    out, skipped = [], {str(p) for p in unfinished or ()}
+    out, lines, skipped = [], {}, {str(p) for p in unfinished or ()}
     rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
@@ -189,6 +222,8 @@ def read_images(path, facts, unfinished=None):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
+            if (first := lines.setdefault(target, number)) < number:
+                raise ValueError(f"'{row['file']}' stands in line {first} already; remove one of the two rows")
             out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
             check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
     return tuple(out)
@@ -216,19 +251,41 @@ def read_edges(path, facts, records):
 
 
 def image_size(file, data):
-    """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither."""
-    ends = {b"\x89PNG\r\n\x1a\n": b"IEND", b"\xff\xd8": b"\xff\xd9"}
-    end = next((end for begin, end in ends.items() if data.startswith(begin)), None)
-    if end is None:
+    """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither.
+
+    Also for a JPEG that takes long to decode, or much memory, by its number of scans or of segments with remarks.
+    """
+    if data.startswith(PNG):
+        size = struct.unpack(">II", data[16:24]) if data[12:16] == b"IHDR" and len(data) >= 24 else None
+        end = b"IEND"
+    elif data.startswith(JPEG):
+        for mark, most, things in ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks")):
+            if (count := data.count(mark)) > most:
+                raise SessionError(f"{file}: a JPEG of {count} {things}, more than {most}; write the image again")
+        size = _jpeg_size(data)
+        end = b"\xff\xd9"
+    else:
         raise SessionError(f"{file}: neither PNG nor JPEG; convert the image")
-    try:
-        with Image.open(BytesIO(data), formats=("PNG", "JPEG")) as image:
-            size = image.size
-    except Exception:  # whatever Pillow makes of a header
-        size = None
     if size is None or end not in data[-64:]:
         raise SessionError(f"{file}: the image is truncated after {len(data)} bytes; restore it or remove its row")
     return size
+
+
+def _jpeg_size(data):
+    """Width and height from the frame header of a JPEG, None where it does not come within some segments."""
+    at = len(JPEG)
+    for _ in range(MOST_SEGMENTS):
+        if len(data) < at + 9 or data[at] != 0xFF:
+            return None
+        if data[at + 1] in FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        if data[at + 1] == 0xFF:  # a byte that fills up
+            at += 1
+        else:
+            (length,) = struct.unpack_from(">H", data, at + 2)
+            at += 2 + length
+    return None
 
 
 def check_image_size(file, data, camera, size=None):
@@ -238,6 +295,13 @@ def check_image_size(file, data, camera, size=None):
         found = f"{width} x {height} pixels, but camera '{camera.name}' has {camera.width} x {camera.height}"
         raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")
 
+
+PNG = b"\x89PNG\r\n\x1a\n"
+JPEG = b"\xff\xd8"
+FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
+SCAN, REMARK = b"\xff\xda", b"\xff\xe1"  # markers, which do not occur within coded pixels
+MOST_SCANS = 100  # of a JPEG, each of which takes up to 30 ms at 30 megapixels; programs write about ten
+MOST_SEGMENTS = 10_000  # of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
 
 # tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
 ORDERED = {
@@ -410,7 +474,7 @@ def validate(path):
                 dark.append(record)
         except SessionError as error:
             found.append(str(error))
-    return found + _too_dark(session, dark)
+    return [stated.printable(problem) for problem in found + _too_dark(session, dark)]
 
 
 def _too_dark(session, dark):

@@ -9,7 +9,7 @@ import os
 import re
 import socket
 import stat
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
@@ -43,10 +43,16 @@ FILES = (  # of any session, besides its images
 KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "b": "a device", "c": "a device"}
 
 
+def printable(text):
+    """Text as a terminal may show it: what steers the terminal, or cannot be encoded, stands there in letters."""
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
+
+
 class SessionError(ValueError):
     """A session on disk that cannot be used: the message names the file, the value and what to do about it."""
 
     def __init__(self, text):
+        text = printable(text)
         super().__init__(text if len(text) < 2000 else f"{text[:1000]} [...] {text[-500:]}")
 
 
@@ -77,19 +83,24 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     Raises
     ------
     SessionError
-        If the file, or a folder between it and the session's, is a link, or the file is none (a pipe, a device) or too
-        large to be read.
+        If the file, or a folder between it and the session's, is a link, or the file is none (a pipe, a device), too
+        large to be read, or to be written and known by another name as well (a hard link, maybe outside).
     OSError
         If it cannot be opened.
     """
-    file = Path(file).resolve() if within is None else checked(file, within)
+    file = Path(os.path.realpath(file)) if within is None else checked(file, within)
     with suppress(FileNotFoundError):  # a device is not even opened
         found = file.lstat()
         _refuse_other(file, found, "-", "a file")
         if flags == os.O_RDONLY and found.st_size > most:
             raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
     inner = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-    return os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
+    stream = os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
+    if flags != os.O_RDONLY and os.fstat(inner).st_nlink > 1:
+        stream.close()
+        remedy = "copy the session's folder and write to the copy"
+        raise SessionError(f"{file}: has another name elsewhere (a hard link); {remedy}")
+    return stream
 
 
 def _refuse_other(file, status, kind, wanted):
@@ -102,12 +113,12 @@ def _refuse_other(file, status, kind, wanted):
 @contextmanager
 def alone(path):
     """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
-    with opened(Path(path) / LOCK, path, os.O_RDWR | os.O_CREAT) as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = stream.read(200).decode(errors="replace") or "another process"
-            raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+    file = Path(path) / LOCK
+    with ExitStack() as stack:
+        stream = stack.enter_context(_locked(file, path))
+        while not _still_there(file, stream):  # its holder removed the file after we had opened it
+            stack.close()
+            stream = stack.enter_context(_locked(file, path))
         stream.truncate()
         stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
         stream.flush()
@@ -115,7 +126,27 @@ def alone(path):
             yield
         finally:
             with suppress(OSError):  # gone with its session?
-                os.unlink(Path(path) / LOCK)
+                os.unlink(file)
+
+
+def _locked(file, path):
+    """The open lock of a session, which nobody else holds."""
+    stream = opened(file, path, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with stream:
+            holder = stream.read(200).decode(errors="replace") or "another process"
+        raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+    return stream
+
+
+def _still_there(file, stream):
+    """Whether an open file is the one that has this name now."""
+    try:
+        return os.path.samestat(os.fstat(stream.fileno()), os.lstat(file))
+    except FileNotFoundError:
+        return False
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
