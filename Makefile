@@ -6,6 +6,8 @@ PYTHON ?= python3
 RUN := .venv/bin/python
 # Open3D brings dash, whose extension makes JupyterLab ask whether to rebuild itself
 NO_BUILD_QUESTION := --ServerApp.tornado_settings="{'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
+# running the notebook that records leaves its file as it is in the repository
+SAVING := --ServerApp.contents_manager_class=lrfcal_lib.report.saving.Contents
 # JupyterLab refuses root, who often is the only user of a container or a board computer
 AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
 SIMULATED := sim_lms221 sim_quick
@@ -51,7 +53,7 @@ lab: setup
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT INT TERM; \
 	[ -z "$$SESSION" ] || export LRFCAL_SESSION="$$(realpath -- "$$SESSION")"; \
 	[ -w notebooks ] || echo "this folder is read-only: notebooks run, changes to them cannot be saved" >&2; \
-	LRFCAL_CACHE="$$folder" .venv/bin/jupyter lab $(AS_ROOT) $(NO_BUILD_QUESTION) notebooks
+	LRFCAL_CACHE="$$folder" .venv/bin/jupyter lab $(AS_ROOT) $(NO_BUILD_QUESTION) $(SAVING) notebooks
 
 bench: export BENCH := 1
 bench: setup

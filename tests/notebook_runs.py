@@ -19,6 +19,7 @@ from shared import ROOT, stages
 
 from lrfcal_lib.report.notebook import asked, report_file, save
 from lrfcal_lib.session import cache
+from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CELL_SECONDS = 600
@@ -52,6 +53,7 @@ def run_nbval(path, report):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("LRFCAL_")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", cache.VARIABLE: str(stages())}
     environment |= {"LRFCAL_REPORT": str(report), "LRFCAL_NOTEBOOK": path.stem, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    environment[RECORDINGS] = str(report / "recordings")
     tests = Path(__file__).parent
     environment["PYTHONPATH"] = os.pathsep.join([str(tests), *filter(None, [environment.get("PYTHONPATH")])])
     environment["PYTHONSTARTUP"] = str(tests / "kernel_start.py")

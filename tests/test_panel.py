@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import threading
 
 import pytest
@@ -14,6 +15,7 @@ from lrfcal_lib.acquire.collector import Busy, Collector, Interrupted
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import DeviceError, LineLost, OutOfRange, PortError
 from lrfcal_lib.drivers.rig_file import RigFileError
+from lrfcal_lib.session.read import open_session
 
 WAIT_S = 120  # guards against hanging
 @pytest.fixture
@@ -148,6 +150,40 @@ def test_buttons_that_the_browser_does_not_press(panel):
     pressed(panel, "go")
     until(lambda: "+3.00°" in parts.pitch.value)
     assert parts.error.value == ""
+
+
+def test_what_starts_and_what_stops_a_recording_stand_side_by_side(panel):
+    *_, buttons = panel.parts.top.children
+    assert {panel.parts.capture, panel.parts.stop} < {*buttons.children}
+
+
+PLACES = {  # LRFCAL_RECORDINGS, what the field says, and where the recording goes, from the home folder
+    "nobody says": ("", None, r"lrfcal_sessions/20\d\d-\d\d-\d\d_\d{6}"),
+    "the environment says": ("mine", None, r"mine/20\d\d-\d\d-\d\d_\d{6}"),
+    "relative": ("mine", "recordings/monday", "recordings/monday"),
+    "of the user": ("", " ~/monday ", "monday"),
+}
+
+
+@pytest.mark.parametrize("case", PLACES)
+def test_a_recording_goes_to_a_folder_that_is_shown_in_full_and_stays(fake, case, tmp_path, monkeypatch):
+    folder, field, expected = PLACES[case]
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.chdir(home)
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("LRFCAL_RECORDINGS", folder and str(home / folder))
+    fake()
+    with page.Panel("../rig.json") as made:
+        if field is not None:
+            made.parts.session.value = field
+        assert re.fullmatch(f"{home}/{expected}", str(made.session))
+        shown = re.sub("<[^>]+>", "", made.parts.places.value)
+        assert f"the recording goes to {made.session}" in shown and f"the rig file is {home}/../rig.json" in shown
+        pressed(made, "connect")
+        assert made.parts.session.value == str(made.session) and made.parts.rig.value == f"{home}/../rig.json"
+        pressed(made, "capture")
+    assert open_session(made.session).placements == (1,)
 
 
 def test_errors_appear_in_the_panel(panel, tmp_path):

@@ -14,11 +14,13 @@ from pathlib import Path
 import nbformat
 import pytest
 from shared import campaign, until
+from test_saving import option
 
 NOTEBOOK = next((Path(__file__).resolve().parents[1] / "notebooks").glob("09_*.ipynb"))
 # dash, which Open3D brings, has JupyterLab ask whether it should be built anew: no dialog in the way
 QUIET = "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False, 'buildAvailable': False}}"
 START_S, ACTION_S = 180, 240  # guards against hanging
+SCREEN = {"width": 1280, "height": 900}  # of a small laptop
 
 
 def panel_only(folder):
@@ -29,7 +31,7 @@ def panel_only(folder):
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs, cell.execution_count = [], None
-    nbformat.write(notebook, folder / "panel.ipynb")
+    nbformat.write(notebook, folder / NOTEBOOK.name)
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def lab(tmp_path):
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JUPYTER_TOKEN": token}
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", "--ip=127.0.0.1",
                f"--port={address.rpartition(':')[2]}", "--ServerApp.port_retries=0", f"--ServerApp.root_dir={work}",
-               QUIET]  # fmt: skip
+               QUIET, option()]  # fmt: skip
 
     def call(path, **options):
         request = urllib.request.Request(address + path, headers={"Authorization": f"token {token}"}, **options)
@@ -60,7 +62,7 @@ def lab(tmp_path):
         try:
             until(lambda: server.poll() is not None or responds(), START_S)
             assert server.poll() is None, f"JupyterLab does not start:\n{log.read_text()[-3000:]}"
-            yield f"{address}/doc/tree/panel.ipynb?token={token}"
+            yield f"{address}/doc/tree/{NOTEBOOK.name}?token={token}"
             for kernel in json.loads(call("/api/kernels")):  # by itself: the panel's rig is closed, its head stopped
                 call(f"/api/kernels/{kernel['id']}", method="DELETE")
         finally:
@@ -70,7 +72,7 @@ def lab(tmp_path):
 
 @pytest.fixture
 def page(browser, lab):
-    page = browser.new_page(viewport={"width": 1400, "height": 1150})
+    page = browser.new_page(viewport=SCREEN)
     page.set_default_timeout(1000 * ACTION_S)
     page.goto(lab)
     yield page
@@ -105,12 +107,32 @@ def press(page, name, text):
     assert failed.count() == 0, failed.first.inner_text()
 
 
+# a picture shows nobody's folders
+ELSEWHERE = """folder => {
+    const shown = text => text.replaceAll(folder, "/home/you");
+    for (const field of document.querySelectorAll(".lrfcal-panel input")) field.value = shown(field.value);
+    const texts = document.createTreeWalker(document.querySelector(".lrfcal-panel"), NodeFilter.SHOW_TEXT);
+    while (texts.nextNode()) texts.currentNode.data = shown(texts.currentNode.data);
+}"""
+
+
+def on_screen(page, *names):
+    """Whether buttons are on screen, all at once."""
+    boxes = [page.locator(f"button.lrfcal-{name}").bounding_box() for name in names]
+    inside = [box["y"] >= 0 and box["y"] + box["height"] <= SCREEN["height"] for box in boxes]
+    return all(inside) and all(box["x"] + box["width"] <= SCREEN["width"] for box in boxes)
+
+
 @campaign
 @pytest.mark.parametrize("count", [1, 3])  # notebook 09 calibrates what it recorded
-def test_buttons_record_and_calibrate(page, count):
+def test_buttons_record_and_calibrate(page, count, tmp_path):
     run_all(page)
     page.fill(".lrfcal-session input", "recordings/monday")
+    page.press(".lrfcal-session input", "Tab")
+    folder = tmp_path / "work" / "recordings" / "monday"
+    page.wait_for_selector(f".lrfcal-places:has-text('the recording goes to {folder}')")
     press(page, "connect", "Placement 1 of")
+    assert page.input_value(".lrfcal-session input") == str(folder)
     empty = page.get_attribute("img.lrfcal-picture-sweep", "src")
     for name in ("scan", "left", "right"):
         changed(page, name, "")
@@ -120,10 +142,21 @@ def test_buttons_record_and_calibrate(page, count):
         assert page.locator(".light:has-text('camera left')").count() == 1
         assert "board on" in page.inner_text(".light:has-text('scan')")
     changed(page, "sweep", empty)
+    page.locator("button.lrfcal-stop").scroll_into_view_if_needed()
+    assert on_screen(page, "stop", "capture")
     press(page, "calibrate", "rotation vector" if count >= 3 else "cannot be trusted")
     said = page.inner_text(".lrfcal-result")
     assert count < 3 or "right" in said and "recordings/monday_calibration" in said, said
     if os.environ.get("LRFCAL_SCREENSHOT"):
         page.add_style_tag(content=".Toastify {display: none}")
+        page.set_viewport_size({"width": 1280, "height": 1900})
+        page.evaluate(ELSEWHERE, str(tmp_path / "work"))
+        page.wait_for_timeout(1000)
         page.locator(".lrfcal-panel").screenshot(path=os.environ["LRFCAL_SCREENSHOT"])
     press(page, "close", "not connected")
+    file = tmp_path / "work" / NOTEBOOK.name
+    before, saved = file.read_bytes(), file.stat().st_mtime_ns
+    page.keyboard.press("Control+S")
+    until(lambda: file.stat().st_mtime_ns != saved)
+    assert file.read_bytes() == before, "the notebook was run, and is as it was"
+    assert sorted(path.name for path in folder.parent.iterdir())[0] == "monday", "the recording stays"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -18,6 +19,7 @@ from lrfcal_lib.acquire.checks import check_image, check_placement, check_scan
 from lrfcal_lib.acquire.record import Recording, RecordingError, main, record_session
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.port import DeviceError
+from lrfcal_lib.session import progress
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder
@@ -332,6 +334,26 @@ def test_a_recording_by_command(run, path):
     code, said, _ = run("", "", count=2)
     assert code == 0 and "placements 1, 2 are safe; 'python -m lrfcal_lib calibrate" in said
     assert run("", resume=True)[0] == 0 and open_session(path).placements == (1, 2, 3)
+
+
+def test_a_recording_into_a_file_tells_how_far_it_is(run, rig, monkeypatch):
+    """Nothing is a terminal here: lines come now and then, at each event where time between them is none."""
+    monkeypatch.setattr(progress, "LINE_S", 0.0)
+    _, said, _ = run("", "", "")
+    lines = said.splitlines()
+    assert lines[0].endswith("rig.json: opening the devices")
+    begun = lines.index("placement 2 (2 of 3): board, pitch 0.00 to 2.00 deg")
+    assert re.fullmatch(r"  stop 1 of 3, \+0\.00 deg, 0 scans, 0 images", lines[begun + 1])
+    assert re.fullmatch(r"  stop 2 of 3, \+1\.00 deg, 1 scans, 1 images, about \d+ s left", lines[begun + 4])
+    left = [line for line in lines if "left: about" in line]
+    assert [line[:24] for line in left] == ["  2 of 3 placements left", "  1 of 3 placements left"]
+
+
+def test_a_recording_of_scenes_is_not_told_to_calibrate(run, rig):
+    rig.stated = make_rig(rig_data(placements=[{"number": 1, "board": False}])).stated
+    code, said, _ = run("")
+    assert code == 0 and "placements 1 are safe; all of them show scenes" in said
+    assert "record placements of the board" in said and "lrfcal_lib calibrate" not in said
 
 
 def interrupt():

@@ -20,6 +20,7 @@ from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.model.geometry import polar_to_points
 from lrfcal_lib.plots.recording import COLORS
 from lrfcal_lib.session.stated import escape
+from lrfcal_lib.session.write import new_session_path
 
 HERE = Path(__file__).parent
 STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
@@ -135,7 +136,7 @@ FIELDS = {  # kind, options, layout
                                "description": "target"}, WIDE),
     "progress": (w.FloatProgress, {"min": 0, "max": 1, "description": ""}, WIDE),
 }  # fmt: skip
-TEXTS = {"state": HTML.state("off"), "error": "", "notes": "", "pitch": "", "task": "", "doing": "",
+TEXTS = {"state": HTML.state("off"), "places": "", "error": "", "notes": "", "pitch": "", "task": "", "doing": "",
          "lights": HTML.lights("Quality", ()),
          "result": HTML.soft("three placements and more; the recording can go on afterwards")}  # fmt: skip
 
@@ -159,7 +160,7 @@ class Picture:
         self.image = w.Image(format=kind, layout=w.Layout(width="100%", max_width=f"{PICTURE[0]}px"))
         self.image.add_class(f"lrfcal-picture-{name}")
         self.remark = w.HTML()
-        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark, basis="270px")
+        self.box = card(w.HTML(HTML.title(heading)), self.image, self.remark, basis="220px")
 
     def show(self, data, remark):
         """Show the bytes of an image; what did not change is not sent again."""
@@ -181,13 +182,16 @@ class Parts:
         vars(self).update(made)
         self.rig.value, self.session.value = rig, session
         self.pictures, self.views = {}, row()
-        head = row(w.HTML("<b style='font-size:16px'>Data collection</b>"), self.state, self.stop,
-                   justify_content="space-between", align_items="center")  # fmt: skip
+        title = w.HTML("<b style='font-size:16px'>Data collection</b>")
+        # what starts and what stops a recording stand side by side, on screen together at any size
+        self.top = row(title, self.state, row(self.capture, self.again, self.stop),
+                       justify_content="space-between", align_items="center")  # fmt: skip
+        self.top.add_class("lrfcal-top")
         head_card = card(w.HTML(HTML.title("Head")), self.pitch, self.slider, row(self.go))
-        next_card = card(self.task, row(self.capture, self.again), self.progress, self.doing)
+        next_card = card(self.task, self.progress, self.doing)
         self.root = w.VBox(
-            [w.HTML(STYLE), head, row(self.rig, self.session, self.connect, self.close), self.error, self.views,
-             row(head_card, next_card, card(self.lights, grow=2, basis="420px")),
+            [w.HTML(STYLE), self.top, row(self.rig, self.session, self.connect, self.close), self.places, self.error,
+             self.views, row(head_card, next_card, card(self.lights, grow=2, basis="420px")),
              card(w.HTML(HTML.title("Result")), row(self.calibrate), self.result, basis="auto"), self.notes],
             layout=w.Layout(grid_gap="10px"),
         )  # fmt: skip
@@ -229,6 +233,21 @@ class Notes(logging.Handler):
         self.part.value = HTML.notes(self.lines)
 
 
+def absolute(text):
+    """The absolute path of what stands in a field."""
+    return Path(text.strip()).expanduser().absolute()
+
+
+def rig_named(text):
+    """What the field of the rig names: an emulated rig by its name, or the absolute path of a rig file."""
+    text = text.strip()
+    path = Path(text).expanduser()
+    looks_like_a_file = bool(path.suffix) or path.exists() or len(path.parts) > 1
+    if text in PRACTICE_RIGS or not looks_like_a_file:
+        return text
+    return path.absolute()
+
+
 class Panel(Closed):
     """Records a session with a rig, by buttons or by methods; a context manager that closes the rig.
 
@@ -239,7 +258,8 @@ class Panel(Closed):
     rig : path-like or str
         Rig file, or an emulated rig: 'practice' (seconds a placement), 'sim_quick', 'sim_lms221'.
     session : path-like, optional
-        Folder of the session; a new one in ``~/lrfcal_sessions`` by default.
+        Folder of the session, which stays; by default a new one in the folder that the environment
+        variable ``LRFCAL_RECORDINGS`` names, else in ``~/lrfcal_sessions``. The panel shows where it is.
 
     Examples
     --------
@@ -248,13 +268,25 @@ class Panel(Closed):
     """
 
     def __init__(self, rig="practice", session=None):
-        session = session or Path.home() / "lrfcal_sessions" / time.strftime("%Y-%m-%d_%H%M%S")
+        session = session or new_session_path()
         self.collector, self.parts = Collector(), Parts(str(rig), str(session))
         self.notes, self._worker = Notes(self.parts.notes), ThreadPoolExecutor(1, thread_name_prefix="panel")
         self.job, self._live, self._quit, self._sweep = None, None, threading.Event(), None
         for name in BUTTONS:
             getattr(self.parts, name).on_click(partial(self._pressed, getattr(self, name)))
+        for name in ("rig", "session"):
+            getattr(self.parts, name).observe(self._show_places, "value")
+        self._show_places()
         self._refresh()
+
+    @property
+    def session(self):
+        """Folder of the session that the field names, an absolute Path."""
+        return absolute(self.parts.session.value)
+
+    def _show_places(self, _=None):
+        """Show what the fields name: relative paths are taken from where this notebook lies."""
+        self.parts.places.value = HTML.places(rig_named(self.parts.rig.value), self.session)
 
     def show(self):
         """Display the panel."""
@@ -271,7 +303,9 @@ class Panel(Closed):
         with self._doing("connecting"):
             DRIVERS.addHandler(self.notes)
             parts, collector = self.parts, self.collector
-            collector.connect(parts.rig.value.strip(), Path(parts.session.value.strip()).expanduser())
+            parts.rig.value = str(rig_named(parts.rig.value))
+            parts.session.value = str(self.session)
+            collector.connect(parts.rig.value, self.session)
             low, high = collector.limits_deg
             with parts.slider.hold_trait_notifications():
                 parts.slider.min, parts.slider.max = low, high

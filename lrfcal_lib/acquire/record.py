@@ -5,7 +5,7 @@ import logging
 import math
 import signal
 import sys
-import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
@@ -14,6 +14,7 @@ from lrfcal_lib.acquire.checks import check_image, check_placement
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import read_rig_file
+from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder, not_written
@@ -189,20 +190,55 @@ def ask(text):
         raise RecordingError(f"nobody is there to move the board: {hint}") from None
 
 
+@dataclass
+class Sweeping:
+    """What the events of a placement tell of how far it is."""
+
+    scans: int = 0
+    images: int = 0
+    pitch: float = 0.0  # radians
+    stop: str = ""
+    share: float = 0.0  # of the sweep
+
+    def note(self, event):
+        """Take an event into account."""
+        if isinstance(event, Moved):
+            self.stop = f"stop {event.number} of {event.of}, "
+            self.pitch = event.pitch
+            self.share = (event.number - 1) / event.of
+        elif isinstance(event, Scanned):
+            self.scans += len(event.readings)
+            self.pitch = event.pitch[-1]
+            if math.isfinite(event.share):
+                self.share = event.share
+        elif isinstance(event, Photographed):
+            self.images += 1
+
+    def counts(self):
+        """What was recorded, as text."""
+        return f"{self.scans} scans, {self.images} images"
+
+
 def follow(placement, number, of, events):
-    """Show the recording of a placement while it runs; the line that is rewritten is for terminals only."""
-    ends = " to ".join(f"{math.degrees(p):.2f}" for p in placement.pitch[[0, -1]])
-    print(f"placement {placement.number} ({number} of {of}): {placement.purpose}, pitch {ends} deg", flush=True)
-    begun, scans, images, stop, pitch = time.monotonic(), 0, 0, "", 0.0
+    """Show the recording of a placement while it runs, and how long it will still take.
+
+    On a terminal one line is written over and over; a file gets a line now and then.
+    """
+    first, last = (math.degrees(pitch) for pitch in placement.pitch[[0, -1]])
+    title = f"placement {placement.number} ({number} of {of}): {placement.purpose}"
+    print(f"{title}, pitch {first:.2f} to {last:.2f} deg", flush=True)
+    progress = Progress()
+    sweeping = Sweeping()
     with tqdm(bar_format="  {desc}", file=sys.stdout, leave=False, disable=None) as line:
         for event in events:
-            if isinstance(event, Moved):
-                stop, pitch = f"stop {event.number} of {event.of}, ", event.pitch
-            elif isinstance(event, Scanned):
-                scans, pitch = scans + len(event.readings), event.pitch[-1]
-            images += isinstance(event, Photographed)
-            line.set_description_str(f"{stop}{math.degrees(pitch):+.2f} deg, {scans} scans, {images} images")
-    print(f"  {scans} scans, {images} images in {time.monotonic() - begun:.0f} s", flush=True)
+            sweeping.note(event)
+            words = f"{sweeping.stop}{math.degrees(sweeping.pitch):+.2f} deg, {sweeping.counts()}"
+            if left := progress.left(sweeping.share):
+                words = f"{words}, {left}"
+            line.set_description_str(words)
+            if line.disable and progress.due():
+                print(f"  {words}", flush=True)
+    print(f"  {sweeping.counts()} in {progress.seconds:.0f} s", flush=True)
 
 
 def show(light, name=None):
@@ -252,6 +288,7 @@ def _close_views(recording):
 def _placements(recording):
     """Each placement that is missing; the user may have the one before again (r), or end (q)."""
     before, of = None, len(recording.plan)
+    recorded = []  # seconds of each placement of this run
     while todo := recording.to_do():
         placement, answer = todo[0], ""
         if not recording.rig.move_board(placement.number):
@@ -266,10 +303,15 @@ def _placements(recording):
             recording.drop(before)
             before = None
             continue
+        progress = Progress()
         follow(placement, of - len(todo) + 1, of, recording.run(placement))
+        recorded.append(progress.seconds)
         before = placement.number
         for light in recording.check(before):
             show(light)
+        if left := len(todo) - 1:
+            expected = duration(left * sum(recorded) / len(recorded))
+            print(f"  {left} of {of} placements left: about {expected} of recording", flush=True)
 
 
 def main(rig_file, path, *, resume=False, count=None, mode=None):
@@ -280,7 +322,9 @@ def main(rig_file, path, *, resume=False, count=None, mode=None):
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
-        with Rig.open(read_rig_file(rig_file).with_mode(mode)) as rig:
+        stated = read_rig_file(rig_file).with_mode(mode)
+        print(f"{rig_file}: opening the devices", flush=True)
+        with Rig.open(stated) as rig:
             recording = record_session(rig, path, resume=resume, count=count)
     except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
         text, code = f"error: {error}", FAILED
@@ -291,5 +335,16 @@ def main(rig_file, path, *, resume=False, count=None, mode=None):
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
             print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
         return code
-    print(f"{path}: {recording.safe()}; 'python -m lrfcal_lib calibrate {path}' calibrates the rig")
+    print(f"{path}: {recording.safe()}; {next_step(recording)}")
     return 0
+
+
+def next_step(recording):
+    """What can be done with a recording that has ended, half a sentence."""
+    boards = {placement.number for placement in recording.plan if placement.purpose == "board"}
+    if boards & set(recording.finished):
+        return f"'python -m lrfcal_lib calibrate {recording.path}' calibrates the rig"
+    return (
+        "all of them show scenes, which a calibration of the same rig can colour: "
+        "to calibrate, record placements of the board"
+    )

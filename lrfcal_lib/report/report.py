@@ -29,8 +29,10 @@ from tqdm import tqdm
 from lrfcal_lib.report import page
 from lrfcal_lib.report.notebook import ROOT, SHIPPED, label_of
 from lrfcal_lib.session.cache import VARIABLE as CACHE
+from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
+from lrfcal_lib.session.write import RECORDINGS
 
 NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
@@ -89,6 +91,7 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
+        environment[RECORDINGS] = cache  # what notebook 09 records with the emulated rig goes with the report's cache
         runs = _execute_all(paths, environment, jobs)
         found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
         found |= {part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")}
@@ -130,7 +133,8 @@ def store(path, session_path, cache=""):
     out.
     """
     environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
-    notebook, error = execute(path, environment | {CACHE: cache})
+    with TemporaryDirectory(prefix="lrfcal-") as recordings:
+        notebook, error = execute(path, environment | {CACHE: cache, RECORDINGS: recordings})
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -186,10 +190,12 @@ def _report(session, out, jobs):
 def _store_all(session):
     open_session(session)
     with TemporaryDirectory(prefix="lrfcal-") as cache:
-        errors = {path.name: store(path, session.resolve(), cache) for path in sorted(NOTEBOOKS.glob(NUMBERED))}
-    for name, error in errors.items():
-        print(f"{name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout)
-    return int(any(errors.values()))
+        failed = False
+        for path in sorted(NOTEBOOKS.glob(NUMBERED)):
+            error = store(path, session.resolve(), cache)
+            failed = failed or bool(error)
+            print(f"{path.name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout, flush=True)
+    return int(failed)
 
 
 @contextmanager
@@ -247,15 +253,12 @@ def _move_files(new, out):
 
 
 def _execute_all(paths, environment, jobs):
-    """Execute notebooks side by side; the bar shows on a terminal only."""
+    """Execute notebooks side by side."""
     with ThreadPoolExecutor(max(1, jobs)) as pool:
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:
-            with tqdm(total=len(paths), desc="notebooks", unit="notebook", disable=None) as bar:
-                for future in as_completed(futures):
-                    bar.set_postfix_str(futures[future].stem)
-                    bar.update()
+            _show_progress(futures)
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
@@ -265,6 +268,23 @@ def _execute_all(paths, environment, jobs):
                         client.km.provisioner.process.kill()
                 time.sleep(0.05)
     return sorted((future.result() for future in futures), key=lambda run: run.name)
+
+
+def _show_progress(futures):
+    """Wait for notebooks (paths by future) with a bar, or where there is no terminal a line for each."""
+    progress = Progress()
+    with tqdm(total=len(futures), desc="notebooks", unit="notebook", disable=None) as bar:
+        if bar.disable:
+            print(f"lrfcal: {len(futures)} notebooks begun", file=sys.stderr, flush=True)
+        for done, future in enumerate(as_completed(futures), start=1):
+            name = futures[future].stem
+            bar.set_postfix_str(name)
+            bar.update()
+            if bar.disable:
+                words = f"{done} of {len(futures)} done after {duration(progress.seconds)} ({name})"
+                if left := progress.left(done / len(futures)):
+                    words = f"{words}, {left}"
+                print(f"lrfcal: {words}", file=sys.stderr, flush=True)
 
 
 def _run(path, environment):

@@ -5,6 +5,7 @@ import errno
 import json
 import math
 import os
+import time
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,14 @@ import numpy as np
 from lrfcal_lib.session import read, stated
 from lrfcal_lib.session.stated import SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
+
+RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
+
+
+def new_session_path():
+    """Where a recording goes whose place nobody names: a folder by date in ``~/lrfcal_sessions``."""
+    folder = os.environ.get(RECORDINGS) or Path.home() / "lrfcal_sessions"
+    return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
 
 
 class SessionWriter:

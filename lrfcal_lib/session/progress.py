@@ -1,0 +1,44 @@
+"""How long something will still take, in words, on a terminal or in a file."""
+
+import time
+
+LINE_S = 10.0  # between lines where none can be written over: a file or a pipe instead of a terminal
+
+
+class Progress:
+    """Of something that began now.
+
+    Parameters
+    ----------
+    clock : callable
+        The present time, seconds.
+    """
+
+    def __init__(self, clock=time.monotonic):
+        self._clock = clock
+        self._begun = clock()
+        self._said = clock()
+
+    @property
+    def seconds(self):
+        """Since it began."""
+        return self._clock() - self._begun
+
+    def left(self, share):
+        """How long it will still take where this share is done, as text; '' where none is, or all."""
+        if not 0 < share < 1:
+            return ""
+        return f"about {duration(self.seconds * (1 - share) / share)} left"
+
+    def due(self):
+        """Whether it is time for another line; then it counts as written."""
+        now = self._clock()
+        if now - self._said < LINE_S:
+            return False
+        self._said = now
+        return True
+
+
+def duration(seconds):
+    """Seconds as text, in minutes from 100 s on."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
