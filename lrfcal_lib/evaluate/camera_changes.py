@@ -123,6 +123,8 @@ def camera_changes(solution, prepared, settings):
             return changes
         camera_of[later] = camera
         changes.append(change)
+        if change.zoomed:  # two poses do not make up for that: what is left looks like more steps
+            return changes
     # what is hopeless also with two poses of a camera has another cause
     explained = max(solution.noise["face_scale"], solution.noise["view_scale"]) < NOISY
     return changes if solution.converged and explained else []

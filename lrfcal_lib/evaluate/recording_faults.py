@@ -20,10 +20,13 @@ from lrfcal_lib.solvers import solve_camera
 EXPLAINING = ("sense", "unit")  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
 BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
+MISREAD = 0.005  # metres; what is misread lies off by more than that
 GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
 AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
 POINTS = 60  # of a placement's face
 LOOKED_AT = 4  # placements in which a board is searched for again
+HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
+LEAST_MISS = 0.001  # metres; paper is no flatter
 LEVER = 0.2  # metres, weighs turns against shifts
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
 BESIDE = 0.15  # metres between the middles of a board in a scan, which may be cut, and in images
@@ -139,7 +142,7 @@ def misread_recording(prepared):
         return [Fault("unit", reading.words, severe=True) for reading in readings[:1]]
 
     stated = board_misses(prepared, AS_STATED)
-    if not stated:
+    if not stated or _worst(stated) < MISREAD:
         return []
     mirrored = {
         camera: found
@@ -161,7 +164,7 @@ def misread_recording(prepared):
 
 @dataclass(frozen=True)
 class BoardMiss:
-    """How far scans lie off boards in images (metres, median placement), at a camera's best pose."""
+    """How far scans lie off boards in images at a camera's best pose: metres, without noise."""
 
     size: float
     transform: RigidTransform
@@ -182,6 +185,7 @@ def _worst(misses):
 def board_misses(prepared, reading):
     """The BoardMiss of every camera that has one, with the recording read in some way."""
     found = {}
+    noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
     for camera in prepared.views:
         obs = plane_observations(prepared, camera, reading)
         with suppress(DegenerateGeometry, np.linalg.LinAlgError):
@@ -191,7 +195,8 @@ def board_misses(prepared, reading):
                 np.median(residuals[obs.plane_placement == p])
                 for p in np.unique(obs.plane_placement)
             ]
-            found[camera] = BoardMiss(float(np.median(each)), transform)
+            square = np.median(each) ** 2 - (HALF * reading.ranges * noise) ** 2
+            found[camera] = BoardMiss(float(np.sqrt(max(square, LEAST_MISS**2))), transform)
     return found
 
 
