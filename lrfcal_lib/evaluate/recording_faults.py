@@ -7,8 +7,10 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
-from lrfcal_lib.evaluate.camera_changes import NOISY, camera_changes
+from lrfcal_lib.calibrate.pipeline import joint_settings
+from lrfcal_lib.evaluate.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
@@ -27,7 +29,6 @@ POINTS = 60  # of a placement's face
 LOOKED_AT = 4  # placements in which a board is searched for again
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
-LEVER = 0.2  # metres, weighs turns against shifts
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
 BESIDE = 0.15  # metres between the middles of a board in a scan, which may be cut, and in images
 
@@ -114,11 +115,21 @@ def recording_faults(calibration):
     found = [fault for fault in faults_of_files(session) if not fault.harmless]
     found += dark_images(session)
     misread = misread_recording(prepared) if hopeless(joint) else []
-    if misread or joint is None:
+    if misread or not prepared.views or not prepared.scans:
         return found + misread
-    changes = camera_changes(joint.solution, prepared, joint.settings)
-    found += faults_of_changes(changes, joint.solution.observations.cameras)
-    return found + exchanged_placements(calibration)
+    found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
+    return found if joint is None else found + exchanged_placements(calibration)
+
+
+def changes_of_cameras(calibration):
+    """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
+    prepared, joint = calibration.prepared, calibration.joint
+    changes = [] if joint is None else camera_changes(joint.solution, prepared, joint.settings)
+    if changes or explains(joint):
+        return changes
+    views = {camera: list(own.values()) for camera, own in prepared.views.items()}
+    obs = observe_joint(prepared, views)
+    return large_changes(obs, prepared, joint_settings(prepared, obs))
 
 
 def explained(faults):
@@ -128,10 +139,15 @@ def explained(faults):
 
 def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    if joint is None or not joint.solution.converged or joint.solution.unobservable:
-        return True
+    return not explains(joint) or bool(joint.solution.unobservable)
+
+
+def explains(joint):
+    """Whether a JointCalibration (or None) leaves residuals that are anything like the noise."""
+    if joint is None or not joint.solution.converged:
+        return False
     noise = joint.solution.noise
-    return max(noise["face_scale"], noise.get("view_scale", 0.0)) > NOISY
+    return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
 
 
 def misread_recording(prepared):
