@@ -1,4 +1,4 @@
-"""What the files of a recording show to be wrong is named, with the file, the value and the remedy."""
+"""What files of a recording show to be wrong is named with the file, the value and the remedy."""
 
 import numpy as np
 import pytest
@@ -38,13 +38,21 @@ def one_camera_of_another_clock(folder):
     replaced(folder / "images.csv", "\n".join([header, *table, ""]).encode())
 
 
-NAMED = {name: WAYS[name] for name in (
-    "an image twice", "a placement twice", "one picture in both folders", "max_range_m exceeded", "images too dark",
-    "field of view", "another clock", "pitch in degrees", "squares in inches",
-)} | {
+BY_CHECK = (
+    "an image twice",
+    "a placement twice",
+    "one picture in both folders",
+    "max_range_m exceeded",
+    "images too dark",
+    "field of view",
+    "another clock",
+    "pitch in degrees",
+    "squares in inches",
+)
+NAMED = {name: WAYS[name] for name in BY_CHECK} | {
     "another step": Way(half_turned_down, ("field of view",), "correct session.json"),
     "clock of one camera": Way(one_camera_of_another_clock, ("clock",), "camera 'left'"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", NAMED)

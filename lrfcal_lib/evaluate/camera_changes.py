@@ -1,9 +1,10 @@
 """Did a camera change between two placements? Steps of its pose and of its image scale."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
 from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
@@ -21,6 +22,8 @@ ASKED = 4.0  # standard deviations: a change of the image scale that is none of 
 STEP = 1e-4  # of the numeric derivative by the image scale
 NOISY = 10.0  # residuals in units of the stated noise: an estimate that explains nothing
 MOST_CHANGES = 3  # in one recording
+FEWEST_PLACEMENTS = 6  # for a pose before and one after a change
+LEVER = 0.2  # metres, weighs turns against shifts
 FEWEST_VIEWS = 3  # of a chessboard, for a focal length
 ALL_BUT_FOCAL_LENGTH = tuple(range(2, 9))  # of fx, fy, cx, cy, k1..k5
 RCOND = 1e-13
@@ -123,9 +126,73 @@ def camera_changes(solution, prepared, settings):
             return changes
         camera_of[later] = camera
         changes.append(change)
+        if change.zoomed:  # two poses do not make up for that: what is left looks like more steps
+            return changes
     # what is hopeless also with two poses of a camera has another cause
     explained = max(solution.noise["face_scale"], solution.noise["view_scale"]) < NOISY
     return changes if solution.converged and explained else []
+
+
+def large_changes(obs, prepared, settings):
+    """Cameras that changed by so much that no estimate with one pose of each is possible.
+
+    What one camera contradicts, the others and the scans agree about: its poses are seen from
+    an estimate without it. Arguments and result are those of :func:`camera_changes`, with the
+    observations of all placements instead of a solution.
+    """
+    if len(obs.cameras) < 2 or len(obs.placements) < FEWEST_PLACEMENTS:
+        return []
+    for index, camera in enumerate(obs.cameras):
+        others = [name for name in obs.cameras if name != camera]
+        with suppress(DegenerateGeometry):
+            without = solve_joint(obs.with_cameras(others), required=False, **settings)
+            if not without.converged or len(without.boards) < FEWEST_PLACEMENTS:
+                continue
+            known = obs.select(without.boards)
+            step = Step(index, row_of_largest_step(known, index, without), 0.0)
+            later = f"{camera} from placement {known.placements[step.row]}"
+            parted = with_two_poses(known, step, later)
+            solution = solve_joint(parted, required=False, **settings)
+            noise = max(solution.noise["face_scale"], solution.noise["view_scale"])
+            if (
+                {camera, later} <= solution.transforms.keys()
+                and solution.converged
+                and noise < NOISY
+            ):
+                change = change_between(solution, camera, later, camera, prepared)
+                if change.moved or change.zoomed:
+                    return [change]
+    return []
+
+
+def row_of_largest_step(obs, camera, solution):
+    """The row of placements from which on the poses of a camera (index) are others.
+
+    `solution` knows the boards from other cameras and scans.
+    """
+    mine = np.flatnonzero(obs.view_camera == camera)
+    rows = obs.view_placement[mine]
+    poses = []
+    for view, row in zip(mine, rows, strict=True):
+        board = solution.boards[int(obs.placements[row])]
+        pose = RigidTransform.from_matrix(obs.view_pose[view]) * board.inv()
+        if obs.mounts[camera] == "head":
+            turn = Rotation.from_rotvec([obs.view_pitch[view], 0.0, 0.0])
+            pose = pose * RigidTransform.from_rotation(turn)
+        poses.append(pose)
+    turns = [(pose.rotation * poses[0].rotation.inv()).as_rotvec() for pose in poses]
+    shifts = [pose.translation for pose in poses]
+    numbers = np.column_stack([LEVER * np.array(turns), shifts])
+
+    def scatter(row):
+        """What is left with two poses, one before and one from a row on."""
+        parts = (numbers[rows < row], numbers[rows >= row])
+        return sum(np.abs(part - np.median(part, axis=0)).sum() for part in parts)
+
+    places = range(BESIDE, len(obs.placements) - BESIDE + 1)
+    return min(
+        (row for row in places if _seen_beside(obs, camera, row)), key=scatter, default=BESIDE
+    )
 
 
 def likeliest_step(solution):

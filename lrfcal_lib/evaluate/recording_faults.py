@@ -7,8 +7,10 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
-from lrfcal_lib.evaluate.camera_changes import NOISY, camera_changes
+from lrfcal_lib.calibrate.pipeline import joint_settings
+from lrfcal_lib.evaluate.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
@@ -20,11 +22,13 @@ from lrfcal_lib.solvers import solve_camera
 EXPLAINING = ("sense", "unit")  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
 BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
+MISREAD = 0.005  # metres; what is misread lies off by more than that
 GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
 AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
 POINTS = 60  # of a placement's face
 LOOKED_AT = 4  # placements in which a board is searched for again
-LEVER = 0.2  # metres, weighs turns against shifts
+HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
+LEAST_MISS = 0.001  # metres; paper is no flatter
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
 BESIDE = 0.15  # metres between the middles of a board in a scan, which may be cut, and in images
 
@@ -111,11 +115,21 @@ def recording_faults(calibration):
     found = [fault for fault in faults_of_files(session) if not fault.harmless]
     found += dark_images(session)
     misread = misread_recording(prepared) if hopeless(joint) else []
-    if misread or joint is None:
+    if misread or not prepared.views or not prepared.scans:
         return found + misread
-    changes = camera_changes(joint.solution, prepared, joint.settings)
-    found += faults_of_changes(changes, joint.solution.observations.cameras)
-    return found + exchanged_placements(calibration)
+    found += faults_of_changes(changes_of_cameras(calibration), tuple(prepared.views))
+    return found if joint is None else found + exchanged_placements(calibration)
+
+
+def changes_of_cameras(calibration):
+    """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
+    prepared, joint = calibration.prepared, calibration.joint
+    changes = [] if joint is None else camera_changes(joint.solution, prepared, joint.settings)
+    if changes or explains(joint):
+        return changes
+    views = {camera: list(own.values()) for camera, own in prepared.views.items()}
+    obs = observe_joint(prepared, views)
+    return large_changes(obs, prepared, joint_settings(prepared, obs))
 
 
 def explained(faults):
@@ -125,10 +139,15 @@ def explained(faults):
 
 def hopeless(joint):
     """Whether a JointCalibration (or None) explains so little that something may be misread."""
-    if joint is None or not joint.solution.converged or joint.solution.unobservable:
-        return True
+    return not explains(joint) or bool(joint.solution.unobservable)
+
+
+def explains(joint):
+    """Whether a JointCalibration (or None) leaves residuals that are anything like the noise."""
+    if joint is None or not joint.solution.converged:
+        return False
     noise = joint.solution.noise
-    return max(noise["face_scale"], noise.get("view_scale", 0.0)) > NOISY
+    return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
 
 
 def misread_recording(prepared):
@@ -139,7 +158,7 @@ def misread_recording(prepared):
         return [Fault("unit", reading.words, severe=True) for reading in readings[:1]]
 
     stated = board_misses(prepared, AS_STATED)
-    if not stated:
+    if not stated or _worst(stated) < MISREAD:
         return []
     mirrored = {
         camera: found
@@ -161,7 +180,7 @@ def misread_recording(prepared):
 
 @dataclass(frozen=True)
 class BoardMiss:
-    """How far scans lie off boards in images (metres, median placement), at a camera's best pose."""
+    """How far scans lie off boards in images at a camera's best pose: metres, without noise."""
 
     size: float
     transform: RigidTransform
@@ -182,6 +201,7 @@ def _worst(misses):
 def board_misses(prepared, reading):
     """The BoardMiss of every camera that has one, with the recording read in some way."""
     found = {}
+    noise = np.median([scan.sigma_range for scan in prepared.scans.values()])
     for camera in prepared.views:
         obs = plane_observations(prepared, camera, reading)
         with suppress(DegenerateGeometry, np.linalg.LinAlgError):
@@ -191,7 +211,8 @@ def board_misses(prepared, reading):
                 np.median(residuals[obs.plane_placement == p])
                 for p in np.unique(obs.plane_placement)
             ]
-            found[camera] = BoardMiss(float(np.median(each)), transform)
+            square = np.median(each) ** 2 - (HALF * reading.ranges * noise) ** 2
+            found[camera] = BoardMiss(float(np.sqrt(max(square, LEAST_MISS**2))), transform)
     return found
 
 
