@@ -75,8 +75,7 @@ class Trials:
 def joint_truth(
     obs, T_head_lrf, cameras, boards, *, range_offset=0.0, bias=0.0, softness=0.1, pitch_scale=0.0
 ):
-    """The truth behind drawn JointObservations, in the form (JointState) and gauge of the joint
-    estimate.
+    """The truth behind drawn JointObservations, as a JointState in the joint estimate's gauge.
 
     Parameters
     ----------
@@ -130,7 +129,8 @@ def monte_carlo(draw, solve, seeds):
         except DegenerateGeometry as error:
             failed[int(seed)] = str(error)
             continue
-        names = names or found.solution.names
+        if names is None:
+            names = found.solution.names
         if names != found.solution.names:
             raise ValueError(f"seed {seed} estimates {found.solution.names}, earlier ones {names}")
         error = state_errors(found.state, truth, found.unknowns)
@@ -139,30 +139,30 @@ def monte_carlo(draw, solve, seeds):
     if not rows:
         last = list(failed.values())[-1] if failed else "no seed given"
         raise ValueError(f"all {len(failed)} draws were refused, the last one: {last}")
-    return Trials(names, *(np.array(column) for column in zip(*rows, strict=True)), failed)
+    seeds, errors, covariances, bounds = (np.array(column) for column in zip(*rows, strict=True))
+    return Trials(names, seeds, errors, covariances, bounds, failed)
 
 
 def state_errors(state, truth, unknowns):
-    """Increments of the shared unknowns that take the truth to an estimate (JointStates in one
-    gauge), shape (c,).
+    """Increments (c,) of the shared unknowns that take the truth to an estimate.
+
+    Both are JointStates in one gauge.
     """
-    both = (np.concatenate([s.head[None], s.cameras]) for s in (state, truth))
-    poses = pose_errors(*both)
+    estimated = np.concatenate([state.head[None], state.cameras])
+    true = np.concatenate([truth.head[None], truth.cameras])
+    poses = pose_errors(estimated, true)
     sensor = state.sensor - truth.sensor
     return np.concatenate([poses[0, AXIS_COLUMNS], poses[1:].ravel(), sensor])[unknowns.mask]
 
 
 def pose_errors(poses, true):
-    """``[w, v]`` with ``R = exp(w) R_true`` and ``t = t_true + v`` of poses (n, 3, 4), shape
-    (n, 6).
-    """
+    """``[w, v]`` (n, 6) with ``R = exp(w) R_true``, ``t = t_true + v`` of poses (n, 3, 4)."""
     turn = pose_transform(poses).rotation * pose_transform(true).rotation.inv()
     return np.concatenate([turn.as_rotvec(), poses[..., 3] - true[..., 3]], axis=-1)
 
 
 def bound(obs, truth, unknowns):
-    """Cramer-Rao bound of the shared unknowns from the expected information at the truth, shape (c,
-    c).
+    """Cramer-Rao bound (c, c) of the shared unknowns from the expected information at the truth.
 
     Nothing of the drawn values enters but which beams and views there are, so it checks the
     covariance that a solver takes from its own residuals. Board poses, and whatever else a
@@ -170,10 +170,11 @@ def bound(obs, truth, unknowns):
     shared unknowns open.
     """
     data = gather(obs)
-    hits = ({"hit": np.full_like(data.beam["hit"], hit)} for hit in (True, False))
-    read, missed = (
-        named_blocks(truth, replace(data, beam=data.beam | hit), unknowns) for hit in hits
-    )
+    hit = np.ones_like(data.beam["hit"])
+    all_read = replace(data, beam=data.beam | {"hit": hit})
+    none_read = replace(data, beam=data.beam | {"hit": ~hit})
+    read = named_blocks(truth, all_read, unknowns)
+    missed = named_blocks(truth, none_read, unknowns)
     hessian = 0.0
     for name, block in read.items():
         J = whiten(block)[1]
@@ -188,34 +189,38 @@ def bound(obs, truth, unknowns):
     values, vectors = np.linalg.eigh(total * scale[:, None] * scale)
     if values[0] < 1e-11:
         names = unknowns.names(obs.cameras)
-        open_ = ", ".join(names[i] for i in np.flatnonzero(np.abs(vectors[:, 0]) > 0.3))
-        raise DegenerateGeometry(f"no bound: the data leave {open_} open")
+        large = np.flatnonzero(np.abs(vectors[:, 0]) > 0.3)
+        raise DegenerateGeometry(
+            f"no bound: the data leave {', '.join(names[i] for i in large)} open"
+        )
     return (vectors / values) @ vectors.T * scale[:, None] * scale
 
 
 def groups_of(names):
     """Unknowns in groups of one unit: dict of words to (indices, unit, factor to that unit)."""
-    found = {}
+    out = {}
     for i, name in enumerate(names):
-        group, (words, *unit) = next(item for item in GROUPS.items() if re.fullmatch(item[0], name))
-        found.setdefault(re.sub(group, words, name), ([], *unit))[0].append(i)
-    return found
+        for pattern, (words, unit, factor) in GROUPS.items():
+            if re.fullmatch(pattern, name):
+                group = re.sub(pattern, words, name)
+                out.setdefault(group, ([], unit, factor))[0].append(i)
+                break
+        else:
+            raise ValueError(f"'{name}' belongs to no group of unknowns")
+    return out
 
 
 def spread(covariance, names):
-    """Standard deviation of each group of unknowns, by its words: root of the trace of
-    `covariance`, in its unit.
-    """
+    """Standard deviation of each group of unknowns in its unit: root of the trace of covariance."""
     variance = np.diagonal(covariance)
-    return {
-        words: float(factor * np.sqrt(variance[i].sum()))
-        for words, (i, _, factor) in groups_of(names).items()
-    }
+    out = {}
+    for words, (index, _, factor) in groups_of(names).items():
+        out[words] = float(factor * np.sqrt(variance[index].sum()))
+    return out
 
 
 def consistency(trials):
-    """How errors compare with the bound and with what the solver states, by group of unknowns and
-    pooled.
+    """How errors compare with the bound and with what the solver states, by group and pooled.
 
     Columns group, unit, rmse, crb (root of the mean trace of the bounds, or of the stated
     covariances where there are none), rmse_over_crb, stated_over_crb, coverage of 90 % intervals,
@@ -232,40 +237,43 @@ def consistency(trials):
         bad = trials.seeds[~np.isfinite(trials.errors).all(axis=1)]
         raise ValueError(f"errors or covariances are not finite (seeds {bad.tolist()[:5]})")
     groups = groups_of(trials.names) | {"all": (list(range(len(trials.names))), "", None)}
-    rows = [
-        {"group": words, "unit": unit} | _judge(trials, i, factor)
-        for words, (i, unit, factor) in groups.items()
-    ]
+    rows = []
+    for words, (index, unit, factor) in groups.items():
+        rows.append({"group": words, "unit": unit} | _judge(trials, index, factor))
     return pd.DataFrame(rows).assign(trials=count, failed=len(trials.failed))
 
 
 def _judge(trials, index, factor):
-    """One row: a group in its unit, or (factor None) unknowns of many units, each in its own
-    bounds.
-    """
+    """One row: a group in its unit, or (factor None) unknowns of many units, each by its bounds."""
+    block = np.ix_(np.arange(len(trials.errors)), index, index)
     e = trials.errors[:, index]
-    C, B = (X[:, index][:, :, index] for X in (trials.covariances, trials.bounds))
+    C = trials.covariances[block]
+    B = trials.bounds[block]
     mean = np.mean(C, axis=0)
-    seen = max(
-        round(len(e) * _freedom(mean / np.sqrt(np.outer(np.diagonal(mean), np.diagonal(mean))))), 1
-    )
-    unit = (
-        1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))
-        if factor is None
-        else np.full(e.shape, factor)
-    )
+    sigma = np.sqrt(np.diagonal(mean))
+    independent = len(e) * _freedom(mean / np.outer(sigma, sigma))
+    seen = max(round(independent), 1)
+    if factor is None:
+        unit = 1 / np.sqrt(np.diagonal(B, axis1=1, axis2=2))
+    else:
+        unit = np.full(e.shape, factor)
+    scale = unit[:, :, None] * unit[:, None, :]
     e = unit * e
-    (C, B) = (unit[:, :, None] * X * unit[:, None, :] for X in (C, B))
-    crb, stated = (np.sqrt(np.mean(np.trace(X, axis1=1, axis2=2))) for X in (B, C))
+    C = scale * C
+    B = scale * B
+    crb = np.sqrt(np.mean(np.trace(B, axis1=1, axis2=2)))
+    stated = np.sqrt(np.mean(np.trace(C, axis1=1, axis2=2)))
     rmse = np.sqrt(np.mean(np.sum(e**2, axis=1)))
     free = len(e) * _freedom(np.mean(B, axis=0))
+    half_width = HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    normalised = np.linalg.solve(C, e[..., None])[..., 0]
     row = {
         "rmse": rmse,
         "crb": crb,
         "rmse_over_crb": rmse / crb,
         "stated_over_crb": stated / crb,
-        "coverage": np.mean(np.abs(e) < HALF_WIDTH * np.sqrt(np.diagonal(C, axis1=1, axis2=2))),
-        "nees": np.mean(np.sum(e * np.linalg.solve(C, e[..., None])[..., 0], axis=-1)) / len(index),
+        "coverage": np.mean(np.abs(e) < half_width),
+        "nees": np.mean(np.sum(e * normalised, axis=-1)) / len(index),
     }
     row["rmse_over_crb_low"], row["rmse_over_crb_high"] = np.sqrt(chi2.ppf(LIMITS, free) / free)
     row["coverage_low"], row["coverage_high"] = binom.ppf(LIMITS, seen, INTERVAL) / seen
@@ -279,15 +287,14 @@ def _freedom(C):
 
 
 def observations(shots, setup, last_beam=False):
-    """Drawn shots as the preprocessing makes CameraObservations of a scan line, with a leading
-    trial axis.
+    """Drawn shots as the preprocessing makes CameraObservations of a scan line, trials first.
 
     Two crossings a placement, at the last beams on the board or half a beam step outside, and 24
     face points. `shots` and `setup` as in :func:`lrfcal_lib.simulate.draw.draw_shots`.
     """
     ranges = shots["ranges"]
     bearings = setup.bearings()
-    (t, p, _) = shots["ranges"].shape
+    t, p, _ = ranges.shape
     flat = ranges.reshape(t * p, -1)
     half = np.array([-0.5, 0.5]) * setup.step
     lines, information = fit_lines(flat, bearings)
@@ -296,10 +303,11 @@ def observations(shots, setup, last_beam=False):
     across = np.cross([0.0, 0.0, 1.0], ray)
     u = np.pad(lines, ((0, 0), (0, 1)))[:, None]
     r = 1 / np.sum(u * ray, axis=-1)  # to the fitted line
-    # by the bearing
-    turned = r[..., None] * across - (r**2 * np.sum(u * across, axis=-1))[..., None] * ray
-    spread = np.linalg.inv(information) * setup.sigma_range**2
-    variance = r**4 * np.einsum("nei,nij,nej->ne", ray[..., :2], spread, ray[..., :2])
+    by_bearing = -(r**2) * np.sum(u * across, axis=-1)  # the range's change
+    turned = r[..., None] * across + by_bearing[..., None] * ray
+    covariance = np.linalg.inv(information) * setup.sigma_range**2  # of u
+    flat_ray = ray[..., :2]
+    variance = r**4 * np.einsum("nei,nij,nej->ne", flat_ray, covariance, flat_ray)
     noise = variance[..., None, None] * _outer(ray)
     found = {
         "points": r[..., None] * ray,
@@ -310,20 +318,21 @@ def observations(shots, setup, last_beam=False):
         "background": 0 * r,
         "line_sigma": np.full(r.shape, setup.sigma_px),
     }
-    crossings = {f"crossing_{k}": v.reshape((t, 2 * p) + v.shape[2:]) for k, v in found.items()}
+    crossings = {}
+    for name, values in found.items():
+        crossings[f"crossing_{name}"] = values.reshape((t, 2 * p) + values.shape[2:])
     # face points for the plane method
     hit = np.isfinite(ranges)
     count = hit.sum(axis=-1)
     on_board = np.argsort(~hit, axis=-1, kind="stable")
-    pick = (np.linspace(0, 1, FACE) * (count[..., None] - 1)).round().astype(int)
+    share = np.linspace(0, 1, FACE)
+    pick = (share * (count[..., None] - 1)).round().astype(int)
     beam = np.take_along_axis(on_board, pick, axis=-1)
-    # short lines give some twice
     ray = polar_to_points(1.0, bearings[beam])
-    repeats = np.maximum(FACE / count, 1.0)
+    repeats = np.maximum(FACE / count, 1.0)  # short lines give some twice
     points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
-    covariance = _outer(ray) * (setup.sigma_range**2 * repeats)[
-        ..., None, None, None
-    ] + 1e-10 * np.eye(3)
+    variance = setup.sigma_range**2 * repeats
+    covariance = _outer(ray) * variance[..., None, None, None] + 1e-10 * np.eye(3)
     return CameraObservations(
         setup.model,
         **crossings,
@@ -342,13 +351,16 @@ def _outer(v):
 
 
 def solve_shots(shots, setup, T0, methods=("line", "line_ml", "zhang_pless")):
-    """All trials from start values `T0`, one a trial: Solutions with a trial axis by method,
-    'line_last_beam' first.
+    """All trials from start values `T0`, one a trial, by method, 'line_last_beam' first.
+
+    Solutions with a trial axis.
     """
     half = observations(shots, setup)
     last = observations(shots, setup, last_beam=True)
-    found = {"line_last_beam": solve_camera(last, "line", T0)}
-    return found | {method: solve_camera(half, method, T0) for method in methods}
+    out = {"line_last_beam": solve_camera(last, "line", T0)}
+    for method in methods:
+        out[method] = solve_camera(half, method, T0)
+    return out
 
 
 def shots_table(shots, setup, solutions):
@@ -359,28 +371,28 @@ def shots_table(shots, setup, solutions):
     absolute error of the edge bias in spot radii, NaN for methods without), converged (share).
     """
     rows = []
-    for method, found in solutions.items():
-        error = pose_errors(pose_array(found.transform), shots["T_camera_lrf"])
-        squares = np.sum(
-            error * np.linalg.solve(found.covariance[..., :6, :6], error[..., None])[..., 0],
-            axis=-1,
-        )
-        angle = np.degrees(np.linalg.norm(error[:, :3], axis=-1))
-        distance = 1e3 * np.linalg.norm(error[:, 3:], axis=-1)
-        rows.append(
-            {
-                "method": method,
-                "rotation_median_deg": np.median(angle),
-                "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
-                "translation_median_mm": np.median(distance),
-                "translation_rms_mm": np.sqrt(np.mean(distance**2)),
-                "nees": np.mean(squares) / 6,
-                "bias_error": np.median(np.abs(edge_bias(found)[0] - setup.bias))
-                if method == "line_ml"
-                else np.nan,
-                "converged": np.mean(found.converged),
-            }
-        )
+    for method, solution in solutions.items():
+        error = pose_errors(pose_array(solution.transform), shots["T_camera_lrf"])
+        covariance = solution.covariance[..., :6, :6]
+        normalised = np.linalg.solve(covariance, error[..., None])[..., 0]
+        squares = np.sum(error * normalised, axis=-1)
+        turn, shift = np.split(error, 2, axis=1)
+        angle = np.degrees(np.linalg.norm(turn, axis=-1))
+        distance = 1e3 * np.linalg.norm(shift, axis=-1)
+        bias_error = np.nan
+        if method == "line_ml":
+            bias_error = np.median(np.abs(edge_bias(solution)[0] - setup.bias))
+        row = {
+            "method": method,
+            "rotation_median_deg": np.median(angle),
+            "rotation_rms_deg": np.sqrt(np.mean(angle**2)),
+            "translation_median_mm": np.median(distance),
+            "translation_rms_mm": np.sqrt(np.mean(distance**2)),
+            "nees": np.mean(squares) / 6,
+            "bias_error": bias_error,
+            "converged": np.mean(solution.converged),
+        }
+        rows.append(row)
     return pd.DataFrame(rows)
 
 

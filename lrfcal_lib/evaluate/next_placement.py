@@ -377,10 +377,7 @@ class Suggestion:
     median_gain: float
 
     def words(self):
-        """The pose in words, e.g.
-
-        ``board 1.5 m ahead, 20 deg to the left, turned 60 deg in its plane, ...``.
-        """
+        """The pose in words, like ``board 1.5 m ahead, 20 deg to the left, upright``."""
         place = self.place
         parts = [f"board {self.place.distance:.1f} m ahead"]
         right_or_left = "to the left" if place.bearing > 0 else "to the right"
@@ -487,9 +484,10 @@ def group_sigma(covariance, solution):
     names = np.array(solution.solution.names)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1) / scales_of(solution, names) ** 2
     groups = {"axis": np.isin(names, AXIS_NAMES)}
-    groups |= {camera: np.char.startswith(names, f"{camera}_") for camera in solution.transforms}
-    return {
-        name: np.sqrt(variance[..., rows].sum(axis=-1))
-        for name, rows in groups.items()
-        if rows.any()
-    }
+    for camera in solution.transforms:
+        groups[camera] = np.char.startswith(names, f"{camera}_")
+    out = {}
+    for name, rows in groups.items():
+        if rows.any():
+            out[name] = np.sqrt(variance[..., rows].sum(axis=-1))
+    return out

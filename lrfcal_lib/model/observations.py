@@ -13,25 +13,24 @@ ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covar
 
 
 def check_finite(record, whose="", missing=()):
-    """Refuse a record with a NaN or an infinity in an array (those named in `missing` may have
-    them).
-    """
+    """Refuse a record with a NaN or an infinity in an array; those named in `missing` may."""
     for name, value in vars(record).items():
-        if name not in missing and isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            bad = ~np.isfinite(value)
-            if bad.any():
-                row = np.argwhere(bad)[0, 0]
-                raise ValueError(
-                    f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row {row} "
-                    f"({value[row].ravel()[:3]}): leave such observations out"
-                )
+        if name in missing or not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            continue
+        bad = ~np.isfinite(value)
+        if bad.any():
+            row = np.argwhere(bad)[0, 0]
+            raise ValueError(
+                f"{name}{whose} holds {bad.sum()} values that are not finite, the first in row "
+                f"{row} ({value[row].ravel()[:3]}): leave such observations out"
+            )
 
 
 def rows(*shape, of, each=0.0):
-    """A field of arrays with a row for each member of a group: `each` row is this by default, None:
-    its number.
+    """A field of arrays with a row for each member of a group.
 
-    Of groups of which nothing is given there are no rows.
+    `each` row is this by default, None: its number. Of groups of which nothing is given there are
+    no rows.
     """
     return field(default=None, metadata={"shape": shape, "of": of, "each": each})
 
@@ -45,22 +44,26 @@ class _Groups:
             if f.metadata and getattr(self, f.name) is None:
                 shape, of, each = f.metadata.values()
                 n = counts.get(of, 0)
-                value = np.arange(n) if each is None else np.broadcast_to(each, (n, *shape)).copy()
+                value = np.arange(n)
+                if each is not None:
+                    value = np.broadcast_to(each, (n, *shape)).copy()
                 object.__setattr__(self, f.name, value)
 
     def group(self, name):
         """Fields of one group of observations: dict of arrays without the group's prefix."""
-        return {
-            f.name[len(name) + 1 :]: getattr(self, f.name)
-            for f in fields(self)
-            if f.name.startswith(name + "_")
-        }
+        prefix = f"{name}_"
+        out = {}
+        for f in fields(self):
+            if f.name.startswith(prefix):
+                out[f.name.removeprefix(prefix)] = getattr(self, f.name)
+        return out
 
     def keep(self, **masks):
         """The observations with some rows of groups left out, e.g. ``keep(view=mask)``."""
         changed = {}
         for name, mask in masks.items():
-            changed |= {f"{name}_{key}": value[mask] for key, value in self.group(name).items()}
+            for key, value in self.group(name).items():
+                changed[f"{name}_{key}"] = value[mask]
         return replace(self, **changed)
 
 
@@ -129,16 +132,21 @@ class CameraObservations(_Groups):
     Six points on edges of a board, and the lines of these edges in the image of a camera 10 cm to
     the right:
 
-    >>> import numpy as np >>> from lrfcal_lib.model.camera import CameraModel, line_through >>>
-    from lrfcal_lib.model.observations import CameraObservations >>> from lrfcal_lib.solvers import
-    solve_camera >>> model = CameraModel(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0) >>> ahead
-    = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # R of T_camera_lrf: x right, z where the
-    LRF's y is >>> points = np.array([[-1, 3, 0], [-0.6, 2, 0], [-0.1, 3, 0], [0.2, 2, 0], [0.7, 3,
-    0], [0.5, 2, 0.0]]) >>> seen = points @ ahead.T - [0.1, 0, 0] >>> pixels = seen[:, :2] / seen[:,
-    2:] * 500.0 + [320.0, 240.0] >>> turn = np.radians([80, 100, 35, 145, 60, 120])  # of the edges
-    in the image >>> lines = line_through(pixels, pixels + np.stack([np.cos(turn), np.sin(turn)],
-    axis=1)) >>> obs = CameraObservations(model, crossing_points=points, crossing_lines=lines) >>>
-    np.allclose(solve_camera(obs, "line").transform.translation, [-0.1, 0, 0]) True
+    >>> import numpy as np
+    >>> from lrfcal_lib.model.camera import CameraModel, line_through
+    >>> from lrfcal_lib.model.observations import CameraObservations
+    >>> from lrfcal_lib.solvers import solve_camera
+    >>> model = CameraModel(640, 480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> ahead = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # R of T_camera_lrf
+    >>> points = [[-1, 3, 0], [-0.6, 2, 0], [-0.1, 3, 0], [0.2, 2, 0], [0.7, 3, 0], [0.5, 2, 0]]
+    >>> points = np.array(points, float)
+    >>> seen = points @ ahead.T - [0.1, 0, 0]
+    >>> pixels = seen[:, :2] / seen[:, 2:] * 500.0 + [320.0, 240.0]
+    >>> turn = np.radians([80, 100, 35, 145, 60, 120])  # of the edges in the image
+    >>> lines = line_through(pixels, pixels + np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    >>> obs = CameraObservations(model, crossing_points=points, crossing_lines=lines)
+    >>> np.allclose(solve_camera(obs, "line").transform.translation, [-0.1, 0, 0])
+    True
     """
 
     model: CameraModel
@@ -173,12 +181,12 @@ class CameraObservations(_Groups):
     scene_placement: np.ndarray = rows(of="scene", each=None)
 
     def __post_init__(self):
-        points = {
-            group: getattr(self, f"{group}_points")
-            for group in ("crossing", "plane", "pattern", "scene")
-        }
-        counts = {group: 0 if p is None else p.shape[-2] for group, p in points.items()}
-        self.fill(board=0 if self.board_poses is None else self.board_poses.shape[-3], **counts)
+        counts = {}
+        for group in ("crossing", "plane", "pattern", "scene"):
+            points = getattr(self, f"{group}_points")
+            counts[group] = 0 if points is None else points.shape[-2]
+        boards = 0 if self.board_poses is None else self.board_poses.shape[-3]
+        self.fill(board=boards, **counts)
         if self.pattern_pixels is None:
             unseen = np.full((self.board_poses.shape[-3], counts["pattern"], 2), np.nan)
             object.__setattr__(self, "pattern_pixels", unseen)
@@ -196,20 +204,19 @@ class CameraObservations(_Groups):
         return np.unique(np.concatenate(parts))
 
     def require(self, kind, least):
-        """Refuse fewer than `least` of a kind ('crossing', 'plane' or 'scene'), with words for
-        what they leave open.
-        """
-        found = self.scene_placement if kind == "scene" else self.crossing_placement
-        if kind == "plane":
-            found = np.intersect1d(self.placements, self.plane_placement)
-        if len(found) < least:
-            what = {
-                "crossing": "crossings of scan lines with edges",
-                "plane": "placements with a board pose and points on the board",
-                "scene": "scene points",
-            }[kind]
+        """Refuse fewer than `least` of a kind: 'crossing', 'plane' or 'scene'."""
+        if kind == "crossing":
+            count = len(self.crossing_placement)
+            what = "crossings of scan lines with edges"
+        elif kind == "plane":
+            count = len(np.intersect1d(self.placements, self.plane_placement))
+            what = "placements with a board pose and points on the board"
+        else:
+            count = len(self.scene_placement)
+            what = "scene points"
+        if count < least:
             raise DegenerateGeometry(
-                f"camera '{self.camera}': {len(found)} {what}, at least {least} needed: "
+                f"camera '{self.camera}': {count} {what}, at least {least} needed: "
                 "the rest of the pose stays unobservable"
             )
 
@@ -220,16 +227,18 @@ class CameraObservations(_Groups):
     def select(self, placements):
         """The observations of some placements (numbers) only."""
         wanted = list(placements)
-        groups = ("crossing", "plane", "scene")
         out = self.keep(
-            **{group: np.isin(getattr(self, f"{group}_placement"), wanted) for group in groups}
+            crossing=np.isin(self.crossing_placement, wanted),
+            plane=np.isin(self.plane_placement, wanted),
+            scene=np.isin(self.scene_placement, wanted),
         )
         known = np.isin(self.placements, wanted)
-        boards = ("board_poses", "board_covariance", "pattern_pixels")
         return replace(
             out,
             placements=self.placements[known],
-            **{name: getattr(self, name)[known] for name in boards},
+            board_poses=self.board_poses[known],
+            board_covariance=self.board_covariance[known],
+            pattern_pixels=self.pattern_pixels[known],
         )
 
 
@@ -350,15 +359,15 @@ class JointObservations(_Groups):
     lens_covariance: np.ndarray = rows(9, 9, of="camera")
 
     def __post_init__(self):
-        self.fill(
-            view=0 if self.view_pose is None else len(self.view_pose), camera=len(self.cameras)
-        )
+        views = 0 if self.view_pose is None else len(self.view_pose)
+        self.fill(view=views, camera=len(self.cameras))
         check_finite(self)
+        count = len(self.placements)
         for group in GROUPS:
             place = getattr(self, f"{group}_placement")
-            if len(place) and not 0 <= place.min() <= place.max() < len(self.placements):
+            if len(place) and not 0 <= place.min() <= place.max() < count:
                 raise ValueError(
-                    f"{group}_placement are indices below {len(self.placements)}, got up to {place.max()}"
+                    f"{group}_placement are indices below {count}, got up to {place.max()}"
                 )
         if len(self.face_sigma) and self.face_sigma.min() <= 0:
             raise ValueError(f"face_sigma must be positive, got {self.face_sigma.min()}")
@@ -371,24 +380,28 @@ class JointObservations(_Groups):
         """The observations of some placements (numbers) only."""
         kept = np.flatnonzero(np.isin(self.placements, list(placements)))
         out = self.keep(
-            **{name: np.isin(getattr(self, f"{name}_placement"), kept) for name in GROUPS}
+            face=np.isin(self.face_placement, kept),
+            beam=np.isin(self.beam_placement, kept),
+            view=np.isin(self.view_placement, kept),
         )
-        moved = {
-            f"{name}_placement": np.searchsorted(kept, getattr(out, f"{name}_placement"))
-            for name in GROUPS
-        }
         return replace(
             out,
-            **moved,
-            **{key: getattr(self, key)[kept] for key in ("placements", "direction", "middle")},
+            placements=self.placements[kept],
+            direction=self.direction[kept],
+            middle=self.middle[kept],
+            face_placement=np.searchsorted(kept, out.face_placement),
+            beam_placement=np.searchsorted(kept, out.beam_placement),
+            view_placement=np.searchsorted(kept, out.view_placement),
         )
 
     def with_cameras(self, names):
         """The observations of some cameras only."""
         kept = [i for i, name in enumerate(self.cameras) if name in names]
         out = self.keep(view=np.isin(self.view_camera, kept))
-        chosen = {key: tuple(getattr(self, key)[i] for i in kept) for key in ("cameras", "mounts")}
-        camera = np.searchsorted(kept, out.view_camera)
         return replace(
-            out, view_camera=camera, lens_covariance=self.lens_covariance[kept], **chosen
+            out,
+            view_camera=np.searchsorted(kept, out.view_camera),
+            lens_covariance=self.lens_covariance[kept],
+            cameras=tuple(self.cameras[i] for i in kept),
+            mounts=tuple(self.mounts[i] for i in kept),
         )

@@ -1,7 +1,4 @@
-"""Figures of what was recorded: scans, range images, pictures, edges.
-
-And one colour for each sensor.
-"""
+"""Figures of what was recorded: scans, range images, pictures, edges; a colour for each sensor."""
 
 import numpy as np
 from matplotlib.patches import Rectangle
@@ -39,65 +36,59 @@ GAIN = 5.0
 
 
 def range_image(ax, sweep, mask=None, limits=None):
-    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch; what
-    was drawn.
+    """A sweep as the rig sees it: range over bearing (to the left as in the scene) and pitch.
 
-    With a pitch that stands still, scan lines are numbered instead. `mask` (L, B) is what was found
-    to be the board; it is outlined, and bearings far from it are cut off. With `limits` (two
-    ranges, metres) several sweeps share their colours, and the colour bar is left to the caller.
+    Returns what was drawn. With a pitch that stands still, scan lines are numbered instead. `mask`
+    (L, B) is what was found to be the board; it is outlined, and bearings far from it are cut off.
+    With `limits` (two ranges, metres) several sweeps share their colours, and the colour bar is
+    left to the caller.
     """
-    moves = np.ptp(sweep.pitch) > 0
     bearing = np.degrees(sweep.bearings)
     order = np.argsort(sweep.pitch, kind="stable")
-    height = np.degrees(sweep.pitch) if moves else np.arange(len(sweep.pitch))
-    looks = {"shading": "nearest", "rasterized": True} | dict(
-        zip(("vmin", "vmax"), limits or (), strict=False)
-    )
+    height = np.arange(len(sweep.pitch))
+    ax.set(xlabel="bearing [deg]", ylabel="scan line", aspect="auto")
+    if np.ptp(sweep.pitch) > 0:
+        height = np.degrees(sweep.pitch)
+        ax.set(ylabel="pitch [deg]", aspect="equal")
+    low, high = limits or (None, None)
+    looks = {"shading": "nearest", "rasterized": True, "vmin": low, "vmax": high}
     drawn = ax.pcolormesh(bearing, height[order], sweep.ranges[order], **looks)
     if limits is None:
         ax.figure.colorbar(drawn, ax=ax, label="range [m]", shrink=0.9)
-    if mask is not None and mask.any() and len(mask) == 1:
-        ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
-    elif mask is not None and mask.any():
-        ax.contour(
-            bearing,
-            height[order],
-            mask[order].astype(float),
-            levels=[0.5],
-            colors="white",
-            linewidths=1,
-        )
     shown = np.isfinite(sweep.ranges).any(axis=0)
-    step = np.ptp(bearing) / max(len(bearing) - 1, 1)
     if mask is not None and mask.any():
-        shown &= (
-            np.abs(bearing - bearing[mask.any(axis=0)].mean())
-            < np.ptp(bearing[mask.any(axis=0)]) / 2 + ABOUT
-        )
+        _outlined(ax, bearing, height[order], mask[order])
+        board = bearing[mask.any(axis=0)]
+        shown &= np.abs(bearing - board.mean()) < np.ptp(board) / 2 + ABOUT
     if shown.any():
+        step = np.ptp(bearing) / max(len(bearing) - 1, 1)
         ax.set_xlim(bearing[shown].max() + step, bearing[shown].min() - step)
     ax.grid(False)
-    ax.set_aspect("equal" if moves else "auto")
-    ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]" if moves else "scan line")
     return drawn
 
 
-def scan_line(ax, sweep, line, mask, fitted=None):
-    """One scan line, a row of ``sweep.ranges``, in the scan plane; `mask` (L, B) has the beams on
-    the board.
+def _outlined(ax, bearing, height, mask):
+    """Draw the border of a mask (L, B) over bearing and height in white; of one line its beams."""
+    if len(mask) == 1:
+        ax.plot(bearing[mask[0]], np.repeat(height, mask.sum()), ".", color="white", markersize=2)
+    else:
+        looks = {"levels": [0.5], "colors": "white", "linewidths": 1}
+        ax.contour(bearing, height, mask.astype(float), **looks)
 
-    `fitted` (L, B) are the ranges of a fitted line, see BoardScan.
+
+def scan_line(ax, sweep, line, mask, fitted=None):
+    """One scan line, a row of ``sweep.ranges``, in the scan plane.
+
+    `mask` (L, B) has the beams on the board, `fitted` (L, B) the ranges of a fitted line, see
+    BoardScan.
     """
     points = polar_to_points(sweep.ranges[line], sweep.bearings)[:, :2]
     on = mask[line]
     ax.plot(*points[~on].T, ".", color=COLORS["raw"], label="scene" if on.any() else "returns")
     ax.plot(*points[on].T, ".", color=COLORS["lrf"], label="board")
     if fitted is not None:
-        ax.plot(
-            *polar_to_points(fitted[line], sweep.bearings)[on, :2].T,
-            color=COLORS["fit"],
-            label="fitted line",
-        )
+        on_line = polar_to_points(fitted[line], sweep.bearings)[on, :2]
+        ax.plot(*on_line.T, color=COLORS["fit"], label="fitted line")
     ax.plot(0, 0, marker="^", color=COLORS["lrf"], markersize=8, linestyle="none", label="LRF")
     to_scale(ax, "x [m]", "y [m]")
     ax.legend()
@@ -110,45 +101,26 @@ def to_scale(ax, x, y):
 
 
 def edge_of_line(ax, scan, line, end=1, edges=()):
-    """Where a scan line of a BoardScan leaves the board: raw, filtered and fitted ranges, after
-    figure 5.
+    """Where a scan line of a BoardScan leaves the board: ranges raw, filtered, fitted (figure 5).
 
     `end` is +1 for the end at the larger bearings, -1 for the other one. Crossings of this line and
     end in `edges` (a sequence of ScanEdges) are drawn as upright lines.
     """
     on = np.flatnonzero(scan.mask[line])
     if on.size == 0:
-        raise ValueError(
-            f"no beam of scan line {line} is on the board of placement {scan.placement}"
-        )
+        where = f"scan line {line} is on the board of placement {scan.placement}"
+        raise ValueError(f"no beam of {where}")
     last = on[-1] if end > 0 else on[0]
     beams = np.arange(scan.mask.shape[1])
     near = np.abs(beams - last) <= BESIDE
-    bearing = np.degrees(scan.sweep.bearings)
     board = near & scan.mask[line]
-    ax.plot(
-        bearing[near],
-        scan.sweep.ranges[line, near],
-        "o",
-        color=COLORS["raw"],
-        markersize=5,
-        label="raw",
-    )
-    ax.plot(
-        bearing[board],
-        scan.filtered[line, board],
-        "o",
-        color=COLORS["filtered"],
-        markersize=3,
-        label="filtered",
-    )
-    ax.plot(
-        bearing[board],
-        scan.fitted[line, board],
-        "-",
-        color=COLORS["fit"],
-        label="line fitted to the board",
-    )
+    bearing = np.degrees(scan.sweep.bearings)
+    raw = {"color": COLORS["raw"], "markersize": 5, "label": "raw"}
+    filtered = {"color": COLORS["filtered"], "markersize": 3, "label": "filtered"}
+    fitted = {"color": COLORS["fit"], "label": "line fitted to the board"}
+    ax.plot(bearing[near], scan.sweep.ranges[line, near], "o", **raw)
+    ax.plot(bearing[board], scan.filtered[line, board], "o", **filtered)
+    ax.plot(bearing[board], scan.fitted[line, board], "-", **fitted)
     for index, found in enumerate(edges):
         for x, y, _ in found.points[(found.line == line) & (found.end == end)]:
             style = ("--", "-", ":")[index % 3]
@@ -161,19 +133,12 @@ def edge_of_line(ax, scan, line, end=1, edges=()):
 
 
 def crossings(ax, edges):
-    """Edge crossings (ScanEdges) of a sweep over bearing and pitch, one colour a straight side;
-    side -1 crossed out.
-    """
-    points = np.degrees(
-        np.column_stack([np.arctan2(edges.points[:, 1], edges.points[:, 0]), edges.pitch])
-    )
+    """Edge crossings (ScanEdges) of a sweep, one colour a straight side; side -1 crossed out."""
+    x, y, _ = edges.points.T
+    points = np.degrees(np.column_stack([np.arctan2(y, x), edges.pitch]))
     for index, side in enumerate(np.unique(edges.side[edges.side >= 0])):
-        ax.plot(
-            *points[edges.side == side].T,
-            ".",
-            color=SERIES[index % len(SERIES)],
-            label=f"side {side}",
-        )
+        color = SERIES[index % len(SERIES)]
+        ax.plot(*points[edges.side == side].T, ".", color=color, label=f"side {side}")
     if (edges.side < 0).any():
         ax.plot(*points[edges.side < 0].T, "x", color=COLORS["outlier"], label="not used")
     ax.legend()
@@ -210,36 +175,24 @@ def projection(ax, edges, plane, lines=None):
 
 
 def picture(ax, image):
-    """An image (h, w, 3) or (h, w) as cameras and OpenCV give it (blue first), without axes.
-
-    A dark one brightened.
-    """
-    gain = np.clip(BRIGHT / max(np.quantile(image[::4, ::4], 0.99), 1.0), 1.0, GAIN)
-    color = (
-        np.clip(gain * image[..., ::-1], 0, 255).astype(np.uint8)
-        if image.ndim == 3
-        else gain * image
-    )
-    ax.imshow(
-        color,
-        cmap=None if image.ndim == 3 else "gray",
-        interpolation="antialiased",
-        vmin=0,
-        vmax=255,
-    )
+    """An image (h, w, 3) or (h, w), blue first, without axes; a dark one brightened."""
+    brightest = max(np.quantile(image[::4, ::4], 0.99), 1.0)
+    gain = np.clip(BRIGHT / brightest, 1.0, GAIN)
+    looks = {"interpolation": "antialiased", "vmin": 0, "vmax": 255}
+    if image.ndim == 3:
+        color = np.clip(gain * image[..., ::-1], 0, 255)
+        ax.imshow(color.astype(np.uint8), **looks)
+    else:
+        ax.imshow(gain * image, cmap="gray", **looks)
     if gain > 1:
-        looks = {
-            "color": "white",
-            "va": "bottom",
-            "bbox": {"facecolor": "#333333", "edgecolor": "none", "pad": 2},
-        }
-        ax.text(0.01, 0.015, f"brightened {gain:.1f} times", transform=ax.transAxes, **looks)
+        box = {"facecolor": "#333333", "edgecolor": "none", "pad": 2}
+        looks = {"color": "white", "va": "bottom", "bbox": box, "transform": ax.transAxes}
+        ax.text(0.01, 0.015, f"brightened {gain:.1f} times", **looks)
     ax.set_axis_off()
 
 
 def board_view(ax, image, view, model, margin=60):
-    """An image with the corners and edges that a BoardView found in it, cut to `margin` pixels
-    around the board.
+    """An image with what a BoardView found in it, cut to `margin` pixels around the board.
 
     The title names edges that were not used. `model` puts edges, which are kept in undistorted
     pixels, back through the lens.
@@ -251,22 +204,17 @@ def board_view(ax, image, view, model, margin=60):
         ax.plot(*view.pixels.T, "+", color=COLORS["filtered"], markersize=4, markeredgewidth=0.8)
         drawn.append(view.pixels)
     box = {"facecolor": color, "edgecolor": "none", "boxstyle": "round,pad=0.2", "alpha": 0.85}
-    looks = {
-        "color": "white",
-        "fontsize": 8,
-        "ha": "center",
-        "va": "center",
-        "bbox": box,
-        "clip_on": True,
-    }
+    looks = {"color": "white", "fontsize": 8, "ha": "center", "va": "center"}
     for edge in view.edges:
-        drawn.append(stretch_in_image(edge, model))
-        ax.plot(*drawn[-1].T, "-", color=color, linewidth=1.6)
-        ax.text(*drawn[-1].mean(axis=0), edge.name, **looks)
-    lost = ", ".join(name for name, _ in view.rejected)
-    ax.set_title(
-        f"{view.camera}, placement {view.placement}" + (f"; not used: {lost}" if lost else "")
-    )
+        stretch = stretch_in_image(edge, model)
+        ax.plot(*stretch.T, "-", color=color, linewidth=1.6)
+        ax.text(*stretch.mean(axis=0), edge.name, bbox=box, clip_on=True, **looks)
+        drawn.append(stretch)
+    title = f"{view.camera}, placement {view.placement}"
+    if view.rejected:
+        lost = ", ".join(name for name, _ in view.rejected)
+        title = f"{title}; not used: {lost}"
+    ax.set_title(title)
     _cut(ax, drawn, image, margin)
 
 
@@ -290,31 +238,20 @@ def seen_points(ax, view, image, model, points, margin=60, styles=("o", "x", "s"
     picture(ax, image)
     lines = [stretch_in_image(edge, model) for edge in view.edges]
     for index, stretch in enumerate(lines):
-        ax.plot(
-            *stretch.T,
-            "-",
-            color="white",
-            linewidth=1.0,
-            label=None if index else "edge in the image",
-        )
+        label = None if index else "edge in the image"
+        ax.plot(*stretch.T, "-", color="white", linewidth=1.0, label=label)
     for index, (method, uv) in enumerate(points.items()):
-        looks = {
-            "color": SERIES[(index + 1) % len(SERIES)],
-            "markersize": 4.5,
-            "markerfacecolor": "none",
-        }
+        color = SERIES[(index + 1) % len(SERIES)]
+        looks = {"color": color, "markersize": 4.5, "markerfacecolor": "none"}
         ax.plot(*uv.T, styles[index % len(styles)], label=method, **looks)
-    ax.legend(
-        facecolor="#333333", labelcolor="white", frameon=True, framealpha=0.8, edgecolor="none"
-    )
+    dark = {"facecolor": "#333333", "labelcolor": "white", "edgecolor": "none"}
+    ax.legend(frameon=True, framealpha=0.8, **dark)
     _cut(ax, [*points.values(), *lines], image, margin)
     ax.set_title(f"{view.camera}, placement {view.placement}")
 
 
 def stretch_in_image(edge, model, count=61):
-    """An image edge as recorded: its stretch of undistorted pixels seen through the lens, shape
-    (count, 2).
-    """
+    """An image edge as recorded: its stretch of pixels seen through the lens, shape (count, 2)."""
     uv = np.linspace(*edge.ends, count)
     focal = np.array([model.fx, model.fy])
     centre = np.array([model.cx, model.cy])
@@ -326,12 +263,13 @@ def _cut(ax, drawn, image, margin):
     points = np.concatenate([*drawn, np.zeros((0, 2))])
     size = np.array(image.shape[1::-1])
     points = points[np.isfinite(points).all(axis=1)]
-    box = (
-        [points.min(axis=0) - margin, points.max(axis=0) + margin]
-        if len(points)
-        else [[-0.5, -0.5], size]
-    )
-    (left, top), (right, bottom) = np.clip(box, -0.5, size - 0.5)
+    first = np.array([-0.5, -0.5])
+    last = size - 0.5
+    if len(points):
+        first = np.maximum(points.min(axis=0) - margin, first)
+        last = np.minimum(points.max(axis=0) + margin, last)
+    left, top = np.minimum(first, size - 0.5)
+    right, bottom = np.maximum(last, -0.5)
     ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
@@ -345,34 +283,22 @@ def board_plan(ax, board):
         start = np.subtract(board.pattern.origin, board.pattern.square)
         for row, column in np.ndindex(board.pattern.rows + 1, board.pattern.columns + 1):
             if (row + column) % 2:
-                ax.add_patch(
-                    Rectangle(
-                        start + size * np.array([column, row]),
-                        size,
-                        size,
-                        color="white",
-                        linewidth=0,
-                    )
-                )
+                corner = start + size * np.array([column, row])
+                ax.add_patch(Rectangle(corner, size, size, color="white", linewidth=0))
     for index, (name, length) in enumerate(board.lengths().items()):
         ends = corners[[index, (index + 1) % len(corners)]]
         at = ends.mean(axis=0) + 0.03 * turn[index]
-        angle = np.degrees(np.arctan2(*(ends[1] - ends[0])[::-1]))
-        looks = {
-            "ha": "center",
-            "va": "center",
-            "rotation": (angle + 90) % 180 - 90,
-            "rotation_mode": "anchor",
-        }
-        ax.text(*at, f"{name.upper()} {1000 * length:.1f} mm", **looks)
+        x, y = ends[1] - ends[0]
+        upright = (np.degrees(np.arctan2(y, x)) + 90) % 180 - 90
+        turned = {"rotation": upright, "rotation_mode": "anchor"}
+        text = f"{name.upper()} {1000 * length:.1f} mm"
+        ax.text(*at, text, ha="center", va="center", **turned)
     ax.update_datalim(np.vstack([corners - 0.06, corners + 0.06]))
     to_scale(ax, "x [m]", "y [m]")
 
 
 def outline(ax, measured, exaggerate=20):
-    """The measured Outline of the board with the spread of each edge over the images,
-    `exaggerate` times larger.
-    """
+    """The measured Outline of the board, the spread of each edge `exaggerate` times larger."""
     corners = measured.board.known_corners()
     closed = np.vstack([corners, corners[:1]])
     ax.plot(*closed.T, "-", color=COLORS["truth"])
@@ -384,9 +310,11 @@ def outline(ax, measured, exaggerate=20):
             band = np.vstack([ends - away, ends[::-1] + away])
             ax.fill(*band.T, color=COLORS["fit"], alpha=0.25, linewidth=0)
         text = f"{name}\n{1000 * length:.1f} mm"
-        ax.text(*(ends.mean(axis=0) - 0.09 * normal), text, ha="center", va="center", fontsize=8)
+        at = ends.mean(axis=0) - 0.09 * normal
+        ax.text(*at, text, ha="center", va="center", fontsize=8)
     if measured.board.pattern is not None:
-        ax.plot(*measured.board.pattern.points()[:, :2].T, "+", color=COLORS["raw"], markersize=4)
+        corners = measured.board.pattern.points()[:, :2]
+        ax.plot(*corners.T, "+", color=COLORS["raw"], markersize=4)
     ax.invert_yaxis()
     to_scale(ax, "x [m]", "y [m]")
     ax.set_title(f"bands: spread over the images, {exaggerate:g} times")

@@ -25,19 +25,13 @@ def residual_strips(ax, residuals, placement, label, color):
     `label` is the quantity with its unit.
     """
     names, column, count = np.unique(placement, return_inverse=True, return_counts=True)
-    within = np.argsort(np.argsort(column, kind="stable")) - (np.cumsum(count) - count)[column]
+    rank = np.argsort(np.argsort(column, kind="stable"))
+    first = np.cumsum(count) - count
+    within = rank - first[column]
     spread = (within + 0.5) / count[column] - 0.5
     rms = np.sqrt(np.bincount(column, np.square(residuals)) / count)
-    ax.bar(
-        np.arange(len(names)),
-        2 * rms,
-        bottom=-rms,
-        width=0.8,
-        color=color,
-        alpha=0.2,
-        linewidth=0,
-        label="rms",
-    )
+    looks = {"width": 0.8, "color": color, "alpha": 0.2, "linewidth": 0}
+    ax.bar(np.arange(len(names)), 2 * rms, bottom=-rms, label="rms", **looks)
     ax.plot(column + 0.6 * spread, residuals, ".", color=color, markersize=2.5)
     by_placement(ax, names, label)
     limit = 1.08 * max(np.abs(residuals).max(), 1e-12)
@@ -45,49 +39,39 @@ def residual_strips(ax, residuals, placement, label, color):
 
 
 def pitch_offsets(ax, placement, offset, sigma, direction):
-    """Pitch offset of each sweep and its sigma (radians), coloured by the direction of the
-    head: +1 (up), -1 or 0.
-    """
+    """Pitch offset of each sweep and its sigma (radians), coloured by direction: +1 (up), -1, 0."""
     offset = np.degrees(offset)
     sigma = np.degrees(sigma)
-    for sign, color, label in (
-        (1, SERIES[0], "upwards"),
-        (-1, SERIES[1], "downwards"),
-        (0, COLORS["raw"], "unknown"),
-    ):
+    kinds = {1: (SERIES[0], "upwards"), -1: (SERIES[1], "downwards"), 0: (COLORS["raw"], "unknown")}
+    for sign, (color, label) in kinds.items():
         rows = np.flatnonzero(np.equal(direction, sign))
         if rows.size:
-            ax.bar(
-                rows, offset[rows], yerr=sigma[rows], color=color, width=0.75, label=label, **SPREAD
-            )
+            looks = {"color": color, "width": 0.75} | SPREAD
+            ax.bar(rows, offset[rows], yerr=sigma[rows], label=label, **looks)
             ax.axhline(np.median(offset[rows]), color=color, linestyle=":", linewidth=1)
     by_placement(ax, placement, "pitch offset [deg]")
-    ax.legend(
-        title="head moved", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2
-    )
+    above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    ax.legend(title="head moved", ncols=3, **above)
 
 
 def parameter_comparison(ax, values, sigmas, label):
-    """One parameter as each method finds it, with one-sigma bars (none for NaN): values and
-    sigmas by method.
-    """
+    """One parameter by method, values and sigmas, with one-sigma bars (none for NaN)."""
     for row, (method, value) in enumerate(values.items()):
+        sigma = sigmas[method] if np.isfinite(sigmas[method]) else None
         looks = {"fmt": "o", "color": SERIES[row % len(SERIES)], "capsize": 2.5, "markersize": 4.5}
-        ax.errorbar(
-            value, row, xerr=sigmas[method] if np.isfinite(sigmas[method]) else None, **looks
-        )
-    ax.set(
-        yticks=np.arange(len(values)),
-        yticklabels=list(values),
-        xlabel=label,
-        ylim=(len(values) - 0.5, -0.5),
-    )
+        ax.errorbar(value, row, xerr=sigma, **looks)
+    rows_of(ax, values)
+    ax.set_xlabel(label)
+
+
+def rows_of(ax, names):
+    """Ticks of rows from above to below."""
+    count = len(names)
+    ax.set(yticks=np.arange(count), yticklabels=list(names), ylim=(count - 0.5, -0.5))
 
 
 def edge_errors(ax, errors):
-    """Errors of edge lengths (measured minus true, mm) by rule or method, one dot an edge, the
-    mean as a bar.
-    """
+    """Errors of edge lengths (measured minus true, mm) by rule: a dot an edge, the mean a bar."""
     for row, values in enumerate(errors.values()):
         spread = (np.arange(len(values)) + 0.5) / max(len(values), 1) - 0.5
         color = SERIES[row % len(SERIES)]
@@ -95,35 +79,33 @@ def edge_errors(ax, errors):
         ax.plot([np.mean(values)] * 2, [row - 0.36, row + 0.36], color=color, linewidth=2.5)
     ax.axvline(0, color=COLORS["truth"], linewidth=0.8)
     ax.grid(False, axis="y")
-    ax.set(yticks=np.arange(len(errors)), yticklabels=list(errors), ylim=(len(errors) - 0.5, -0.5))
+    rows_of(ax, errors)
     ax.set_xlabel("measured - true length [mm]")
 
 
 def method_bars(ax, table, column, label):
-    """One column of a :func:`lrfcal_lib.evaluate.tables.method_comparison`, a bar for each
-    method and camera.
-    """
+    """One column of a ``method_comparison``, a bar for each method and camera."""
     methods = list(dict.fromkeys(table.method))
     cameras = list(dict.fromkeys(table.camera))
     height = 0.8 / len(cameras)
     rows = np.arange(len(methods))
     for i, camera in enumerate(cameras):
         part = table[table.camera == camera].set_index("method")[column].reindex(methods)
-        ax.barh(
-            rows + i * height, part, height=0.95 * height, color=color_of(camera, i), label=camera
-        )
-    ticks = rows + height * (len(cameras) - 1) / 2
-    ax.set(
-        yticks=ticks, yticklabels=methods, xlabel=label, ylim=(len(methods) - 0.5 * height, -height)
-    )
-    best = table.groupby("method", sort=False)[column].mean()
-    ax.set_title(f"least: {best.idxmin()}" if best.notna().any() else "no method could be judged")
+        looks = {"height": 0.95 * height, "color": color_of(camera, i)}
+        ax.barh(rows + i * height, part, label=camera, **looks)
+    middle = height * (len(cameras) - 1) / 2
+    ax.set(yticks=rows + middle, yticklabels=methods, xlabel=label)
+    ax.set_ylim(len(methods) - 0.5 * height, -height)
+    mean = table.groupby("method", sort=False)[column].mean()
+    title = "no method could be judged"
+    if mean.notna().any():
+        title = f"least: {mean.idxmin()}"
+    ax.set_title(title)
     ax.legend()
 
 
 def projection_map(ax, found, index=0, name=""):
-    """Standard deviation over an image of where points of the LRF project, at one of the distances
-    of a map.
+    """Standard deviation over an image of where points of the LRF project, at a map's distance.
 
     `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN
     stay white.
@@ -134,9 +116,7 @@ def projection_map(ax, found, index=0, name=""):
 
 
 def point_map(ax, found, index=0):
-    """Standard deviation of reconstructed points over the field of view, a SigmaMap of
-    ``uncertainty.point_sigma``.
-    """
+    """Standard deviation of points over the field of view, of ``uncertainty.point_sigma``."""
     _sigma_map(ax, found, index, "mm", "cloud", np.degrees(1.0), 1000.0)
     middle = np.mean(ax.get_ylim())
     height = max(np.ptp(ax.get_ylim()), LEAST_HEIGHT)
@@ -157,14 +137,14 @@ def _sigma_map(ax, found, index, unit, name, angle=1.0, scale=1.0):
     mesh = ax.pcolormesh(*at, good, cmap="viridis", shading=shading, vmin=0.0, vmax=top)
     ax.grid(False)
     if good.count() and good.max() > 1.05 * good.min():
-        ax.clabel(
-            ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8), fontsize=8, fmt="%.3g"
-        )
-    ax.figure.colorbar(mesh, ax=ax, label=f"standard deviation [{unit}]", shrink=0.8, format="%.3g")
+        lines = ax.contour(*at, good, LEVELS, colors="white", linewidths=0.8)
+        ax.clabel(lines, fontsize=8, fmt="%.3g")
+    label = f"standard deviation [{unit}]"
+    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.8, format="%.3g")
     ax.set_aspect("equal")
     rms = scale * found.rms()[index]
-    said = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"
-    ax.set_title(f"{name} at {found.distances[index]:g} m: {said}")
+    size = f"{rms:.2g} {unit} rms" if np.isfinite(rms) else "no bound"
+    ax.set_title(f"{name} at {found.distances[index]:g} m: {size}")
 
 
 def point_parts(ax, found):
@@ -172,50 +152,42 @@ def point_parts(ax, found):
 
     SigmaMap of ``point_sigma``.
     """
-    rows = {k: np.sqrt(np.mean(v**2, axis=(1, 2))) for k, v in found.parts.items()} | {
-        "calibration": found.rms()
-    }
-    rows = {name: value for name, value in rows.items() if np.any(value > 0)}
-    for index, (name, value) in enumerate(rows.items()):
-        style = {"range noise": ":", "calibration": "-"}.get(name, "--")
-        color = COLORS["truth"] if name == "calibration" else SERIES[index % len(SERIES)]
-        ax.plot(
-            found.distances,
-            1000 * value,
-            style,
-            marker="o",
-            markersize=3.5,
-            color=color,
-            label=name,
-        )
-    ax.set(
-        xlabel="distance [m]", ylabel="standard deviation [mm]", ylim=(0, 1.35 * ax.get_ylim()[1])
-    )
-    ax.set_title(f"calibration: {1000 * found.rms()[-1]:.2g} mm at {found.distances[-1]:g} m")
+    rms = {name: np.sqrt(np.mean(part**2, axis=(1, 2))) for name, part in found.parts.items()}
+    shown = {name: value for name, value in rms.items() if np.any(value > 0)}
+    dots = {"marker": "o", "markersize": 3.5}
+    for index, (name, value) in enumerate(shown.items()):
+        style = ":" if name == "range noise" else "--"
+        color = SERIES[index % len(SERIES)]
+        ax.plot(found.distances, 1000 * value, style, color=color, label=name, **dots)
+    whole = 1000 * found.rms()
+    if np.any(whole > 0):
+        ax.plot(found.distances, whole, "-", color=COLORS["truth"], label="calibration", **dots)
+    ax.set(xlabel="distance [m]", ylabel="standard deviation [mm]")
+    ax.set_ylim(0, 1.35 * ax.get_ylim()[1])
+    ax.set_title(f"calibration: {whole[-1]:.2g} mm at {found.distances[-1]:g} m")
     ax.legend(ncols=2, loc="upper left")
 
 
 def observability_bars(ax, directions):
     """The six least known combinations of unknowns, in words (``next_placement.observability``)."""
     shown = directions[:6]
-    sigma = 1000 * np.array([d.sigma for d in directions[:6]])
+    sigma = 1000 * np.array([direction.sigma for direction in shown])
     known = np.isfinite(sigma)
     longest = 1.15 * sigma[known].max(initial=0.0) or 1.0
     colors = np.where(known, COLORS["fit"], COLORS["outlier"])
     ax.barh(np.arange(len(shown)), np.where(known, sigma, longest), color=colors, height=0.6)
-    for row, s in enumerate(sigma):
-        text, at, color = (
-            (f" {s:.2g} mm", s, "black") if known[row] else (" not determined", 0.0, "white")
-        )
-        ax.text(at, row, text, va="center", ha="left", color=color)
-    lost = f"{(~known).sum()} motions are not determined"
-    ax.set_title(f"least known: {sigma[0]:.2g} mm at 2 m" if known.all() else lost)
-    ax.set(
-        ylim=(len(shown) - 0.5, -0.5),
-        xlim=(0, 1.12 * longest),
-        xlabel="standard deviation at 2 m [mm]",
-    )
-    ax.set_yticks(np.arange(len(shown)), [textwrap.fill(d.words, 64) for d in shown], fontsize=8)
+    for row, value in enumerate(sigma):
+        if known[row]:
+            ax.text(value, row, f" {value:.2g} mm", va="center", ha="left", color="black")
+        else:
+            ax.text(0.0, row, " not determined", va="center", ha="left", color="white")
+    title = f"{(~known).sum()} motions are not determined"
+    if known.all():
+        title = f"least known: {sigma[0]:.2g} mm at 2 m"
+    ax.set_title(title)
+    ax.set(xlim=(0, 1.12 * longest), xlabel="standard deviation at 2 m [mm]")
+    rows_of(ax, [textwrap.fill(direction.words, 64) for direction in shown])
+    ax.tick_params(axis="y", labelsize=8)
     ax.grid(False, axis="y")
 
 
@@ -227,62 +199,48 @@ def misfit_bars(ax, misfit, limit=4.0):
     values = np.array(list(misfit.values()))
     every = 1 if len(misfit) < 16 else 2
     bad = values > limit * max(np.median(values), 1.0)
-    ax.bar(
-        np.arange(len(values)),
-        values,
-        color=np.where(bad, COLORS["outlier"], COLORS["lrf"]),
-        width=0.75,
-    )
+    color = np.where(bad, COLORS["outlier"], COLORS["lrf"])
+    ax.bar(np.arange(len(values)), values, color=color, width=0.75)
     ax.axhline(1.0, color=COLORS["truth"], linewidth=1, linestyle="--")
     by_placement(ax, list(misfit), "chi-square per degree of freedom")
     ax.set_xticks(np.arange(len(values))[::every], list(misfit)[::every])
-    many = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
-    title = many if bad.any() else f"all placements fit alike, the worst {values.max():.1f}"
+    title = f"all placements fit alike, the worst {values.max():.1f}"
+    if bad.any():
+        title = f"{bad.sum()} of {len(values)} placements fit much worse than the others"
     ax.set(ylim=(0, 1.1 * max(values.max(), 1.2)), title=title)
 
 
 def residuals_by_range(ax, distance, residual):
-    """Range residuals over distance (metres, shapes (n,)), with the mean and its standard error in
-    bins.
+    """Range residuals over distance (metres, shapes (n,)), with means and their errors in bins.
 
-    Noise scatters, a model error bends; see :func:`lrfcal_lib.evaluate.joint_tables.range_residuals`.
+    Noise scatters, a model error bends; see ``joint_tables.range_residuals``.
     """
     residual = 1000 * np.asarray(residual)
     ax.plot(distance, residual, ",", color=COLORS["raw"], zorder=0)
     limits = np.unique(np.quantile(distance, np.linspace(0, 1, BINS + 1)))
-    which = np.clip(np.searchsorted(limits, distance, side="right") - 1, 0, max(len(limits) - 2, 0))
-    bins = [which == i for i in np.unique(which)]
-    means = [
-        (distance[b].mean(), residual[b].mean(), residual[b].std() / np.sqrt(b.sum())) for b in bins
-    ]
+    number = np.searchsorted(limits, distance, side="right") - 1
+    number = np.clip(number, 0, max(len(limits) - 2, 0))
+    means = []
+    for i in np.unique(number):
+        here = residual[number == i]
+        error = here.std() / np.sqrt(len(here))
+        means.append((distance[number == i].mean(), here.mean(), error))
     x, y, error = np.transpose(means)
-    ax.errorbar(
-        x,
-        y,
-        yerr=error,
-        fmt="o-",
-        color=COLORS["lrf"],
-        capsize=2.5,
-        label="mean and its standard error",
-    )
+    looks = {"fmt": "o-", "color": COLORS["lrf"], "capsize": 2.5}
+    ax.errorbar(x, y, yerr=error, label="mean and its standard error", **looks)
     ax.axhline(0, color=COLORS["truth"], linewidth=0.8)
     limit = 1.05 * max(np.quantile(np.abs(residual), 0.995), 1e-9)
-    title = f"{np.sqrt(np.mean(residual**2)):.2g} mm rms"
-    ax.set(
-        xlabel="range [m]",
-        ylabel="predicted - measured [mm]",
-        ylim=(-limit, limit),
-        title=f"ranges: {title}",
-    )
+    rms = np.sqrt(np.mean(residual**2))
+    ax.set(xlabel="range [m]", ylabel="predicted - measured [mm]", ylim=(-limit, limit))
+    ax.set_title(f"ranges: {rms:.2g} mm rms")
     ax.legend()
 
 
 def residuals_by_region(ax, uv, shift, model, name):
-    """Residuals of the boards' middles over an image, as arrows; the longest is an eighth of the
-    image's width.
+    """Residuals of the boards' middles over an image, as arrows.
 
-    `uv` and `shift` (n, 2), pixels: see :func:`lrfcal_lib.evaluate.joint_tables.view_residuals`. The
-    camera's name is its colour.
+    The longest is an eighth of the image's width. `uv` and `shift` (n, 2), pixels: see
+    ``joint_tables.view_residuals``. The camera's name is its colour.
     """
     length = np.linalg.norm(shift, axis=1)
     title = f"{name}: no board in any image"
@@ -293,10 +251,8 @@ def residuals_by_region(ax, uv, shift, model, name):
         unit = float(f"{longest / 2:.1g}")
         ax.quiverkey(drawn, 0.85, 0.94, unit, f"{unit:g} px", labelpos="S", coordinates="axes")
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
-    ax.set(
-        xlim=(0, model.width), ylim=(model.height, 0), xlabel="u [px]", ylabel="v [px]", title=title
-    )
-    ax.set_aspect("equal")
+    ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
+    ax.set(xlabel="u [px]", ylabel="v [px]", title=title)
 
 
 def board_bend(ax, bends):
@@ -306,52 +262,43 @@ def board_bend(ax, bends):
     """
     found = [b for b in bends.placements.values() if np.isfinite(b.size)]
     if not found:
-        raise ValueError(
-            f"no bends to draw: none of {len(bends.placements)} placements shows enough of the board"
-        )
+        count = f"none of {len(bends.placements)} placements"
+        raise ValueError(f"no bends to draw: {count} shows enough of the board")
     values = 1000 * np.array([(b.size, b.sigma, b.sheet, b.sheet_sigma) for b in found])
-    (size, sigma, sheet, sheet_sigma) = values.T
+    size, sigma, sheet, sheet_sigma = values.T
     at = np.arange(len(found))
     bent = np.array([b.bends for b in found])
-    for some, color, label in (
-        (bent, "lrf", "scan: bends"),
-        (~bent, "raw", "scan: too little to matter"),
-    ):
-        if some.any():
-            ax.bar(
-                at[some],
-                size[some],
-                yerr=sigma[some],
-                color=COLORS[color],
-                label=label,
-                width=0.75,
-                **SPREAD,
-            )
+    kinds = (bent, "lrf", "scan: bends"), (~bent, "raw", "scan: too little to matter")
+    for rows, color, label in kinds:
+        if rows.any():
+            looks = {"color": COLORS[color], "width": 0.75} | SPREAD
+            ax.bar(at[rows], size[rows], yerr=sigma[rows], label=label, **looks)
     if np.isfinite(sheet).any():
         looks = {"fmt": "D", "color": COLORS["left"], "markersize": 4, "capsize": 2, "linewidth": 1}
-        ax.errorbar(
-            at, sheet, yerr=sheet_sigma, label="images: change of the printed sheet", **looks
-        )
+        label = "images: change of the printed sheet"
+        ax.errorbar(at, sheet, yerr=sheet_sigma, label=label, **looks)
     by_placement(ax, [b.placement for b in found], "highest to lowest point [mm]")
-    many = f"{bent.sum()} of {len(found)} boards bend in the scan, by up to {size[bent].max(initial=0.0):.0f} mm"
-    ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=many if bent.any() else "no board bends")
+    title = "no board bends"
+    if bent.any():
+        count = f"{bent.sum()} of {len(found)} boards bend in the scan"
+        title = f"{count}, by up to {size[bent].max():.0f} mm"
+    ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=title)
     ax.legend(ncols=3, fontsize=8, loc="upper left")
 
 
 def over_view(ax, cloud, values, limit):
-    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees;
-    what was drawn.
+    """Values of a Cloud's points over bearing (to the left as in the scene) and pitch, degrees.
 
-    Colours end at `limit`, and at its negative where there are negative values.
+    Colours end at `limit`, and at its negative where there are negative values. Returns what was
+    drawn.
     """
-    signed = np.nanmin(values, initial=0.0) < 0
-    shades = {
-        "cmap": "RdBu_r" if signed else "magma",
-        "vmin": -limit if signed else 0.0,
-        "vmax": limit,
-    }
-    place = np.degrees(cloud.bearing), np.degrees(cloud.pitch)
-    drawn = ax.scatter(*place, c=values, s=2.5, marker="s", linewidths=0, rasterized=True, **shades)
+    shades = {"cmap": "magma", "vmin": 0.0, "vmax": limit}
+    if np.nanmin(values, initial=0.0) < 0:
+        shades = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    bearing = np.degrees(cloud.bearing)
+    pitch = np.degrees(cloud.pitch)
+    looks = {"s": 2.5, "marker": "s", "linewidths": 0, "rasterized": True}
+    drawn = ax.scatter(bearing, pitch, c=values, **looks, **shades)
     ax.set(xlabel="bearing [deg]", ylabel="pitch [deg]", aspect="equal")
-    ax.set(xlim=(place[0].max(), place[0].min()), ylim=(place[1].min(), place[1].max()))
+    ax.set(xlim=(bearing.max(), bearing.min()), ylim=(pitch.min(), pitch.max()))
     return drawn

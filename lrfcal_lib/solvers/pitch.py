@@ -1,7 +1,6 @@
 """Errors of the recorded pitch, found from the boards that cameras on the base see."""
 
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -55,9 +54,7 @@ class PitchData:
 
     @property
     def n_numbers(self):
-        """Independent numbers in the data: the LRF's errors are the same for all cameras, so
-        they count once.
-        """
+        """Independent numbers in the data; errors of the LRF are common to all cameras: once."""
         edges = max(np.round(np.sum(e["weight"] ** 2)) for e in self.edges)
         return int(PLANE_NUMBERS * len(self.placements) + EDGE_NUMBERS * edges)
 
@@ -68,123 +65,122 @@ def gather(cameras, direction, middle):
     for name, obs in cameras.items():
         if obs.source != "platform":
             raise ValueError(
-                f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to the platform"
+                f"camera '{name}' has source '{obs.source}': pitch errors need cameras fixed to "
+                "the platform"
             )
-    placements = reduce(
-        np.intersect1d, [every[0].plane_placement, *(obs.placements for obs in every)]
-    )
+    placements = every[0].plane_placement
+    for obs in every:
+        placements = np.intersect1d(placements, obs.placements)
     if len(placements) < 4:
         raise DegenerateGeometry(
-            f"{len(placements)} placements seen by the LRF and all cameras: at least 4 needed to compare sweeps"
+            f"{len(placements)} placements seen by the LRF and all cameras: at least 4 needed to "
+            "compare sweeps"
         )
-
-    def shared_out(obs, name, parts, **more):
-        """A group padded by placement, all rows of a part (a face, an edge of a placement)
-        together with weight 1.
-        """
-        group = {"points": obs.group(name)["points"], "pitch": obs.group(name)["pitch"]} | more
-        place = obs.group(name)["placement"]
-        keep = np.isin(place, placements)
-        group["placement"] = np.searchsorted(placements, place)
-        _, index, number = np.unique(parts[keep], return_inverse=True, return_counts=True)
-        group = {key: value[keep] for key, value in group.items()}
-        return pad(group | {"weight": 1 / np.sqrt(number[index])}, len(placements))
-
     edges = []
     boards = []
     for obs in every:
-        sides = np.unique(obs.crossing_edge, return_inverse=True)[1]
-        parts = obs.crossing_placement * (len(sides) + 1) + sides
-        edges.append(
-            shared_out(
-                obs, "crossing", parts, sight=sight_normals(obs.crossing_lines, obs.model)[0]
-            )
-        )
+        group = obs.group("crossing")
+        group["sight"] = sight_normals(obs.crossing_lines, obs.model)[0]
+        edges.append(_shared_out(group, ("placement", "edge"), placements))
         order = np.argsort(obs.placements)
-        boards.append(
-            obs.board_poses[order[np.searchsorted(obs.placements, placements, sorter=order)], :3]
-        )
-    direction, middle = (
-        np.array([known[p] for p in placements.tolist()]) for known in (direction, middle)
-    )
-    faces = shared_out(every[0], "plane", every[0].plane_placement)
+        rows = order[np.searchsorted(obs.placements, placements, sorter=order)]
+        boards.append(obs.board_poses[rows, :3])
+    direction = np.array([direction[p] for p in placements.tolist()])
+    middle = np.array([middle[p] for p in placements.tolist()])
+    faces = _shared_out(every[0].group("plane"), ("placement",), placements)
     return PitchData(placements, direction, middle, faces, edges, np.array(boards), tuple(cameras))
+
+
+def _shared_out(group, part, placements):
+    """A group padded by placement; the rows of a part (alike in these columns) weigh 1 together."""
+    kept = np.isin(group["placement"], placements)
+    number = np.zeros(kept.sum(), int)
+    for key in part:
+        names, value = np.unique(group[key][kept], return_inverse=True)
+        number = number * len(names) + value
+    _, index, count = np.unique(number, return_inverse=True, return_counts=True)
+    columns = {key: group[key][kept] for key in ("points", "pitch", "sight") if key in group}
+    columns["placement"] = np.searchsorted(placements, group["placement"][kept])
+    columns["weight"] = 1 / np.sqrt(count[index])
+    return pad(columns, len(placements))
 
 
 def corrected_points(group, data, state):
     """Platform points with the recorded pitch corrected, and their derivative by the pitch."""
     _, direction, offset, stretch = state
-    change = (direction * data.direction + offset)[:, None] + stretch[:, None] * (
-        group["pitch"] - data.middle[:, None]
-    )
+    away = group["pitch"] - data.middle[:, None]
+    common = direction * data.direction + offset
+    change = common[:, None] + stretch[:, None] * away
     q = geometry.tilt(group["points"], change)
     return q, np.stack([0 * change, -q[..., 2], q[..., 1]], axis=-1)
 
 
 def plane_distances(state, data):
-    """Distances (p, n) of every camera's face points from its boards' planes and of its crossings
-    from their sights.
+    """Distances (p, n) of face points from boards' planes and of crossings from their sights.
 
     Yields for each camera twice: group, distances, and Jacobian by the poses of all cameras 6 c and
     by `ERRORS` 3.
     """
-    cameras = len(state[0])
-    for i, pose in enumerate(state[0]):
-        board = data.boards[i][:, None]
-        for group, normal, point in (
-            (data.faces, board[..., 2], board[..., 3]),
-            (data.edges[i], None, 0.0),
-        ):
-            normal = (
-                group["sight"] if normal is None else np.broadcast_to(normal, group["points"].shape)
-            )
-            q, by_pitch = corrected_points(group, data, state)
-            rotated = q @ pose[:, :3].T
-            r = np.sum(normal * (rotated + pose[:, 3] - point), axis=-1)
-            slope = np.sum((normal @ pose[:, :3]) * by_pitch, axis=-1)
-            J = np.zeros(r.shape + (6 * cameras + len(ERRORS),))
-            J[..., 6 * i : 6 * i + 6] = gradient_by_pose(rotated, normal)
-            away = group["pitch"] - data.middle[:, None]
-            J[..., -3:] = np.stack([slope * data.direction[:, None], slope, slope * away], axis=-1)
-            yield group, r, J
+    for i, board in enumerate(data.boards):
+        normal = np.broadcast_to(board[:, None, :, 2], data.faces["points"].shape)
+        yield _camera_distances(state, data, i, data.faces, normal, board[:, None, :, 3])
+        yield _camera_distances(state, data, i, data.edges[i], data.edges[i]["sight"], 0.0)
+
+
+def _camera_distances(state, data, camera, group, normal, point):
+    """One yield of :func:`plane_distances`: distances from planes through points of a camera."""
+    poses = state[0]
+    pose = poses[camera]
+    q, by_pitch = corrected_points(group, data, state)
+    rotated = q @ pose[:, :3].T
+    r = np.sum(normal * (rotated + pose[:, 3] - point), axis=-1)
+    slope = np.sum((normal @ pose[:, :3]) * by_pitch, axis=-1)
+    away = group["pitch"] - data.middle[:, None]
+    J = np.zeros(r.shape + (6 * len(poses) + len(ERRORS),))
+    J[..., 6 * camera : 6 * camera + 6] = gradient_by_pose(rotated, normal)
+    J[..., -3] = slope * data.direction[:, None]
+    J[..., -2] = slope
+    J[..., -1] = slope * away
+    return group, r, J
 
 
 def pitch_blocks(state, data, name):
-    """Residuals in metres by placement with analytic Jacobian, and weak priors, for one of
-    `MODELS`.
+    """Residuals in metres by placement with analytic Jacobian, and weak priors, of a model.
 
     The state are camera poses (c, 3, 4), offset by direction, offsets (p,), stretches (p,).
     Unknowns are 6 of each camera and the model's; what belongs to single sweeps is their own.
     """
     cameras = len(state[0])
-    own = [e for e in MODELS[name] if e != "direction"]
     columns = [*range(6 * cameras), *(6 * cameras + ERRORS.index(error) for error in MODELS[name])]
     sigma = SIGMA * np.sqrt(cameras)
-    blocks = [
-        Block(r, J[..., columns], group["weight"] / sigma)
-        for group, r, J in plane_distances(state, data)
-    ]
+    blocks = []
+    for group, r, J in plane_distances(state, data):
+        blocks.append(Block(r, J[..., columns], group["weight"] / sigma))
+    own = sum(error != "direction" for error in MODELS[name])
     if own:
-        values = np.stack(state[2:], axis=1)[:, : len(own)]
+        values = np.stack(state[2:], axis=1)[:, :own]
         k = len(columns)
-        J = np.broadcast_to(np.eye(k)[k - len(own) :], values.shape + (k,))
-        blocks.append(Block(values, J, np.broadcast_to(1 / PRIOR[: len(own)], values.shape)))
+        J = np.broadcast_to(np.eye(k)[k - own :], values.shape + (k,))
+        blocks.append(Block(values, J, np.broadcast_to(1 / PRIOR[:own], values.shape)))
     return blocks
 
 
 def move_pitch_state(state, step, name):
     """Retraction of the pitch models."""
-    poses = state[0]
-    cameras = len(state[0])
+    poses, direction, offset, stretch = state
     common, own = step
-    steps = dict(zip(MODELS[name], [*common[6 * cameras :], *own.T], strict=True))
-    moved = [value + steps.get(error, 0.0) for error, value in zip(ERRORS, state[1:], strict=True)]
-    return geometry.move_pose(poses, common[: 6 * cameras].reshape(cameras, 6)), *moved
+    by_pose, direction_step = np.split(common, [6 * len(poses)])
+    steps = dict(zip(MODELS[name], [*direction_step, *own.T], strict=True))
+    return (
+        geometry.move_pose(poses, by_pose.reshape(-1, 6)),
+        direction + steps.get("direction", 0.0),
+        offset + steps.get("offset", 0.0),
+        stretch + steps.get("stretch", 0.0),
+    )
 
 
 def misfit(data, state):
-    """What the models are compared by (m^2), and rms distances of face points from the boards by
-    camera, metres.
+    """What the models are compared by (m^2), and rms distances of face points by camera, metres.
 
     Sum over the placements of the mean square distance of the fitted scan plane from the camera's
     plane, and over their edges of the mean square distance of the crossings from the planes of
@@ -193,23 +189,24 @@ def misfit(data, state):
     q, _ = corrected_points(data.faces, data, state)
     used = data.faces["used"]
     count = used.sum(axis=1)
-    away = (q - np.sum(q * used[..., None], axis=1, keepdims=True) / count[:, None, None]) * used[
-        ..., None
-    ]
+    within = used[..., None]
+    middle = np.sum(q * within, axis=1, keepdims=True) / count[:, None, None]
+    away = (q - middle) * within
     flat = np.linalg.svd(away, full_matrices=False)[2][:, 2]
     # what the scan scatters about its own plane tells nothing of the pitch
-    own = np.sum(flat[:, None] * away, axis=-1)
+    scatter = np.sum(flat[:, None] * away, axis=-1)
     total = 0.0
     rms = {}
-    found = plane_distances(state, data)
+    distances = plane_distances(state, data)
     for name, pose, board in zip(data.cameras, state[0], data.boards, strict=True):
-        r = next(found)[1] * used
-        (edges, d, _) = next(found)
+        _, r, _ = next(distances)
+        edges, d, _ = next(distances)
+        r = r * used
         rms[name] = float(np.sqrt(np.sum(r**2) / used.sum()))
-        aligned = own * np.sign(np.sum((board[..., 2] @ pose[:, :3]) * flat, axis=1))[:, None]
-        total += np.sum(np.sum(((r - aligned) * used) ** 2, axis=1) / count) + np.sum(
-            (d * edges["weight"]) ** 2
-        )
+        side = np.sign(np.sum((board[..., 2] @ pose[:, :3]) * flat, axis=1))
+        without_scatter = (r - scatter * side[:, None]) * used
+        total += np.sum(np.sum(without_scatter**2, axis=1) / count)
+        total += np.sum((d * edges["weight"]) ** 2)
     return float(total) / len(state[0]), rms
 
 
@@ -246,9 +243,7 @@ class PitchModel:
     p_value: float = np.nan
 
     def tested(self, small, numbers):
-        """The model with F and its p-value against a smaller one, of so many independent
-        numbers.
-        """
+        """The model with F and p-value against a smaller one, of so many independent numbers."""
         if small is None or self.n_parameters <= small.n_parameters or numbers <= self.n_parameters:
             return self
         more = self.n_parameters - small.n_parameters
@@ -324,10 +319,11 @@ def estimate_pitch_errors(cameras, direction, middle):
         state, sigma, model = _solve_model(name, data, state)
         if name == "direction":
             turn = float(state[1]), sigma
-        models[name] = before = model.tested(before, numbers)
-        wanted = (
-            before if wanted is None or before.tested(wanted, numbers).p_value < LEVEL else wanted
-        )
+        model = model.tested(before, numbers)
+        if wanted is None or model.tested(wanted, numbers).p_value < LEVEL:
+            wanted = model
+        models[name] = model
+        before = model
     return PitchErrors(data.placements, data.direction, *turn, models, wanted.name)
 
 
@@ -337,20 +333,27 @@ def _solve_model(name, data, state):
     The stated sigmas only weigh faces against edges, the level comes from the residuals.
     """
     names = [f"{c}_{n}" for c in data.cameras for n in geometry.POSE_NAMES]
-    names += ["direction_offset"] * (name == "direction")
+    if name == "direction":
+        names.append("direction_offset")
+
+    def read(state):
+        """No transform, and the shared unknowns."""
+        values = np.r_[geometry.pose_parameters(state[0]).ravel(), state[1]]
+        return None, values[: len(names)]
+
     found = solve(
         lambda s: pitch_blocks(s, data, name),
         state,
         lambda s, step: move_pitch_state(s, step, name),
         names=names,
-        read=lambda s: (None, np.r_[geometry.pose_parameters(s[0]).ravel(), s[1]][: len(names)]),
+        read=read,
         required=False,
         method=f"pitch_{name}",
         shared=len(names),
         limit=10.0,
         freedom=data.n_numbers - 6,
     )
-    (poses, direction, offset, stretch) = found.state
+    poses, direction, offset, stretch = found.state
     p = len(data.placements)
     total, rms = misfit(data, found.state)
     level = total / max(data.n_numbers - 6, 1) / SIGMA**2 / found.inflation
@@ -362,21 +365,17 @@ def _solve_model(name, data, state):
         offset = offset - offset.mean()
         own = found.jacobian[..., 6 * len(poses) :]
         inverse = np.linalg.inv(np.swapaxes(own, -1, -2) @ own)
-        offset_sigma = (
-            np.sqrt(inverse[:, 0, 0] * total / max(data.n_numbers - parameters, 1)) / SIGMA
-        )
-    transforms = {
-        camera: pose_transform(pose) for camera, pose in zip(data.cameras, poses, strict=True)
-    }
+        variance = total / max(data.n_numbers - parameters, 1)
+        offset_sigma = np.sqrt(inverse[:, 0, 0] * variance) / SIGMA
     model = PitchModel(
         name,
-        offset,
-        offset_sigma,
-        stretch,
-        transforms,
-        total,
-        rms,
-        parameters,
-        bool(found.converged),
+        offset=offset,
+        offset_sigma=offset_sigma,
+        stretch=stretch,
+        transforms=dict(zip(data.cameras, map(pose_transform, poses), strict=True)),
+        misfit=total,
+        rms=rms,
+        n_parameters=parameters,
+        converged=bool(found.converged),
     )
     return found.state, sigma, model

@@ -1,6 +1,6 @@
-"""The tilt axis from edges swept at known pitch angles (eqs.
+"""The tilt axis from edges swept at known pitch angles: in space, and projected as printed.
 
-1-15): in space, and projected as printed.
+Equations (1) to (15).
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,8 @@ class PlatformSolution:
         return self.solution.converged
 
     def __repr__(self):
-        return f"PlatformSolution({self.solution.method}, {self.axis}, {len(self.placements)} placements)"
+        count = f"{len(self.placements)} placements"
+        return f"PlatformSolution({self.solution.method}, {self.axis}, {count})"
 
 
 def start_head(T0):
@@ -132,26 +133,25 @@ def solve_platform(obs, T0=None, *, sigma_pitch=0.0):
 
 
 def prepare_boards(obs, T_head_lrf):
-    """Edge and face points padded by placement, a start board by placement, and why some placements
-    are skipped.
+    """Edge and face points padded by placement, start boards by placement, and who is skipped why.
 
     `second` is 1 for points of edge 2 and 0 for others, those of a lone edge, too. Boards are pose
     arrays (3, 4), ``T_platform_board``, with x along edge 1 and z along the normal.
     """
-    groups = obs.group("edge"), obs.group("face")
-    p_edge, p_face = (
-        lrf_to_platform(group["points"], group["pitch"], T_head_lrf) for group in groups
-    )
+    edge = obs.group("edge")
+    face = obs.group("face")
+    p_edge = lrf_to_platform(edge["points"], edge["pitch"], T_head_lrf)
+    p_face = lrf_to_platform(face["points"], face["pitch"], T_head_lrf)
     boards = {}
     skipped = {}
     second = np.full(len(p_edge), -1.0)
     for placement in np.unique(obs.edge_placement).tolist():
-        edges = [(obs.edge_placement == placement) & (obs.edge_number == e) for e in (1, 2)]
+        here = obs.edge_placement == placement
+        edges = [here & (obs.edge_number == number) for number in (1, 2)]
         edges = [rows for rows in edges if rows.sum() >= 2]
+        on_face = p_face[obs.face_placement == placement]
         try:
-            boards[placement] = _start_board(
-                [p_edge[rows] for rows in edges], p_face[obs.face_placement == placement]
-            )
+            boards[placement] = _start_board([p_edge[rows] for rows in edges], on_face)
         except DegenerateGeometry as error:
             skipped[placement] = str(error)
             continue
@@ -159,16 +159,21 @@ def prepare_boards(obs, T_head_lrf):
             second[rows] = number
     if not boards:
         raise DegenerateGeometry(f"no placement can be used for the tilt axis: {skipped}")
-    padded = []
-    numbers = list(boards)
-    for group, number in zip(groups, (second, np.zeros(len(p_face))), strict=True):
-        kept = np.isin(group["placement"], numbers) & (number >= 0)
-        group = {key: value[kept] for key, value in (group | {"second": number}).items()}
-        padded.append(
-            pad(group | {"placement": np.searchsorted(numbers, group["placement"])}, len(numbers))
-        )
-        padded[-1]["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
-    return *padded, boards, skipped
+    edge["second"] = second
+    face["second"] = np.zeros(len(p_face))
+    edge = _padded(edge, list(boards))
+    face = _padded(face, list(boards))
+    return edge, face, boards, skipped
+
+
+def _padded(group, placements):
+    """Columns of points by placement, padded, without those of other placements and lone points."""
+    kept = np.isin(group["placement"], placements) & (group["second"] >= 0)
+    group = {key: value[kept] for key, value in group.items()}
+    group["placement"] = np.searchsorted(placements, group["placement"])
+    out = pad(group, len(placements))
+    out["covariance"] += SIGMA_FLOOR**2 * np.eye(3)  # no board is flat
+    return out
 
 
 def _start_board(edges, face):
@@ -186,7 +191,8 @@ def _start_board(edges, face):
                 "the two edges are nearly parallel: edges 1 and 2 must be perpendicular"
             )
         # the origin is where edge 1 comes nearest to edge 2
-        point = point + x * (between @ x - cosine * (between @ second)) / (1 - cosine**2)
+        along = between @ x - cosine * (between @ second)
+        point = point + x * along / (1 - cosine**2)
     elif len(face) >= 3:
         normal = geometry.fit_plane(face)[0]
         z = normal - x * (x @ normal)
@@ -205,25 +211,23 @@ def board_coordinates(head, boards, points, pitch):
     q = tilt(rotated + head[:, 3], pitch)
     lever = q - boards[:, None, :, 3]
     to_board = np.swapaxes(boards[:, None, :, :3], -1, -2)
-    turned = to_board @ np.swapaxes(tilt(np.eye(3), pitch[..., None]), -1, -2)  # B^T Rx(pitch)
+    Rx = np.swapaxes(tilt(np.eye(3), pitch[..., None]), -1, -2)
+    turned = to_board @ Rx
     eye = np.broadcast_to(np.eye(3), turned.shape)
-    axis = (turned @ np.concatenate([-hat(rotated), eye], axis=-1))[..., AXIS_COLUMNS]
-    board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
-    by_pitch = (to_board @ geometry.cross(np.array([1.0, 0.0, 0.0]), q)[..., None])[..., 0]
-    return (
-        lever @ boards[:, :, :3],
-        np.concatenate([axis, board], axis=-1),
-        turned @ head[:, :3],
-        by_pitch,
-    )
+    by_head = turned @ np.concatenate([-hat(rotated), eye], axis=-1)
+    by_board = to_board @ np.concatenate([hat(lever), -eye], axis=-1)
+    J = np.concatenate([by_head[..., AXIS_COLUMNS], by_board], axis=-1)
+    turn = geometry.cross(np.array([1.0, 0.0, 0.0]), q)
+    by_pitch = (to_board @ turn[..., None])[..., 0]
+    return lever @ boards[:, :, :3], J, turned @ head[:, :3], by_pitch
 
 
 def distances(state, group):
-    """Distances of points from their edge, in the board's plane and across it, (p, n, 2), and their
-    Jacobians.
+    """Distances (p, n, 2) of points from their edge, in the board's plane and across it.
 
-    Edge 1 lies along x of the board, edge 2 along y but for the skew and the gap. The second
-    distance serves for points on the face, too.
+    And their Jacobians by the unknowns, by the point and by the pitch. Edge 1 lies along x of the
+    board, edge 2 along y but for the skew and the gap. The second distance serves for points on the
+    face, too.
     """
     head, boards, bends = state
     b, J, by_point, by_pitch = board_coordinates(head, boards, group["points"], group["pitch"])
@@ -233,8 +237,10 @@ def distances(state, group):
     c = second * np.cos(skew)
     s = second * np.sin(skew)
     inside = np.stack([c, 1 - second + s, 0 * c], axis=-1)
-    normals = np.stack([inside, np.broadcast_to([0.0, 0.0, 1.0], inside.shape)], axis=-2)
-    r = (normals @ b[..., None])[..., 0] - np.stack([0 * second, second * gap], axis=-1)
+    across = np.broadcast_to([0.0, 0.0, 1.0], inside.shape)
+    normals = np.stack([inside, across], axis=-2)
+    gaps = np.stack([0 * second, second * gap], axis=-1)
+    r = (normals @ b[..., None])[..., 0] - gaps
     bend = np.zeros(r.shape + (2,))
     bend[..., 0, 0] = c * b[..., 1] - s * b[..., 0]
     bend[..., 1, 1] = -second
@@ -243,9 +249,7 @@ def distances(state, group):
 
 
 def distance_block(state, group, sigma_pitch, which):
-    """Some of the :func:`distances` of a group's points, whitened by the noise of points and
-    pitch.
-    """
+    """Some of the :func:`distances` of a group, whitened by the noise of points and pitch."""
     r, J, by_point, by_pitch = (x[:, :, which] for x in distances(state, group))
     pull = group["covariance"] @ np.swapaxes(by_point, -1, -2)
     by_pitch = sigma_pitch * by_pitch
@@ -256,9 +260,8 @@ def distance_block(state, group, sigma_pitch, which):
     corrected = distances(state, group | {"points": points, "pitch": pitch})[1][:, :, which]
     whitener = np.linalg.inv(np.linalg.cholesky(noise)) * group["used"][..., None, None]
     p = len(r)
-    return Block(
-        r.reshape(p, -1), J.reshape(p, -1, 12), whitener, corrected=corrected.reshape(p, -1, 12)
-    )
+    J = J.reshape(p, -1, 12)
+    return Block(r.reshape(p, -1), J, whitener, corrected=corrected.reshape(J.shape))
 
 
 def platform_blocks(state, edge, face, sigma_pitch):
@@ -271,37 +274,36 @@ def platform_blocks(state, edge, face, sigma_pitch):
     # a board seen with one edge may slide along it: its origin is held at the middle of that edge's
     # points
     b, J, _, _ = board_coordinates(head, boards, edge["points"], edge["pitch"])
-    along = np.concatenate([b[..., :1], J[..., 0, :]], axis=-1) * used
-    middle = np.sum(along, axis=1, keepdims=True) / np.maximum(used.sum(axis=1, keepdims=True), 1)
+    count = np.maximum(used.sum(axis=1), 1)
+    middle = np.sum(b[..., :1] * used, axis=1) / count
+    by_middle = np.zeros((p, 1, 12))
+    by_middle[..., :10] = (np.sum(J[..., 0, :] * used, axis=1) / count)[:, None]
+    stiff = np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))
     return [
         distance_block(state, edge, sigma_pitch, slice(0, 2)),
         distance_block(state, face, sigma_pitch, slice(1, 2)),
-        Block(bends, tolerance, np.broadcast_to([1 / SIGMA_SKEW, 1 / SIGMA_GAP], (p, 2))),
-        Block(
-            middle[..., 0], np.pad(middle[..., 1:], ((0, 0), (0, 0), (0, 2))), lone[:, None] * 100.0
-        ),
+        Block(bends, tolerance, stiff),
+        Block(middle, by_middle, lone[:, None] * 100.0),
     ]
 
 
 def move_platform(state, step):
     """Retraction of axis, boards, and their skew and gap."""
-    common, own = step
-    return (
-        move_head(state[0], common),
-        geometry.move_pose(state[1], own[:, :6]),
-        state[2] + own[:, 6:],
-    )
+    head, boards, bends = state
+    common, by_placement = step
+    pose, bend = np.split(by_placement, [6], axis=1)
+    return move_head(head, common), geometry.move_pose(boards, pose), bends + bend
 
 
 def solve_projected(obs, T0=None, *, printed=False):
-    """The tilt axis by the paper's projected line fits; for parameters and errors see
-    :func:`solve_platform`.
+    """The tilt axis by the paper's projected line fits.
 
-    Of the observations the edge points are used, without their covariance; that of the result comes
-    from the scatter of the residuals. Placements with an edge parallel to a coordinate plane are
-    skipped: their projected fits would divide by zero. Which planes these are is a matter of the
-    chart: of that of this repository, where the LRF is turned least, or (`printed`) of the paper's,
-    where it lies on the y axis of the head, ``t = (0, t_y, 0)``.
+    Parameters and errors are those of :func:`solve_platform`. Of the observations the edge points
+    are used, without their covariance; that of the result comes from the scatter of the residuals.
+    Placements with an edge parallel to a coordinate plane are skipped: their projected fits would
+    divide by zero. Which planes these are is a matter of the chart: of that of this repository,
+    where the LRF is turned least, or (`printed`) of the paper's, where it lies on the y axis of the
+    head, ``t = (0, t_y, 0)``.
 
     Notes
     -----
@@ -313,22 +315,22 @@ def solve_projected(obs, T0=None, *, printed=False):
     that. :func:`lrfcal_lib.solvers.platform.solve_platform` weighs every term by its noise.
     """
     gauge = start_head(T0)
-    turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real if printed else 0.0
-    groups, skipped = _slanted(
-        obs, tilt(lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge), turn)
-    )
+    turn = 0.0
+    if printed:
+        turn = _to_printed_chart(geometry.pose_array(gauge)[:, 3]).real
+    p_platform = lrf_to_platform(obs.edge_points, obs.edge_pitch, gauge)
+    groups, skipped = _slanted(obs, tilt(p_platform, turn))
     if not groups:
         raise DegenerateGeometry(
             f"projected fits: no placement can be used: {skipped}; use the 3D fits instead"
         )
     rows = [2 * (len(a) + len(b)) + 2 for a, b in groups.values()]
+    options = {"obs": obs, "groups": groups.values(), "printed": printed}
 
     def solved(head, scatter, **earlier):
         """The fits with a given scatter about the lines."""
         return solve(
-            partial(
-                projected_block, obs=obs, groups=groups.values(), scatter=scatter, printed=printed
-            ),
+            partial(projected_block, scatter=scatter, **options),
             geometry.pose_array(head),
             move_head,
             names=AXIS_NAMES,
@@ -342,39 +344,36 @@ def solve_projected(obs, T0=None, *, printed=False):
         )
 
     first = solved(gauge, 1.0)
-    scatter = max(np.sqrt(np.sum(first.residuals**2) / max(len(first.residuals) - 4, 1)), 1e-6)
-    found = solved(head_from_axis(axis_of(first.transform)), scatter, earlier=[first.cost_history])
+    freedom = max(len(first.residuals) - 4, 1)
+    scatter = max(np.sqrt(np.sum(first.residuals**2) / freedom), 1e-6)
+    gauge = head_from_axis(axis_of(first.transform))
+    found = solved(gauge, scatter, earlier=[first.cost_history])
     # the last two of every placement
     cosine, gap = scatter * found.residuals[np.cumsum(rows) - [[2], [1]]]
-    return PlatformSolution(
-        found, np.array(list(groups)), np.arcsin(np.clip(cosine, -1, 1)), gap, skipped
-    )
+    skew = np.arcsin(np.clip(cosine, -1, 1))
+    return PlatformSolution(found, np.array(list(groups)), skew, gap, skipped)
 
 
 def _slanted(obs, p_platform):
-    """Rows of edges 1 and 2 of every placement whose edges are slanted to the coordinate
-    planes, and why not others.
+    """Rows of edges 1 and 2 of placements whose edges are slanted, and why others are left out.
+
+    To the coordinate planes.
     """
     groups = {}
     skipped = {}
     for placement in np.unique(obs.edge_placement).tolist():
-        edges = [
-            np.flatnonzero((obs.edge_placement == placement) & (obs.edge_number == e))
-            for e in (1, 2)
-        ]
+        here = obs.edge_placement == placement
+        edges = [np.flatnonzero(here & (obs.edge_number == number)) for number in (1, 2)]
         reasons = []
         for number, rows in enumerate(edges, start=1):
             if len(rows) < 3:
                 reasons.append(f"edge {number} has {len(rows)} points, at least 3 needed")
                 continue
             direction = np.abs(fit_line(p_platform[rows])[1])
-            level = [
-                plane for axis, plane in ((2, "xy"), (1, "xz")) if direction[axis] < LEAST_SLOPE
-            ]
-            reasons += [
-                f"edge {number} is parallel to the {p} plane: its projected fits divide by zero"
-                for p in level
-            ]
+            for axis, plane in ((2, "xy"), (1, "xz")):
+                if direction[axis] < LEAST_SLOPE:
+                    parallel = f"edge {number} is parallel to the {plane} plane"
+                    reasons.append(f"{parallel}: its projected fits divide by zero")
         if reasons:
             skipped[placement] = reasons[0]
         else:
@@ -383,65 +382,69 @@ def _slanted(obs, p_platform):
 
 
 def projected_block(head, obs, groups, scatter=1.0, printed=False):
-    """The six terms of equation (15) of every placement (rows of edge 1, rows of edge 2) over their
-    common scatter.
+    """The six terms of equation (15) of every placement over their common scatter.
 
-    The Jacobian by the axis chart comes from complex steps, exact but for rounding.
+    `groups` are rows of edge 1 and rows of edge 2. The Jacobian by the axis chart comes from
+    complex steps, exact but for rounding.
     """
     rotated = obs.edge_points @ head[:, :3].T
-    by_axis = np.concatenate(
-        [-hat(rotated), np.broadcast_to(np.eye(3), rotated.shape + (3,))], axis=-1
-    )
-    by_axis = np.moveaxis(by_axis[..., AXIS_COLUMNS], -1, 0)
-    q = tilt(rotated + head[:, 3], obs.edge_pitch) + TINY * 1j * tilt(by_axis, obs.edge_pitch)
+    eye = np.broadcast_to(np.eye(3), rotated.shape + (3,))
+    by_head = np.concatenate([-hat(rotated), eye], axis=-1)
+    by_axis = np.moveaxis(by_head[..., AXIS_COLUMNS], -1, 0)
+    tiny = TINY * 1j
+    q = tilt(rotated + head[:, 3], obs.edge_pitch)
+    q = q + tiny * tilt(by_axis, obs.edge_pitch)
     if printed:
-        q = tilt(
-            q, _to_printed_chart(head[:, 3] + TINY * 1j * np.eye(6)[AXIS_COLUMNS, 3:])[:, None]
-        )
-    terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1) / scatter
+        t = head[:, 3] + tiny * np.eye(6)[AXIS_COLUMNS, 3:]
+        q = tilt(q, _to_printed_chart(t)[:, None])
+    terms = np.concatenate([_six_terms(q[:, a], q[:, b]) for a, b in groups], axis=1)
+    terms = terms / scatter
     return Block(terms[0].real, terms.imag.T / TINY, np.ones(terms.shape[1]))
 
 
 def _to_printed_chart(t):
-    """Angle about the tilt axis that turns shifts (..., 3) of the LRF from it into the paper's
-    t = (0, t_y, 0).
+    """Angle about the tilt axis that turns shifts (..., 3) of the LRF into the paper's (0, t_y,
+    0).
     """
-    y, z = np.moveaxis(t[..., 1:], -1, 0)  # of an axis through the LRF's origin: none
-    change = (z.real * y.imag - y.real * z.imag) / np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
+    y, z = np.moveaxis(t[..., 1:], -1, 0)
+    squared = np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
+    # of an axis through the LRF's origin: none
+    change = (z.real * y.imag - y.real * z.imag) / squared
     return -np.arctan2(z.real, y.real) + 1j * change
 
 
 def _six_terms(first, second):
-    """Errors of the four projected fits, ``u1 .
-
-    U2``, and the gap D of equation (14) of one placement, (4, m).
-    """
-    (errors1, u1, p1), (errors2, u2, p2) = (_projected_line(q) for q in (first, second))
+    """Errors of the four projected fits, u1 . u2, and the gap D of equation (14), shape (4, m)."""
+    errors1, u1, p1 = _projected_line(first)
+    errors2, u2, p2 = _projected_line(second)
     normal = geometry.cross(u1, u2)
     gap = _dot(normal, p1 - p2) / np.sqrt(_dot(normal, normal))
     return np.concatenate([errors1, errors2, _dot(u1, u2), gap], axis=-1)
 
 
 def _projected_line(q):
-    """Fit ``x = a z + b`` and ``z = c y + d`` (equations (7), (8)) to the points (4, n, 3) of one
-    edge.
+    """Fit ``x = a z + b`` and ``z = c y + d``, equations (7), (8), to points (4, n, 3) of an edge.
 
     Returns the errors (4, 2 n) over the root of n, and of equations (9) to (12) the direction ``u ~
     (a, 1 / c, 1)`` as a unit vector and the point ``p = (b, -d / c, 0)``.
     """
     x, y, z = np.moveaxis(q, -1, 0)
-    (e1, a, b) = _regression(z, x)
-    (e2, c, d) = _regression(y, z)
+    e1, a, b = _regression(z, x)
+    e2, c, d = _regression(y, z)
     u = np.concatenate([a, 1 / c, 1 + 0 * a], axis=-1)
+    point = np.concatenate([b, -d / c, 0 * b], axis=-1)
     errors = np.concatenate([e1, e2], axis=-1) / np.sqrt(x.shape[-1])
-    return errors, u / np.sqrt(_dot(u, u)), np.concatenate([b, -d / c, 0 * b], axis=-1)
+    return errors, u / np.sqrt(_dot(u, u)), point
 
 
 def _regression(s, v):
     """Errors, slope and offset of the straight-line fit ``v = slope s + offset``."""
-    s_mean, v_mean = (w.mean(axis=-1, keepdims=True) for w in (s, v))
-    slope = _dot(s - s_mean, v - v_mean) / _dot(s - s_mean, s - s_mean)
-    return v - v_mean - slope * (s - s_mean), slope, v_mean - slope * s_mean
+    s_mean = s.mean(axis=-1, keepdims=True)
+    v_mean = v.mean(axis=-1, keepdims=True)
+    s_off = s - s_mean
+    v_off = v - v_mean
+    slope = _dot(s_off, v_off) / _dot(s_off, s_off)
+    return v_off - slope * s_off, slope, v_mean - slope * s_mean
 
 
 def _dot(a, b):
