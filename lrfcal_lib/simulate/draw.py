@@ -63,6 +63,8 @@ class Bench(Devices):
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
     # standard deviation of the recorded pitch at the stop of an image, radians
     sigma_stop: float = 0.0
+    # standard deviation of the log odds of the edge from side to side: uneven backgrounds
+    spread: float = 0.0
     # least softness, in beam steps; real edges have none, the model of the joint estimate has
     floor: float = 0.0
 
@@ -201,7 +203,7 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     edge = distances.argmax(axis=-1)
     soft = np.hypot(bench.softness * radius, bench.floor * bench.step * r)
     jitter = noise * soft * rng.standard_normal(r.shape)
-    hit = (u + jitter < bench.bias * radius) & sensible
+    hit = (u + jitter < _bias_of_sides(bench, rng)[edge] * radius) & sensible
     # near to an edge across the scan lines, and along them
     changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
     across, along = (
@@ -229,6 +231,18 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
         "step": step * r[row, b],
     }
     return face, beams
+
+
+def _bias_of_sides(bench, rng):
+    """How far outside each edge of one placement a spot's centre still reads the board, spot radii, (E,)."""
+    bias = np.full(len(bench.board.edges), float(bench.bias))
+    if bench.spread:
+        x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
+        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi  # of a disc within an edge x radii inside its centre
+        odds = np.log(share / (1 - share))
+        own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
+        bias = np.interp(-own, -odds, x)
+    return bias
 
 
 def _views(bench, pose, at, rng, noise):

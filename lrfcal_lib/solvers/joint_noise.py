@@ -16,6 +16,7 @@ SHARP = 0.4  # scatter of scores over their information where edges are sharp, f
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
 SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
+SIDE_ROUNDS = 20
 SETTLED = 0.02  # change of the logarithm of a noise level
 NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
 ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
@@ -76,18 +77,19 @@ def estimate_noise(state, data, unknowns):
     blocks = residuals.named_blocks(state, data, unknowns)
     hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
     own = hessian[:, unknowns.shared :, unknowns.shared :]
-    variance = np.diagonal(np.linalg.pinv(own, rcond=1e-13, hermitian=True), axis1=1, axis2=2)  # shared ones held
+    spread = np.linalg.pinv(own, rcond=1e-13, hermitian=True)  # shared ones held
     if "face" in blocks:
         data = replace(data, **face_levels(state, data, blocks["face"]))
     if "beam" in blocks:
-        data = replace(data, beam_share=beam_share(state, data, blocks["beam"], unknowns))
+        data = replace(data, beam_share=beam_share(state, data, blocks["beam"], unknowns, spread))
     if "view" in blocks:
         data = view_levels(data, blocks["view"], hessian, gradient, unknowns.shared)
     count = SWEEPS[unknowns.sweep]
-    if unknowns.sides:
-        data = replace(data, side_sigma=side_level(state.sides**2 + variance[:, 6 + count :], data.side_sigma))
+    if unknowns.sides and "beam" in blocks:
+        data = replace(data, side_sigma=side_level(state.sides, data, own, gradient[:, unknowns.shared :]))
     if count:
-        found = np.sqrt(np.mean(state.sweeps[:, :count] ** 2 + variance[:, 6 : 6 + count], axis=0))
+        variance = np.diagonal(spread, axis1=1, axis2=2)[:, 6 : 6 + count]
+        found = np.sqrt(np.mean(state.sweeps[:, :count] ** 2 + variance, axis=0))
         data = replace(data, sweep_sigma=(*np.maximum(found, 1e-6), *data.sweep_sigma[count:]))
     return data
 
@@ -126,10 +128,12 @@ def _part(values, used):
     return np.sum(values[None] > limits[..., None], axis=0)
 
 
-def beam_share(state, data, block, unknowns):
+def beam_share(state, data, block, unknowns, spread):
     """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
 
-    Above one where readings flip more sharply than the floor of the softness: scores then scatter less than expected.
+    Board and sides take up a part of the scores, in all but few of them the larger one: with `spread` (p, k, k), the
+    covariance of a placement's own unknowns, tells what is left. Above one where readings flip more sharply than the
+    floor of the softness: scores then scatter less than expected.
     """
     ray = rays(state, data, data.beam)
     a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
@@ -137,14 +141,22 @@ def beam_share(state, data, block, unknowns):
     normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
     r = np.sum(normal * (origin - o), axis=-1) / np.sum(normal * d, axis=-1)
     along = np.sum((o + r[..., None] * d - origin - a) * t, axis=-1)
-    root = np.linalg.norm(block.jacobian[..., unknowns.shared + 3 : unknowns.shared + 6], axis=-1)  # root information
-    ratios = []
+    own = block.jacobian[..., unknowns.shared :]
+    root = np.linalg.norm(own[..., 3:6], axis=-1)  # root information
+    squares, expected = [], []
     for edge in range(len(data.lines)):
         mine = data.beam["used"] & (data.beam["edge"] == edge)
-        here = mine & (_part(along, mine) == np.arange(PARTS)[:, None, None])
-        information, score = (np.sum(np.where(here, v, 0.0), axis=-1) for v in (root**2, block.residuals * root))
-        ratios.append(np.divide(score**2, information, out=np.full(score.shape, np.nan), where=information > 0))
-    ratio = np.nanmean(ratios) * PARTS / (PARTS - 1) if np.isfinite(ratios).any() else 1.0
+        for part in range(PARTS):
+            weight = np.where(mine & (_part(along, mine) == part), root, 0.0)
+            information = np.sum(weight**2, axis=-1)
+            known = information > 0
+            score = np.sum(weight * block.residuals, axis=-1)[known]
+            by_own = (weight[:, None] @ own)[known, 0]
+            taken = data.beam_share * np.vecdot(by_own, (spread[known] @ by_own[..., None])[..., 0])
+            squares.append(score**2 / information[known])
+            expected.append(1 - taken / information[known])
+    total = np.sum(np.concatenate(expected))
+    ratio = np.sum(np.concatenate(squares)) / total if total > 1 else 1.0
     return float(1 / max(ratio, SHARP))
 
 
@@ -260,12 +272,31 @@ class ViewEvidence:
         return cost, float(np.sqrt(better))
 
 
-def side_level(square, sigma):
-    """Scale of the sides' (squared) deviations, Student's t by expectation and maximisation."""
-    for _ in range(20):
-        weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma**2)
-        sigma = np.sqrt(np.mean(weight * square))
-    return float(np.clip(sigma, 0.01, 2.0))
+def side_level(sides, data, hessian, gradient):
+    """Scale of the sides' deviations, Student's t, by expectation and maximisation.
+
+    Student's t is a normal distribution whose precision varies from side to side; what is expected of it hangs on the
+    whole expected square of a deviation. A side that the beams hardly show is as uncertain as the scale says, and must
+    not pull it down. `hessian` (p, k, k) and `gradient` (p, k) are of a placement's own unknowns, the sides last; shared
+    ones are held.
+    """
+    edges, sigma2 = sides.shape[1], data.side_sigma**2
+    shown = np.zeros(sides.shape, bool)
+    place, beam = np.nonzero(data.beam["used"])
+    shown[place, data.beam["edge"][place, beam]] = True
+    prior = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM * sigma2 + sides**2)  # as in `side_block`
+    last = np.arange(hessian.shape[-1])[-edges:]
+    weight = prior * sigma2
+    for _ in range(SIDE_ROUNDS):
+        whole, right = hessian.copy(), gradient.copy()
+        whole[:, last, last] += weight / sigma2 - prior
+        right[:, last] += (weight / sigma2 - prior) * sides
+        spread = np.linalg.pinv(whole, rcond=1e-13, hermitian=True)
+        step = -(spread @ right[..., None])[..., 0]
+        square = (sides + step[:, last]) ** 2 + spread[:, last, last]
+        weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
+        sigma2 = np.clip(np.mean((weight * square)[shown]), 1e-4, 4.0)
+    return float(np.sqrt(sigma2))
 
 
 def same_levels(before, after):
