@@ -159,7 +159,7 @@ def test_misfit_model_error_and_noise_are_named(good):
     found = {r.kind: r for r in diagnose(absurd)}
     assert found["noise"].answer == "no" and found["dependent"].words.startswith("only 5 % of the errors of ranges")
     blurred = {r.kind: r for r in diagnose(replace(absurd, lens_scale=4.0))}  # intrinsics are as uncertain
-    assert blurred["noise"].answer == "with care" and "(images 2.7 times)" in blurred["noise"].words
+    assert blurred["noise"].answer == "with care" and "images of 'right' 2.7 times" in blurred["noise"].words
 
 
 def test_large_errors_forbid_trust(good):

@@ -11,11 +11,14 @@ from shared import campaign
 
 from lrfcal_lib.evaluate.alternatives import (
     ALTERNATIVES,
+    alternatives_of,
     doubtful,
     not_an_offset,
+    weigh,
 )
 from lrfcal_lib.evaluate.diagnosis import lens_words
 from lrfcal_lib.model.board import Chessboard
+from lrfcal_lib.model.geometry import hat
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -41,6 +44,41 @@ def test_a_wrong_statement_is_named_with_its_size(kind, value, mount):
     found = next(doubt for doubt in doubts if doubt.kind == kind)
     assert found.value == pytest.approx(-value, abs=0.25 * abs(value) + 3 * found.sigma)
     assert ALTERNATIVES[kind].remedy in found.words and ALTERNATIVES[kind].signs[int(value > 0)] in found.words
+
+
+def doubt_about_squares(seed, by, corners):
+    """What the data say of the squares with the board's origin moved by `by` (metres)."""
+
+    def change(obs):
+        poses, arm = obs.view_pose.copy(), obs.view_pose[:, :3, :2] @ by
+        poses[:, :3, 3] += arm
+        turn = np.tile(np.eye(6), (len(poses), 1, 1))
+        turn[:, 3:, :3] = -hat(arm)
+        covariance = turn @ obs.view_covariance @ np.swapaxes(turn, -1, -2)
+        return replace(obs, view_pose=poses, view_covariance=covariance, corners=obs.corners - by)
+
+    solution = solved(seed, change)
+    pattern = Chessboard(4, 5, 0.029, tuple(np.array([0.05, 0.05]) - by))
+    lrf = SimpleNamespace(spot_exit=None)
+    session = SimpleNamespace(lrf=lrf, board=SimpleNamespace(corners=corners))
+    stated = alternatives_of(SimpleNamespace(session=session, board=SimpleNamespace(pattern=pattern)))
+    return next(doubt for doubt in weigh(solution, ADMITTED, stated) if doubt.kind == "squares")
+
+
+@pytest.mark.parametrize("corners", [None, "stated"])
+def test_what_the_data_say_of_squares_does_not_depend_on_the_origin(corners):
+    here, there = (doubt_about_squares(5, np.array(by), corners) for by in ((0.0, 0.0), (0.315, 0.38)))
+    assert there.value == pytest.approx(here.value, abs=0.1 * here.sigma)
+    assert there.sigma == pytest.approx(here.sigma, rel=0.2)
+
+
+def test_an_outline_that_the_images_measured_is_no_statement():
+    plain = SimpleNamespace(pattern=None)
+    session = SimpleNamespace(lrf=SimpleNamespace(spot_exit=0.01), board=SimpleNamespace(corners=None))
+    assert "squares" not in alternatives_of(SimpleNamespace(session=session, board=plain))
+    printed = SimpleNamespace(pattern=PATTERN)
+    assert "outline" not in alternatives_of(SimpleNamespace(session=session, board=printed))
+    assert "leave" not in ALTERNATIVES["spot"].remedy
 
 
 @pytest.mark.parametrize(("value", "mount"), [(0.03, "head"), (-0.03, "platform")])
@@ -73,10 +111,11 @@ def fisheye_views(field_deg, count, rng, size=(640, 480)):
 
 
 @pytest.mark.parametrize(
-    ("field_deg", "scale", "named"),
-    [(60, 1.0, None), (140, 1.0, "the model folds back"), (60, 2.0, "as with intrinsics of another image size")],
-)
-def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
+    ("field_deg", "scale", "named", "wide"),
+    [(60, 1.0, None, False), (140, 1.0, "the model folds back", True),
+     (60, 2.0, "as with intrinsics of another image size", False)],
+)  # fmt: skip
+def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named, wide):
     pixels = fisheye_views(field_deg, 15, rng(3))
     model = estimate_intrinsics(pixels, PATTERN, (640, 480)).models[0]
     model = model.with_parameters(model.parameters * np.r_[[scale] * 4, [1.0] * 5])
@@ -87,3 +126,4 @@ def test_a_lens_that_its_model_does_not_fit_is_named(field_deg, scale, named):
     )
     words = lens_words(prepared)
     assert words == {} if named is None else named in words["left"]
+    assert ("use a lens below 110 deg" in words.get("left", "")) == wide

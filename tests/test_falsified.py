@@ -5,13 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from falsified import FALSIFIED
+from falsified import FALSIFIED, changed, scaled, second_camera
 from joint_draws import draw, rng
 from shared import campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
 from lrfcal_lib.evaluate.verdict import contradicts_stated, verdict
 from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -19,18 +20,50 @@ STATED = np.radians(3.0), 0.03
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
 
 
-def judged(change, seed, mount="head", stated=True):
-    """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
-    obs, truth, rig = draw(rng(seed), 16, mount=mount, pitch_step=np.radians(2.0))
+LMS200 = {"spot": (0.012, 0.0044), "sigma_range": 0.005, "sigma_px": 0.1, "pitch_step": np.radians(1.0)}
+QUARTER = {"step": np.radians(0.25), "sigma_px": 0.15, "pitch_step": np.radians(1.0)}
+FINE = {"pitch_step": np.radians(1.0)}
+
+
+def edge_longer(share):
+    """The board's first edge stated so much longer: the next one is stated to run elsewhere."""
+
+    def change(obs):
+        corners = obs.corners.copy()
+        corners[1] = corners[0] + (1 + share) * (corners[1] - corners[0])
+        return replace(obs, corners=corners)
+
+    return change
+
+
+HARMFUL = {
+    "angular step 1 % too small": scaled(bearings=0.01),
+    "angular step 1 % too large": scaled(bearings=-0.01),
+    "spot stated twice as wide": changed(beam_radius=lambda radius: 2.0 * radius),
+    "spot stated half as wide": changed(beam_radius=lambda radius: 0.5 * radius),
+    **{f"an edge stated {100 * share:.0f} % longer": edge_longer(share) for share in (0.05, 0.1, 0.2, 0.3)},
+}
+
+
+def estimated(change, seed, mount="head", stated=True, **devices):
+    """As much of a JointCalibration of falsified observations as is judged, the truth, and the rig."""
+    obs, truth, rig = draw(rng(seed), 16, mount=mount, **({"pitch_step": np.radians(2.0)} | devices))
     prior = PlatformPrior(rig.T_head_lrf, *STATED)
     settings = {"sensor": SENSOR, "noise": "estimate", "lapse": 0.01, "sides": True, "axis": True, "prior": prior}
     T_head_lrf, settings["prior"] = (rig.T_head_lrf, prior) if stated else (None, None)
     solution = solve_joint(change(replace(obs, T_head_lrf=T_head_lrf)), required=False, **settings)
     cameras = {name: SimpleNamespace(guess=pose if stated else None) for name, pose in rig.cameras.items()}
     lrf = LrfInfo("home-made", (0.9, 2.2), 0.002, 0.005)
-    session = SimpleNamespace(lrf=lrf, T_head_lrf=T_head_lrf, platform_sigma=STATED, cameras=cameras)
-    prepared = SimpleNamespace(session=session, board=SimpleNamespace(pattern="a chessboard"))
-    joint = SimpleNamespace(prepared=prepared, solution=solution, settings=settings)
+    board = replace(rig.board, pattern=Chessboard(4, 5, 0.029))
+    session = SimpleNamespace(lrf=lrf, board=board, T_head_lrf=T_head_lrf, platform_sigma=STATED, cameras=cameras)
+    prepared = SimpleNamespace(session=session, board=board)
+    return SimpleNamespace(prepared=prepared, solution=solution, settings=settings), truth, rig
+
+
+def judged(change, seed, *options, **devices):
+    """Reasons of the verdict on falsified observations, and errors of axis and cameras in standard deviations."""
+    joint, truth, rig = estimated(change, seed, *options, **devices)
+    solution = joint.solution
     reasons, doubt = contradicts_stated(joint)
     reasons += verdict(solution, dict.fromkeys(rig.cameras, rig.model), suggest=False, doubt=doubt).reasons
     whole = len(solution.boards) == len(truth.boards)
@@ -60,6 +93,43 @@ def test_what_is_falsified_is_named(name):
 def test_what_is_named_where_no_platform_and_no_guess_is_stated(name, words):
     reasons, *_ = judged(FALSIFIED[name][0], 7, "platform", stated=False)
     assert words in "".join(reason.words for reason in reasons)
+
+
+def moved(solution, honest):
+    """The largest change of axis and cameras against another solution, in standard deviations."""
+    change = state_errors(solution.state, honest.state, solution.unknowns)[:16]
+    return np.abs(change / solution.solution.trusted_sigma[:16]).max()
+
+
+RIGS = [(2, "head", FINE), (3, "head", LMS200), (2, "head", QUARTER), (2, "platform", LMS200)]
+QUICKLY = "angular step 1 % too small"
+
+
+@pytest.mark.parametrize(
+    ("seed", "mount", "devices", "names"),
+    [(3, "head", LMS200, [QUICKLY]), *(pytest.param(*rig, list(HARMFUL), marks=campaign) for rig in RIGS)],
+)
+def test_what_moves_the_result_by_two_standard_deviations_is_never_silent(seed, mount, devices, names):
+    honest = judged(lambda obs: obs, seed, mount, **devices)[2]
+    for name in names:
+        reasons, _, solution = judged(HARMFUL[name], seed, mount, **devices)
+        if list(solution.boards) == list(honest.boards):
+            assert reasons or moved(solution, honest) < 2.0, name
+
+
+def test_noise_names_the_camera():
+    exact = changed(second_camera, view_covariance=lambda covariance: covariance / 2500)
+    reasons, *_ = judged(exact, 7)
+    words = next(reason.words for reason in reasons if reason.kind == "noise")
+    assert "images of 'right'" in words and "images of 'left'" not in words
+
+
+def test_after_an_estimate_that_has_not_converged_nothing_is_weighed():
+    joint, *_ = estimated(lambda obs: scaled(squares=0.05)(obs).select(obs.placements[:8]), 7, "platform")
+    assert [reason.kind for reason in contradicts_stated(joint)[0]][0] in ("squares", "ranges")
+    lost = replace(joint.solution, solution=replace(joint.solution.solution, converged=False))
+    reasons, doubt = contradicts_stated(SimpleNamespace(**vars(joint) | {"solution": lost}))
+    assert [reason.kind for reason in reasons] == ["not weighed"] and doubt == 0.0
 
 
 @pytest.mark.parametrize(

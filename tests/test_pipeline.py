@@ -67,8 +67,9 @@ def test_sides_are_named_after_the_nearest_edge():
 
 
 def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
-    names, problems = observe.nearest_edges(BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)})
-    assert names == {} and "turned by 5.0 deg" in problems[0] and "200 mm from the edge 'bc'" in problems[1]
+    names, dropped = observe.nearest_edges(BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)})
+    assert names == {} and [dropped[number].edge for number in (0, 1)] == ["ab", "bc"]
+    assert "turned by 5.0 deg" in dropped[0].words and "200 mm from the edge 'bc'" in dropped[1].words
 
 
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():

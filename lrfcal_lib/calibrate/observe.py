@@ -20,7 +20,7 @@ from lrfcal_lib.model.observations import (
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
-from lrfcal_lib.preprocess.prepared import VARIANTS
+from lrfcal_lib.preprocess.prepared import VARIANTS, DroppedSide
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import LENS, pose_by_intrinsics
@@ -373,15 +373,17 @@ def name_sides(prepared):
     scan.
 
     The cameras' poses come from the planes alone (Zhang and Pless), which needs no names. Returns
-    edge names by placement and side number, and problems: of :func:`rough_poses`, and why sides
-    have no name. Those farther than 8 cm from every edge have none; nor has any where nobody knows
-    the outline of the board.
+    edge names by placement and side number, those that got none likewise (DroppedSide), and
+    problems: of :func:`rough_poses`, and why sides have no name. Those farther than 8 cm from every
+    edge have none; nor has any where nobody knows the outline of the board.
     """
     rough, problems = rough_poses(prepared)
     names = {}
-    for placement, on_board in (
-        board_maps(prepared, rough).items() if prepared.board.corners is not None else ()
-    ):
+    dropped = {}
+    maps = {}
+    if prepared.board.corners is not None:
+        maps = board_maps(prepared, rough)
+    for placement, on_board in maps.items():
         sides = {}
         for found in (
             edges["half_step"].get(placement) for edges in (prepared.edges, prepared.swept)
@@ -389,11 +391,10 @@ def name_sides(prepared):
             for side in () if found is None else np.unique(found.side[found.side >= 0]):
                 rows = found.side == side
                 sides.setdefault(int(side), on_board(found.points[rows], found.pitch[rows]))
-        names[placement], crooked = nearest_edges(prepared.board, sides)
-        problems |= {
-            f"{placement} {side}": f"placement {placement}: {why}" for side, why in crooked.items()
-        }
-    return names, problems
+        names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
+        for side, why in dropped[placement].items():
+            problems[f"{placement} {side}"] = f"placement {placement}: {why.words}"
+    return names, dropped, problems
 
 
 def board_maps(prepared, rough):
@@ -448,35 +449,31 @@ def rough_poses(prepared):
 
 
 def nearest_edges(board, sides):
-    """Edge names of sides (board-frame points by number), each given once, and why the others got
-    none.
+    """Edge names of sides (board-frame points by number), each given once, and DroppedSide of those
+    that got none.
     """
-    lines, names, problems, numbers = board.lines(), {}, {}, list(sides)
+    lines = board.lines()
+    names = {}
+    dropped = {}
+    numbers = list(sides)
     distances = [np.abs(p[:, :2] @ lines[:, :2].T + lines[:, 2]) for p in sides.values()]
     cost = np.array([np.median(d, axis=0) for d in distances]).reshape(-1, len(lines))
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
-        number, edge, off = numbers[row], board.edges[column], 1000 * cost[row, column]
+        number, edge, off = numbers[row], board.edges[column], float(cost[row, column])
         turned, allowed, points = 0.0, NAME_ANGLE, sides[number]
         if len(points) > 2:  # what noise may turn the line through them is allowed
             _, direction, rms = fit_line(points)
-            turned = np.arcsin(
-                min(abs(direction[:2] @ lines[column, :2]) / np.linalg.norm(direction[:2]), 1.0)
-            )
-            allowed = np.hypot(
-                NAME_ANGLE, 3 * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
-            )
-        if off > 1000 * NAME_DISTANCE:
-            problems[number] = (
-                f"a side of the scan is {off:.0f} mm from the edge '{edge}': not used"
-            )
+            cosine = abs(direction[:2] @ lines[column, :2]) / np.linalg.norm(direction[:2])
+            turned = np.arcsin(min(cosine, 1.0))
+            noise = 3 * rms * np.sqrt(12 / len(points)) / np.ptp(points @ direction)
+            allowed = np.hypot(NAME_ANGLE, noise)
+        if off > NAME_DISTANCE:
+            dropped[number] = DroppedSide(edge, off)
         elif turned > allowed:
-            angle = np.rad2deg(turned)
-            problems[number] = (
-                f"the scan's side '{edge}' is turned by {angle:.1f} deg against the board: not used"
-            )
+            dropped[number] = DroppedSide(edge, off, float(turned))
         else:
             names[number] = edge
-    return names, problems
+    return names, dropped
 
 
 def observe_joint(prepared, views=None):

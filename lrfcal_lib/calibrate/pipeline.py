@@ -191,8 +191,8 @@ def prepare(session):
     Placements that cannot be used are in `problems` of the Prepared, with their reason.
     """
     ready = prepare_images(prepare_scans(session))
-    names, problems = name_sides(ready)
-    ready = without(replace(ready, names=names, problems=ready.problems | problems))
+    names, dropped, problems = name_sides(ready)
+    ready = without(replace(ready, names=names, dropped=dropped, problems=ready.problems | problems))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
 
 
@@ -203,7 +203,8 @@ def without(prepared):
         return {key: value for key, value in found.items() if key not in prepared.problems}
 
     edges, swept = ({v: kept(found) for v, found in both.items()} for both in (prepared.edges, prepared.swept))
-    return replace(prepared, scans=kept(prepared.scans), edges=edges, swept=swept, names=kept(prepared.names))
+    left = {name: kept(getattr(prepared, name)) for name in ("scans", "names", "dropped")}
+    return replace(prepared, edges=edges, swept=swept, **left)
 
 
 def find_pitch_errors(prepared):

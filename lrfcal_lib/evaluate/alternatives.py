@@ -3,21 +3,24 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from lrfcal_lib.fit.least_squares import eliminate, whiten
-from lrfcal_lib.fit.residuals import gather, named_blocks
+from lrfcal_lib.fit.residuals import SENSOR, gather, named_blocks
 from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
 from lrfcal_lib.solvers.joint import solve_joint
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
-ASKED = 4.0  # standard deviations beyond which the data contradict a statement
-HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset,
-LEAST_INSTEAD = 0.015  # and how wrong they have to be: less is hardly told from an offset, and makers are better
+ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
+PREFERRED = 2.0  # chance alone exceeds so many standard deviations once in 20 times; enough where it does harm:
+MOVED = 2.0  # standard deviations by which what is handed over would move
+HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
@@ -37,6 +40,8 @@ class Alternative:
         Of observations and a value s: the observations as they would be if the truth were off by s.
     worth : float
         Smaller values of s are not worth a word.
+    reach : float
+        Larger values of s are more than a test at the solution can tell.
     unit : float
         What s is multiplied by for the words.
     words : str
@@ -49,13 +54,21 @@ class Alternative:
     remedy: str
     signs: tuple = ("larger", "smaller")
     worth: float = 0.004
+    reach: float = 0.3
     unit: float = 100.0
 
 
-def _views(obs, s):
+def _views(obs, s, origin=(0.0, 0.0)):
+    """Squares larger by s about the pattern's first corner (`origin`, metres, in the board's frame)."""
     pose = obs.view_pose.copy()
-    pose[:, :3, 3] *= 1 + s
+    corner = pose[:, :3, :2] @ np.asarray(origin)
+    pose[:, :3, 3] = (1 + s) * pose[:, :3, 3] + s * corner
     return replace(obs, view_pose=pose)
+
+
+def _views_and_outline(obs, s):
+    """Squares larger by s where the outline was measured in their scale."""
+    return replace(_views(obs, s), corners=obs.corners * (1 + s))
 
 
 def _bearings(obs, s):
@@ -89,28 +102,62 @@ ALTERNATIVES = {
     "spot": Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
-        "check spot_exit_m and spot_divergence_rad, or leave them out", worth=0.2,
+        "state spot_exit_m and spot_divergence_rad as its maker does", worth=0.2, reach=5.0,
     ),
     "lag": Alternative(
         _lag, "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
-        ("late", "early"), np.radians(0.05), np.degrees(1.0),
+        ("late", "early"), worth=np.radians(0.05), unit=np.degrees(1.0),
     ),
 }  # fmt: skip
 
 
+def alternatives_of(prepared):
+    """Those of `ALTERNATIVES` that are there to be wrong in a session (Prepared): dict of str to Alternative.
+
+    A plain board has no squares. An outline that the images measured is not stated, and scales with the squares; one
+    that is stated stays as it is, and squares that are larger reach farther from the pattern's first corner.
+    """
+    stated = dict(ALTERNATIVES)
+    pattern = prepared.board.pattern
+    if pattern is None:
+        del stated["squares"]
+    elif prepared.session.board.corners is None:
+        del stated["outline"]
+        stated["squares"] = replace(stated["squares"], change=_views_and_outline)
+    else:
+        stated["squares"] = replace(stated["squares"], change=partial(_views, origin=pattern.origin))
+    if prepared.session.lrf.spot_exit is None:
+        del stated["spot"]
+    return stated
+
+
 @dataclass(frozen=True)
 class Doubt:
-    """What the data say of one alternative: its value, standard deviation and likelihood ratio (squared score)."""
+    """What the data say of one alternative.
+
+    Attributes
+    ----------
+    kind : str
+        Of `ALTERNATIVES`.
+    value, sigma : float
+        As the data have it, with its standard deviation.
+    ratio : float
+        Likelihood ratio (squared score).
+    moved : float
+        By how many of its standard deviations the axis or a camera would move, the largest one, were it so.
+    words : str
+    """
 
     kind: str
     value: float
     sigma: float
     ratio: float
+    moved: float
     words: str
 
 
-def weigh(solution, admitted_offset):
+def weigh(solution, admitted_offset, stated=ALTERNATIVES):
     """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest first.
 
     A score test at the solution: no estimate is repeated. The standard deviation is the larger one of noise and scatter
@@ -122,19 +169,22 @@ def weigh(solution, admitted_offset):
     solution : JointSolution
     admitted_offset : float
         Of the range finder's maker, metres.
+    stated : dict of str to Alternative
+        What may be wrong.
     """
     state, unknowns, obs = solution.state, solution.unknowns, solution.observations
     # sides that may deviate, and beams that may say nothing, take up what a wrong statement does to edges
     levels = solution.data.levels | {"side_sigma": min(solution.data.side_sigma, ALIKE), "lapse": 0.0}
     before, c = named_blocks(state, gather(obs, **levels), unknowns), unknowns.shared
     before = {name: whiten(block) for name, block in before.items()}
+    handed = [i for i, name in enumerate(solution.solution.names) if name not in SENSOR]
     prior, pull = np.zeros((2, c + 1))
     if "range_offset" in unknowns.sensor:
         where = unknowns.columns["range_offset"]
         prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
         pull[where] = prior[where] * solution.sensor["range_offset"]
     found = []
-    for kind, alternative in ALTERNATIVES.items():
+    for kind, alternative in stated.items():
         after = named_blocks(state, gather(alternative.change(obs, STEP), **levels), unknowns)
         hessian = gradient = 0.0
         for name, (r, J) in before.items():
@@ -146,25 +196,39 @@ def weigh(solution, admitted_offset):
         step = -covariance @ (score.sum(axis=0) + pull)
         own = (score + reduced @ step) @ covariance[-1]  # what each placement still pulls at the value found
         sigma = np.sqrt(max(covariance[-1, -1], np.sum(own**2) * len(own) / max(len(own) - 1, 1)))
+        along = covariance[:c, -1] / max(covariance[-1, -1], 1e-300) * step[-1]
+        moved = float(np.max(np.abs(along[handed]) / solution.solution.trusted_sigma[handed], initial=0.0))
         if 0 < sigma < UNKNOWN * alternative.worth:
             size, spread = (f"{x * alternative.unit:.2g}" for x in (abs(step[-1]), sigma))
             words = alternative.words.format(size=size, sigma=spread, sign=alternative.signs[int(step[-1] < 0)])
             words = f"{words}: {alternative.remedy}"
-            found.append(Doubt(kind, float(step[-1]), float(sigma), float((step[-1] / sigma) ** 2), words))
+            found.append(Doubt(kind, float(step[-1]), float(sigma), float((step[-1] / sigma) ** 2), moved, words))
     return sorted(found, key=lambda doubt: -doubt.ratio)
 
 
-def doubtful(solution, admitted_offset, without=()):
+def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well.
 
-    Kinds named in `without` are not there to be wrong: the squares of a plain board.
+    Beyond chance whatever they do, or preferred by the data where what is handed over would move by more than its
+    standard deviation tells. Kinds named in `faint` are asked for by the latter alone.
     """
-    found = [doubt for doubt in weigh(solution, admitted_offset) if doubt.kind not in without]
-    asked = [d for d in found if d.ratio > ASKED**2 and abs(d.value) > ALTERNATIVES[d.kind].worth]
-    return [d for d in asked if d.ratio > AS_GOOD * asked[0].ratio]
+    found = [doubt for doubt in weigh(solution, admitted_offset, stated) if abs(doubt.value) < stated[doubt.kind].reach]
+    freedom = max(len(solution.boards) - 1, 1)  # of the scatter over placements, which is itself known so well only
+    preferred = stdtrit(freedom, ndtr(PREFERRED)) ** 2
+    asked = []
+    for doubt in found:
+        harmful = doubt.ratio > preferred and doubt.moved > MOVED
+        if harmful or (doubt.kind not in faint and _certain(doubt, stated)):
+            asked.append(doubt)
+    return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 
 
-def not_an_offset(solution):
+def _certain(doubt, stated):
+    """Whether the data contradict a statement beyond chance, by as much as is worth a word."""
+    return doubt.ratio > ASKED**2 and abs(doubt.value) > stated[doubt.kind].worth
+
+
+def not_an_offset(solution, stated=ALTERNATIVES):
     """The Doubt about bearings where they explain the data far better than the range offset found does, or None.
 
     Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with the offset held.
@@ -172,9 +236,9 @@ def not_an_offset(solution):
     offset, sigma = solution.sensor["range_offset"], solution.sigma.get("range_offset")
     if sigma is not None:
         square = (offset / sigma) ** 2
-        best = weigh(solution, HELD)[0] if square > ASKED**2 else None
-        asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and abs(best.value) > LEAST_INSTEAD
-        if asked and best.kind == "bearings":
+        best = weigh(solution, HELD, stated)[0] if square > ASKED**2 else None
+        asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and best.kind == "bearings"
+        if asked and (best.moved > MOVED or _certain(best, stated)):
             return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
     return None
 

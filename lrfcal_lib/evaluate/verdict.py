@@ -10,7 +10,13 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
 from lrfcal_lib.evaluate import alternatives
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES, doubtful, far_from_stated, not_an_offset, places_of_cameras
+from lrfcal_lib.evaluate.alternatives import (
+    alternatives_of,
+    doubtful,
+    far_from_stated,
+    not_an_offset,
+    places_of_cameras,
+)
 from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
 from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
 from lrfcal_lib.evaluate.recording_faults import explained, recording_faults
@@ -48,13 +54,17 @@ POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
 LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
+MOST = 0.5  # share of the scans across an edge: where so many lie elsewhere, its statement does
 LEFT_OUT = 0.2  # share of the placements that is a finding of its own
 RECORD = (
     f"Record next: {FEW} or more placements that all cameras see, the board leaning every way by 20 deg and more, at "
     "several distances, with a sweep over its edges and images at several pitch angles each."
 )
 REGIONS = [" ".join(both).strip() or "middle" for both in product(("top", "", "bottom"), ("left", "", "right"))]
+NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
 SAID = ("not converged", "the data do not determine")  # warnings of the solver that are findings of their own
+
+NO_BOUND = {"mm": 1e4, "px": 1e4}  # ten metres; more pixels than an image has
 
 LIES = {
     "as recorded": {}, "squares 5 % too small": {"squares": -0.05},
@@ -71,7 +81,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', 'sense', of
-        :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'convergence', 'unobservable', 'cameras',
+        :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'not weighed', 'convergence', 'unobservable', 'cameras',
         'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
         'model error', 'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
     words : str
@@ -193,7 +203,7 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
     }  # fmt: skip
     maps = {"cloud_mm": 1000 * cloud.rms()} | {f"{camera}_px": found.rms() for camera, found in seen.items()}
     regions = {camera: _regions(found.sigma[DISTANCES.index(2.0)]) for camera, found in seen.items()}
-    errors = {d: {name: float(rms[i]) for name, rms in maps.items()} for i, d in enumerate(DISTANCES)}
+    errors = {d: bounded({name: float(rms[i]) for name, rms in maps.items()}) for i, d in enumerate(DISTANCES)}
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
     if large:
         bad = any(not value <= BAD[name[-2:]] for name, value in large.items())
@@ -201,6 +211,11 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
         reasons = [*reasons, Reason(NO if bad else CARE, "error", words)]
     sweep = 1000 * float(np.sqrt(np.mean(cloud.parts["sweep"][DISTANCES.index(2.0)] ** 2)))
     return _answered(Verdict(YES, (), errors, 1000 * float(noise), sweep, None, regions=regions), reasons)
+
+
+def bounded(errors):
+    """Errors by name, millimetres and pixels; infinite where so large a one is no bound at all."""
+    return {name: value if value < NO_BOUND[name[-2:]] else np.inf for name, value in errors.items()}
 
 
 def _regions(sigma):
@@ -240,6 +255,7 @@ def judge(calibration, method=None, **options):
     else:
         found = _without_joint(calibration, method, doubt)
     reasons, words = _left_out(calibration, method)
+    reasons += sides_elsewhere(prepared)
     if any("placements are left out" in reason.words for reason in reasons):  # with words of what was excluded
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
@@ -310,14 +326,20 @@ def contradicts_stated(joint):
     What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
     """
     lrf, reasons, doubt = joint.prepared.session.lrf, [], 0.0
-    hopeless = not alternatives.plausible(joint.solution) or joint.solution.noise["face_scale"] > ABSURD
+    level = joint.solution.noise["face_scale"]
+    hopeless = not alternatives.plausible(joint.solution) or level > ABSURD
     if hopeless and (words := alternatives.other_sense(joint)):  # what else is found wrong comes from that
         return [Reason(NO, "sense", words)], doubt
+    if not joint.solution.converged:
+        return [Reason(NO, "not weighed", f"{NOT_WEIGHED}: the estimate has not converged")], doubt
     offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
     sigma = joint.solution.sigma
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     asked, instead = _asked(joint)
     doubt = abs(offset) if instead in asked else 0.0
+    if level > ABSURD and not asked:
+        words = f"{NOT_WEIGHED}: no single one explains why ranges fit {level:.0f} times worse than stated"
+        reasons.append(Reason(NO, "not weighed", words))
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
@@ -351,12 +373,12 @@ def contradicts_stated(joint):
 
 def _asked(joint):
     """Statements that the data contradict (Doubts), and one that stands for a range offset, which may be of them."""
-    # the spot is to be stated, and before many backgrounds of different distance
+    # of the spot many backgrounds of different distance tell, others where a wrong one does harm only
     many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
-    told, lrf = bool(many), joint.prepared.session.lrf
-    known = {"squares": joint.prepared.board.pattern is not None, "spot": lrf.spot_exit is not None and told}
-    asked = doubtful(joint.solution, lrf.admitted_offset, [kind for kind, there in known.items() if not there])
-    instead = not_an_offset(joint.solution)
+    stated = alternatives_of(joint.prepared)
+    admitted = joint.prepared.session.lrf.admitted_offset
+    asked = doubtful(joint.solution, admitted, stated, faint=() if many else ("spot",))
+    instead = not_an_offset(joint.solution, stated)
     return [instead] if instead and (not asked or asked[0].kind == instead.kind) else asked, instead
 
 
@@ -365,11 +387,11 @@ def falsified(joint):
 
     Columns falsified, range_offset_mm (that the estimate finds), doubted (words).
     """
-    rows = []
+    rows, stated = [], alternatives_of(joint.prepared)
     for name, sizes in LIES.items():
         obs, offset = joint.observations, np.nan
-        for kind, value in sizes.items():
-            obs = ALTERNATIVES[kind].change(obs, value)
+        for kind in (kind for kind in sizes if kind in stated):
+            obs = stated[kind].change(obs, sizes[kind])
         try:
             solution = solve_joint(obs, required=False, **joint.settings) if sizes else joint.solution
             offset, reasons = solution.sensor["range_offset"], contradicts_stated(replace(joint, solution=solution))[0]
@@ -404,6 +426,24 @@ def _left_out(calibration, method):
     words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
     reasons += [Reason(CARE, "left out", words)] * large
     return reasons, f"{'' if large else f'{words}.'} {also}".strip()
+
+
+def sides_elsewhere(prepared):
+    """Edges of the board that lie elsewhere in most scans that cross them (Prepared): list of Reason."""
+    reasons = []
+    for edge in prepared.board.edges:
+        dropped = [side for own in prepared.dropped.values() for side in own.values() if side.edge == edge]
+        crossed = len(dropped) + sum(edge in own.values() for own in prepared.names.values())
+        if len(dropped) < FEWEST or len(dropped) <= MOST * crossed:
+            continue
+        turn = np.degrees(np.median([side.turn for side in dropped]))
+        off = 1000 * np.median([side.distance for side in dropped])
+        words = (
+            f"the board's edge '{edge}' lies elsewhere than its outline says in {len(dropped)} of {crossed} scans "
+            f"({off:.0f} mm off, turned by {turn:.1f} deg) and is not used there: measure the board's edges (corners_m)"
+        )
+        reasons.append(Reason(CARE, "outline", words))
+    return reasons
 
 
 def diagnose(solution):
@@ -453,6 +493,23 @@ def _of_placements(solution):
     ]  # fmt: skip
 
 
+def noise_of_images(solution):
+    """How far board poses in the images of each camera scatter, in stated standard deviations: by its name in words.
+
+    All cameras have one level; how their residuals differ tells whose it is. What errors of the intrinsics cause is
+    taken off.
+    """
+    obs = solution.observations
+    if len(obs.view_camera) == 0:
+        return {}
+    level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)  # with intrinsics as stated
+    factors = np.linalg.cholesky(obs.view_covariance)
+    squares = np.mean(np.linalg.solve(factors, solution.residuals("view")[..., None])[..., 0] ** 2, axis=1)
+    usual = max(np.mean(squares), np.finfo(float).tiny)
+    of_camera = {name: np.mean(squares[obs.view_camera == i]) for i, name in enumerate(obs.cameras)}
+    return {f"images of '{name}'": float(level * np.sqrt(mean / usual)) for name, mean in of_camera.items()}
+
+
 def _of_residuals(solution):
     """What residuals and their scatter say against the model: rows of whether, answer, kind and words."""
     level, misfit = max(np.median([*solution.misfit.values()]), 1.0), solution.misfit.items()
@@ -463,8 +520,7 @@ def _of_residuals(solution):
         ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
         worst = max(ratio, key=ratio.get)
     what = "the axis" if worst == "axis" else f"camera '{worst}'"
-    images = solution.noise.get("view_scale", 1.0) / np.hypot(1.0, solution.lens_scale)  # with intrinsics as stated
-    noise = {"ranges": solution.noise["face_scale"], "images": images}
+    noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
     large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
     share = solution.noise["face_share"]  # beams about an edge always repeat errors: they share a background
     return [

@@ -37,6 +37,30 @@ class PitchNoise:
 
 
 @dataclass(frozen=True)
+class DroppedSide:
+    """A side of a scan that lies elsewhere than the board's edge next to it, and is not used.
+
+    Attributes
+    ----------
+    edge : str
+    distance, turn : float
+        Between them: metres, radians. Where the distance is too large already, the turn is 0.
+    """
+
+    edge: str
+    distance: float
+    turn: float = 0.0
+
+    @property
+    def words(self):
+        """Why it is not used."""
+        if self.turn:
+            angle = np.rad2deg(self.turn)
+            return f"the scan's side '{self.edge}' is turned by {angle:.1f} deg against the board: not used"
+        return f"a side of the scan is {1000 * self.distance:.0f} mm from the edge '{self.edge}': not used"
+
+
+@dataclass(frozen=True)
 class Prepared:
     """A session after preprocessing.
 
@@ -59,6 +83,8 @@ class Prepared:
         Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the images).
     names : dict of int to dict of int to str
         Board edge of each side of the scan, by placement and side number.
+    dropped : dict of int to dict of int to DroppedSide
+        Sides that got no name because the board has no edge there, likewise.
     pitch_noise : PitchNoise
         What the recordings themselves tell about it.
     problems : dict of int or str to str
@@ -75,6 +101,7 @@ class Prepared:
     outline: Outline | None = None
     relief: np.ndarray | None = None
     names: dict = field(default_factory=dict)
+    dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
     problems: dict = field(default_factory=dict)
 

@@ -399,12 +399,15 @@ def refuse_contradiction(state, data, most):
 
 
 def second_minima(obs, tried, best):
-    """In words, which start values with cameras far from the best one's explain the data nearly as well."""
-    others = [start.state.cameras for start in tried if start.badness <= NEARLY**2 * best.badness]
-    named = [zip(obs.cameras, best.state.cameras, poses, strict=True) for poses in others]
-    pairs = [(name, *map(pose_transform, both)) for poses in named for name, *both in poses]
-    far = [pair for pair in pairs if geometry.transform_difference(*pair[1:])[0] > SAME_TURN]
-    return tuple(dict.fromkeys(rival_words(*pair) for pair in far))
+    """In words, which cameras a start value that explains the data nearly as well puts far from the best one's."""
+    others = sorted(tried, key=lambda start: start.badness)
+    rivals = {}
+    for start in (start for start in others if start.badness <= NEARLY**2 * best.badness):
+        for name, *poses in zip(obs.cameras, best.state.cameras, start.state.cameras, strict=True):
+            both = [pose_transform(pose) for pose in poses]
+            if name not in rivals and geometry.transform_difference(*both)[0] > SAME_TURN:
+                rivals[name] = rival_words(name, *both)
+    return tuple(rivals.values())
 
 
 def left_out_shares(obs, bad):

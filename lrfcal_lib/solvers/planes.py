@@ -144,7 +144,7 @@ def check_normals(sets, camera, least=0.02):
 
 SUBSETS, MINIMAL = 400, 40
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
-MOST_APART = 8
+MOST_APART = 6  # minima to choose from
 CAPPED = 16.0  # times the usual square: a larger miss, four standard deviations, belongs to no minimum
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
