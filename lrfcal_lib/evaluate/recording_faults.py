@@ -19,7 +19,11 @@ from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.solvers import solve_camera
 
-EXPLAINING = ("sense", "unit")  # kinds that everything else which looks wrong follows from
+EXPLAINING = (
+    "sense",
+    "unit",
+    "numbers",
+)  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
 BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
 MISREAD = 0.005  # metres; what is misread lies off by more than that
@@ -39,23 +43,27 @@ class Reading:
 
     Attributes
     ----------
-    kind : {'sense', 'unit'}
+    kind : {'sense', 'unit', 'numbers'}
     words : str
         What is wrong if this way is right, and what to do about it.
-    ranges, pitch : float
-        Factors on what was recorded.
+    ranges, pitch, image_pitch : float
+        Factors on what was recorded; the pitch is that of scans and images.
     turned_round : bool
         Bearings count the other way.
     mirrored : bool
         Images are mirrored.
+    ahead : int
+        By how much the placement numbers of images are ahead of those of scans.
     """
 
     kind: str
     words: str
     ranges: float = 1.0
     pitch: float = 1.0
+    image_pitch: float = 1.0
     turned_round: bool = False
     mirrored: bool = False
+    ahead: int = 0
 
     def apply(self, points, pitch):
         """Points (n, 3) of the range finder and their pitch (n,), read this way."""
@@ -82,6 +90,28 @@ SENSES = (
         "sense",
         "the pitch counts in the other sense (positive lifts the view: change its sign)",
         pitch=-1.0,
+    ),
+)
+IMAGES = (
+    Reading(
+        "numbers",
+        "the images' placement numbers (images.csv) are ahead by one: take 1 off them",
+        ahead=1,
+    ),
+    Reading(
+        "numbers",
+        "the images' placement numbers (images.csv) are behind by one: add 1 to them",
+        ahead=-1,
+    ),
+    Reading(
+        "unit",
+        "pitch_deg in images.csv is in radians: multiply it by 57.29578",
+        image_pitch=180 / np.pi,
+    ),
+    Reading(
+        "sense",
+        "pitch_deg in images.csv counts in the other sense than that of the scans",
+        image_pitch=-1.0,
     ),
 )
 UNITS = (
@@ -170,7 +200,7 @@ def misread_recording(prepared):
             _mirrored_camera(camera, stated[camera], found) for camera, found in mirrored.items()
         ]
 
-    for readings in (SENSES, UNITS):
+    for readings in (SENSES, IMAGES, UNITS):
         misses = {reading: board_misses(prepared, reading) for reading in readings}
         fitting = [reading for reading in readings if _fits(misses[reading], stated)]
         if fitting:
@@ -221,7 +251,9 @@ def plane_observations(prepared, camera, reading):
     mount = prepared.session.cameras[camera].mount
     T_head_lrf = platform_of(prepared)
     views = {
-        p: view for p, view in prepared.views[camera].items() if view.T_camera_board is not None
+        placement - reading.ahead: view
+        for placement, view in prepared.views[camera].items()
+        if view.T_camera_board is not None
     }
     poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(-1, 4, 4)
     if (
@@ -232,7 +264,9 @@ def plane_observations(prepared, camera, reading):
 
     points, placements = [np.zeros((0, 3))], [np.zeros(0, int)]
     for placement in views.keys() & prepared.scans.keys():
-        image_pitch = reading.pitch * views[placement].pitch if mount == "head" else 0.0
+        image_pitch = 0.0
+        if mount == "head":
+            image_pitch = reading.pitch * reading.image_pitch * views[placement].pitch
         p_lrf, pitch, _ = face_points(prepared.scans[placement], POINTS)
         points.append(lrf_to_source(*reading.apply(p_lrf, pitch), T_head_lrf, mount, image_pitch))
         placements.append(np.full(len(pitch), placement))
