@@ -391,10 +391,11 @@ def exchanged_placements(calibration):
             scans[placement] = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
 
     found = []
-    for first, second in combinations(scans, 2):
-        if _same_board(calibration, scans[first], second) and _same_board(
-            calibration, scans[second], first
-        ):
+    strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
+    for first, second in combinations(strange, 2):
+        there = _same_board(calibration, scans[first], second)
+        back = _same_board(calibration, scans[second], first)
+        if there and back:
             words = (
                 f"the images of placement {first} fit the scans of placement {second}, and those "
                 f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
@@ -407,6 +408,9 @@ def exchanged_placements(calibration):
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared, solution = calibration.prepared, calibration.joint.solution
+    board = prepared.board
+    corners = board.pattern.points() if board.corners is None else board.corners
+    middle = corners.mean(axis=0)[:2]
     p_lrf, pitch, _ = face_points(scan, POINTS)
     agree = []
     for camera, transform in solution.transforms.items():
@@ -417,8 +421,6 @@ def _same_board(calibration, scan, placement):
         image_pitch = view.pitch if mount == "head" else 0.0
         points = lrf_to_source(p_lrf, pitch, solution.T_head_lrf, mount, image_pitch)
         on_board = view.T_camera_board.inv().apply(transform.apply(points))
-        beside = np.linalg.norm(
-            on_board[:, :2].mean(axis=0) - prepared.board.known_corners().mean(axis=0)
-        )
+        beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
         agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)
