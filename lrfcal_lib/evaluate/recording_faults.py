@@ -9,12 +9,13 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
-from lrfcal_lib.calibrate.pipeline import joint_settings
+from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
 from lrfcal_lib.evaluate.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.solvers import solve_camera
@@ -132,8 +133,13 @@ UNITS = (
 )
 
 
-def recording_faults(calibration):
-    """What went wrong with the recording behind a Calibration.
+def recording_faults(calibration: Calibration) -> list[Fault]:
+    """What went wrong with the recording behind a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Its images lie where they lay when its session was opened: some are looked at again.
 
     Returns
     -------
@@ -162,7 +168,7 @@ def changes_of_cameras(calibration):
     return large_changes(obs, prepared, joint_settings(prepared, obs))
 
 
-def explained(faults):
+def explained(faults: list[Fault]) -> bool:
     """Whether one of these is a cause that everything else which looks wrong follows from."""
     return any(fault.kind in EXPLAINING for fault in faults)
 
@@ -180,7 +186,7 @@ def explains(joint):
     return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
 
 
-def misread_recording(prepared):
+def misread_recording(prepared: Prepared) -> list[Fault]:
     """Units and senses that are not as stated: read otherwise, scans and images agree."""
     session = prepared.session
     if len(prepared.scans) <= len(session.board_placements) / 2:
