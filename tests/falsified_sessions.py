@@ -322,7 +322,7 @@ WAYS = {
     ),
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
-    "another clock": Way(other_clock, ("clock",), "clock"),
+    "another clock": Way(other_clock, ("clock",), "clock", ("sim_lms221",)),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
     "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),
     "numbers of images ahead": Way(numbers_ahead, ("numbers",), "ahead by one"),
