@@ -232,6 +232,26 @@ def exchange_rows(folder):
     change_rows(folder, change)
 
 
+def numbers_ahead(folder):
+    """Images of boards that carry the number of the next placement."""
+    numbers = [str(number) for number in open_session(folder).board_placements]
+    following = dict(zip(numbers, numbers[1:] + numbers[:1], strict=True))
+
+    def change(rows):
+        for row in rows:
+            row["placement"] = following.get(row["placement"], row["placement"])
+
+    change_rows(folder, change)
+
+
+def image_pitch_in_radians(folder):
+    def change(rows):
+        for row in rows:
+            row["pitch_deg"] = row["pitch_deg"] and repr(float(row["pitch_deg"]) * np.pi / 180)
+
+    change_rows(folder, change)
+
+
 def half_size(folder):
     """Images of half the size, with the intrinsics that are true of the full one."""
     truth = json.loads((folder / "truth.json").read_text())
@@ -302,8 +322,12 @@ WAYS = {
     ),
     "pitch reversed": Way(pitch_times(-1.0), ("sense", "far from stated"), "sense"),
     "images of half the size": Way(half_size, ("lens",), "image size", ("sim_lms221",)),
-    "another clock": Way(other_clock, ("clock",), "clock"),
+    "another clock": Way(other_clock, ("clock",), "clock", ("sim_lms221",)),
     "pattern stated 6 x 8": Way(pattern_turned, (), sessions=("lms400_zed",)),
     "rows exchanged": Way(exchange_rows, ("exchanged",), "exchange them back"),
+    "numbers of images ahead": Way(numbers_ahead, ("numbers",), "ahead by one"),
+    "pitch of images in radians": Way(
+        image_pitch_in_radians, ("unit",), "images.csv is in radians", ("sim_lms221",)
+    ),
     "squares in inches": Way(squares_in_inches, ("refused",), "inches"),
 }

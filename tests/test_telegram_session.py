@@ -93,7 +93,7 @@ def test_the_field_of_view_is_that_of_the_telegrams(recorded, values, first, ste
     (problem,) = session.problems
     assert problem == (
         f"the telegrams cover {first:g} to {last:g} deg in steps of {step:g} deg, session.json states 40 to 140 deg in "
-        "steps of 0.25 deg: the telegrams count"
+        "steps of 0.25 deg: the telegrams count; correct field_of_view_deg and bearing_step_deg"
     )
 
 

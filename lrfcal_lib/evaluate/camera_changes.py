@@ -11,8 +11,10 @@ from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
 from lrfcal_lib.fit.residuals import gather, named_blocks
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.preprocess.intrinsics import adjust_robust, raised_points
-from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.solvers.joint import JointSolution, solve_joint
 
 POSE = 6  # numbers of a camera's pose
 BESIDE = 2  # placements on either side of a step, at least: one alone may simply be wrong
@@ -90,7 +92,9 @@ class Step:
     p_value: float
 
 
-def camera_changes(solution, prepared, settings):
+def camera_changes(
+    solution: JointSolution, prepared: Prepared, settings: dict
+) -> list[CameraChange]:
     """Cameras that sit, or magnify, otherwise from some placement on.
 
     A score test of every camera and place; where it finds a step, an estimate with two poses of
@@ -133,12 +137,23 @@ def camera_changes(solution, prepared, settings):
     return changes if solution.converged and explained else []
 
 
-def large_changes(obs, prepared, settings):
+def large_changes(obs: JointObservations, prepared: Prepared, settings: dict) -> list[CameraChange]:
     """Cameras that changed by so much that no estimate with one pose of each is possible.
 
     What one camera contradicts, the others and the scans agree about: its poses are seen from
-    an estimate without it. Arguments and result are those of :func:`camera_changes`, with the
-    observations of all placements instead of a solution.
+    an estimate without it.
+
+    Parameters
+    ----------
+    obs : JointObservations
+        Of all placements.
+    prepared, settings
+        As of :func:`camera_changes`.
+
+    Returns
+    -------
+    list of CameraChange
+        One at most.
     """
     if len(obs.cameras) < 2 or len(obs.placements) < FEWEST_PLACEMENTS:
         return []

@@ -9,17 +9,22 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
-from lrfcal_lib.calibrate.pipeline import joint_settings
+from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
 from lrfcal_lib.evaluate.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board
+from lrfcal_lib.preprocess.prepared import Prepared
 from lrfcal_lib.session.faults import Fault, dark_images, faults_of_files
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.solvers import solve_camera
 
-EXPLAINING = ("sense", "unit")  # kinds that everything else which looks wrong follows from
+EXPLAINING = (
+    "sense",
+    "unit",
+    "numbers",
+)  # kinds that everything else which looks wrong follows from
 SEVERE_PX = 5.0  # a camera that moves images by more is two cameras
 BETTER = 3.0  # times nearer to the boards in the images, with what was recorded read otherwise
 MISREAD = 0.005  # metres; what is misread lies off by more than that
@@ -39,23 +44,27 @@ class Reading:
 
     Attributes
     ----------
-    kind : {'sense', 'unit'}
+    kind : {'sense', 'unit', 'numbers'}
     words : str
         What is wrong if this way is right, and what to do about it.
-    ranges, pitch : float
-        Factors on what was recorded.
+    ranges, pitch, image_pitch : float
+        Factors on what was recorded; the pitch is that of scans and images.
     turned_round : bool
         Bearings count the other way.
     mirrored : bool
         Images are mirrored.
+    ahead : int
+        By how much the placement numbers of images are ahead of those of scans.
     """
 
     kind: str
     words: str
     ranges: float = 1.0
     pitch: float = 1.0
+    image_pitch: float = 1.0
     turned_round: bool = False
     mirrored: bool = False
+    ahead: int = 0
 
     def apply(self, points, pitch):
         """Points (n, 3) of the range finder and their pitch (n,), read this way."""
@@ -84,6 +93,28 @@ SENSES = (
         pitch=-1.0,
     ),
 )
+IMAGES = (
+    Reading(
+        "numbers",
+        "the images' placement numbers (images.csv) are ahead by one: take 1 off them",
+        ahead=1,
+    ),
+    Reading(
+        "numbers",
+        "the images' placement numbers (images.csv) are behind by one: add 1 to them",
+        ahead=-1,
+    ),
+    Reading(
+        "unit",
+        "pitch_deg in images.csv is in radians: multiply it by 57.29578",
+        image_pitch=180 / np.pi,
+    ),
+    Reading(
+        "sense",
+        "pitch_deg in images.csv counts in the other sense than that of the scans",
+        image_pitch=-1.0,
+    ),
+)
 UNITS = (
     Reading(
         "unit",
@@ -102,8 +133,13 @@ UNITS = (
 )
 
 
-def recording_faults(calibration):
-    """What went wrong with the recording behind a Calibration.
+def recording_faults(calibration: Calibration) -> list[Fault]:
+    """What went wrong with the recording behind a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Its images lie where they lay when its session was opened: some are looked at again.
 
     Returns
     -------
@@ -132,7 +168,7 @@ def changes_of_cameras(calibration):
     return large_changes(obs, prepared, joint_settings(prepared, obs))
 
 
-def explained(faults):
+def explained(faults: list[Fault]) -> bool:
     """Whether one of these is a cause that everything else which looks wrong follows from."""
     return any(fault.kind in EXPLAINING for fault in faults)
 
@@ -150,7 +186,7 @@ def explains(joint):
     return max(noise["face_scale"], noise.get("view_scale", 0.0)) <= NOISY
 
 
-def misread_recording(prepared):
+def misread_recording(prepared: Prepared) -> list[Fault]:
     """Units and senses that are not as stated: read otherwise, scans and images agree."""
     session = prepared.session
     if len(prepared.scans) <= len(session.board_placements) / 2:
@@ -170,7 +206,7 @@ def misread_recording(prepared):
             _mirrored_camera(camera, stated[camera], found) for camera, found in mirrored.items()
         ]
 
-    for readings in (SENSES, UNITS):
+    for readings in (SENSES, IMAGES, UNITS):
         misses = {reading: board_misses(prepared, reading) for reading in readings}
         fitting = [reading for reading in readings if _fits(misses[reading], stated)]
         if fitting:
@@ -221,7 +257,9 @@ def plane_observations(prepared, camera, reading):
     mount = prepared.session.cameras[camera].mount
     T_head_lrf = platform_of(prepared)
     views = {
-        p: view for p, view in prepared.views[camera].items() if view.T_camera_board is not None
+        placement - reading.ahead: view
+        for placement, view in prepared.views[camera].items()
+        if view.T_camera_board is not None
     }
     poses = np.array([view.T_camera_board.as_matrix() for view in views.values()]).reshape(-1, 4, 4)
     if (
@@ -232,7 +270,9 @@ def plane_observations(prepared, camera, reading):
 
     points, placements = [np.zeros((0, 3))], [np.zeros(0, int)]
     for placement in views.keys() & prepared.scans.keys():
-        image_pitch = reading.pitch * views[placement].pitch if mount == "head" else 0.0
+        image_pitch = 0.0
+        if mount == "head":
+            image_pitch = reading.pitch * reading.image_pitch * views[placement].pitch
         p_lrf, pitch, _ = face_points(prepared.scans[placement], POINTS)
         points.append(lrf_to_source(*reading.apply(p_lrf, pitch), T_head_lrf, mount, image_pitch))
         placements.append(np.full(len(pitch), placement))
@@ -357,10 +397,11 @@ def exchanged_placements(calibration):
             scans[placement] = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
 
     found = []
-    for first, second in combinations(scans, 2):
-        if _same_board(calibration, scans[first], second) and _same_board(
-            calibration, scans[second], first
-        ):
+    strange = [p for p, scan in scans.items() if not _same_board(calibration, scan, p)]
+    for first, second in combinations(strange, 2):
+        there = _same_board(calibration, scans[first], second)
+        back = _same_board(calibration, scans[second], first)
+        if there and back:
             words = (
                 f"the images of placement {first} fit the scans of placement {second}, and those "
                 f"of {second} the scans of {first}: their numbers are exchanged; exchange them "
@@ -373,6 +414,9 @@ def exchanged_placements(calibration):
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
     prepared, solution = calibration.prepared, calibration.joint.solution
+    board = prepared.board
+    corners = board.pattern.points() if board.corners is None else board.corners
+    middle = corners.mean(axis=0)[:2]
     p_lrf, pitch, _ = face_points(scan, POINTS)
     agree = []
     for camera, transform in solution.transforms.items():
@@ -383,8 +427,6 @@ def _same_board(calibration, scan, placement):
         image_pitch = view.pitch if mount == "head" else 0.0
         points = lrf_to_source(p_lrf, pitch, solution.T_head_lrf, mount, image_pitch)
         on_board = view.T_camera_board.inv().apply(transform.apply(points))
-        beside = np.linalg.norm(
-            on_board[:, :2].mean(axis=0) - prepared.board.known_corners().mean(axis=0)
-        )
+        beside = np.linalg.norm(on_board[:, :2].mean(axis=0) - middle)
         agree.append(np.median(np.abs(on_board[:, 2])) < GOOD and beside < BESIDE)
     return bool(agree) and all(agree)

@@ -27,7 +27,7 @@ class Fault:
     kind : str
         'repeated image', 'repeated scan', 'beyond range', 'field of view', 'dark', 'clock'; of
         :mod:`lrfcal_lib.evaluate.recording_faults` also 'camera moved', 'camera zoomed',
-        'exchanged', 'sense', 'unit'.
+        'exchanged', 'numbers', 'sense', 'unit'.
     words : str
         What was found, where, and what to do about it.
     severe : bool
@@ -47,18 +47,24 @@ class Fault:
     placements: tuple[int, ...] = ()
 
 
-def faults_of_files(session):
-    """What cannot be right about an opened Session: repetitions, ranges, bearings and times.
+def faults_of_files(session) -> list[Fault]:
+    """What cannot be right about a session: repetitions, ranges, bearings and times.
+
+    Parameters
+    ----------
+    session : Session
+        Opened; its images are read again where two files are of the same size.
 
     Returns
     -------
     list of Fault
+        Harmless ones included.
     """
     found = repeated_images(session) + repeated_scans(session)
     return found + ranges_beyond(session) + bearings_beyond(session) + other_clocks(session)
 
 
-def repeated_images(session):
+def repeated_images(session) -> list[Fault]:
     """Images whose files are the same to the byte; one Fault a pair of cameras."""
     by_size = defaultdict(list)
     for record in session.image_records:
@@ -99,7 +105,7 @@ def _repeated(session, first_camera, camera, pairs):
     return Fault("repeated image", words, severe, camera=camera, placements=tuple(placements))
 
 
-def repeated_scans(session):
+def repeated_scans(session) -> list[Fault]:
     """Placements whose ranges are the same to the last digit: noise never repeats itself."""
     same_ranges = defaultdict(list)
     placement = session.scans["placement"]
@@ -203,12 +209,12 @@ def brightness(image):
     return int(np.quantile(image[::4, ::4].max(axis=2), WHITE))
 
 
-def dark_image(image):
+def dark_image(image: np.ndarray) -> bool:
     """Whether the brightest surface of an image (h, w, 3) is darker than a white square may be."""
     return brightness(image) < DARK
 
 
-def dark_images(session):
+def dark_images(session) -> list[Fault]:
     """Cameras whose images of the board are too dark; SHOWN of each are looked at."""
     found = []
     for camera in session.cameras:
@@ -220,7 +226,7 @@ def dark_images(session):
     return found
 
 
-def too_dark(session, records, how_many):
+def too_dark(session, records, how_many: str) -> Fault:
     """The Fault of dark images of one camera."""
     first = records[0]
     name = first.file.relative_to(session.path)

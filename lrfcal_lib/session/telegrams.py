@@ -227,4 +227,5 @@ def other_than_stated(scans, lrf):
     if np.abs(np.subtract(seen, stated)).max() <= stated[2] / 2:
         return ()
     texts = ["{:g} to {:g} deg in steps of {:g} deg".format(*values) for values in (seen, stated)]
-    return (f"the telegrams cover {texts[0]}, session.json states {texts[1]}: the telegrams count",)
+    remedy = "the telegrams count; correct field_of_view_deg and bearing_step_deg"
+    return (f"the telegrams cover {texts[0]}, session.json states {texts[1]}: {remedy}",)
