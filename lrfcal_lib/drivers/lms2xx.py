@@ -24,8 +24,8 @@ COUNTS = ("dropped", "stale", "reconnects")
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
-    Every call returns or raises a DeviceError within its deadline. While the device streams, only `take`, `counts`,
-   , `stop` and `close` may be called.
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only
+    `take`, `counts`, `stop` and `close` may be called.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """A device at the end of a serial line: the times of its bytes, and the port it is at.
 
-The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong one
-garbles bytes as on a real line.
+The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong
+one garbles bytes as on a real line.
 """
 
 import contextlib
@@ -31,8 +31,8 @@ SENDING = "sending"  # tag of what is planned for the bytes on their way out
 class SerialDevice:
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that it
-    lives on.
+    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that
+    it lives on.
 
     Parameters
     ----------
