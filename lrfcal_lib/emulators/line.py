@@ -179,9 +179,8 @@ class Terminal(threading.Thread):
         if event & select.POLLIN:
             with contextlib.suppress(OSError):
                 self._device.hear(os.read(self._master, 4096))
-        if (
-            self.open and event & select.POLLHUP
-        ):  # a port forgets what nobody read when it is closed
+        # a port forgets what nobody read when it is closed
+        if self.open and event & select.POLLHUP:
             with contextlib.suppress(OSError, termios.error):
                 slave = os.open(
                     os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK
