@@ -5,12 +5,24 @@ import math
 
 from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.lms2xx_link import POINTS, POWER_ON, RATES, Assembler, Link, ScanClock
-from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.port import (
+    REAL,
+    Closed,
+    DeviceError,
+    LineLost,
+    NoReply,
+    PortError,
+    Refused,
+    WrongDevice,
+)
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import MODES, SCAN, UNITS
 
 LOG = logging.getLogger(__name__)
-INSTALLATION, STREAM, INTERLACED = b"\x00", b"\x24", b"\x2a"  # data of MODE
+# data of MODE
+INSTALLATION = b"\x00"
+STREAM = b"\x24"
+INTERLACED = b"\x2a"
 ALL_VALUES = b"\x01"  # data of VALUES
 AGAIN_S = 0.1  # between looks for a port that vanished
 FIND_S = 6.0
@@ -24,8 +36,8 @@ COUNTS = ("dropped", "stale", "reconnects")
 class LMS2xx(Closed):
     """An LMS2xx, found at a port whatever it is doing, its stream stopped; a context manager.
 
-    Every call returns or raises a DeviceError within its deadline. While the device streams, only `take`, `counts`,
-   , `stop` and `close` may be called.
+    Every call returns or raises a DeviceError within its deadline. While the device streams, only
+    `take`, `counts`, `stop` and `close` may be called.
 
     Parameters
     ----------
@@ -67,14 +79,24 @@ class LMS2xx(Closed):
     def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", variant=None, find_s=FIND_S,
                  host=REAL, **configuration):  # fmt: skip
         if baudrate not in (None, *RATES):
-            raise ValueError(f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}")
+            raise ValueError(
+                f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}"
+            )
         if not 0 <= address < 0x80 or len(password) != 8:
-            raise ValueError(f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}")
-        self.port, self._password, self._host = str(port), bytes(password), host
-        self._counts, self._interrupted = dict.fromkeys(COUNTS, 0), host.event()
+            raise ValueError(
+                f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}"
+            )
+        self.port = str(port)
+        self._password = bytes(password)
+        self._host = host
+        self._counts = dict.fromkeys(COUNTS, 0)
+        self._interrupted = host.event()
         self._options = {"address": address, "interrupted": self._interrupted, "host": host}
         self._link = self._assembler = self._settled = self._scan_clock = self._thread = None
-        self._interlaced, self._readings, self._trouble, self._news = False, [], None, host.event()
+        self._interlaced = False
+        self._readings = []
+        self._trouble = None
+        self._news = host.event()
         try:
             self._connect(baudrate or 38400, host.now() + find_s)
             if baudrate is not None and baudrate != self.baudrate:
@@ -116,7 +138,8 @@ class LMS2xx(Closed):
 
     def _connect(self, first, end, deadline=math.inf):
         """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
-        self._link, self._scan_clock = Link(self.port, first, **self._options), ScanClock()
+        self._link = Link(self.port, first, **self._options)
+        self._scan_clock = ScanClock()
         self._link.deadline = deadline
         self._link.find([first, *(rate for rate in RATES if rate != first)], end - self._host.now())
         self._link.hush()
@@ -124,8 +147,11 @@ class LMS2xx(Closed):
         self._link.senders = {0x80, 0x80 | self.status.address}
         model, *rest = self._told(wire.TYPE, codec.parse_type)
         if not model.startswith("LMS2"):
-            raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx")
-        self.type, self.firmware = "-".join([model, *rest[:1]]), self.status.firmware
+            raise WrongDevice(
+                f"{self.port}: '{model}' answers, not an LMS2xx: name the port of the LMS2xx"
+            )
+        self.type = "-".join([model, *rest[:1]])
+        self.firmware = self.status.firmware
         self._read_configuration()
         told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
         LOG.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
@@ -133,10 +159,14 @@ class LMS2xx(Closed):
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
         if self.variant not in POINTS:
-            raise WrongDevice(f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does")
+            raise WrongDevice(
+                f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does"
+            )
         if (mode := self.configuration.measuring_mode) not in MODES:
             text = f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are no ranges"
-            raise WrongDevice(f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set")
+            raise WrongDevice(
+                f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set"
+            )
         self._settled = self.variant, self.configuration, self.baudrate
         self._assembler = Assembler(*self._settled, interlaced, self._counts, self._scan_clock)
 
@@ -214,7 +244,9 @@ class LMS2xx(Closed):
             self._link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
             self._link.find([old, *(r for r in RATES if r not in (old, rate)), rate], FIND_S)
-            need = "RS-422 (a jumper in the plug of the device)" if rate == 500000 else "a shorter cable"
+            need = "a shorter cable"
+            if rate == 500000:
+                need = "RS-422 (a jumper in the plug of the device)"
             text = f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; {self.baudrate} Bd now"
             raise NoReply(text) from error
 
@@ -247,7 +279,9 @@ class LMS2xx(Closed):
         self.status = self._told(wire.STATUS, codec.parse_status)
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
-            raise Refused(f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}")
+            raise Refused(
+                f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}"
+            )
 
     def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
         """Change settings that are kept in flash (some thousand writes), only if they differ; whether they did.
@@ -258,9 +292,15 @@ class LMS2xx(Closed):
         """
         self._idle()
         if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
-            raise ValueError(f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}")
+            raise ValueError(
+                f"unit is one of {UNITS}, measuring mode 0 to 6; got {unit!r}, {measuring_mode!r}"
+            )
         self._read_configuration()
-        options = {"unit": unit, "measuring_mode": measuring_mode, "realtime_indices": realtime_indices}
+        options = {
+            "unit": unit,
+            "measuring_mode": measuring_mode,
+            "realtime_indices": realtime_indices,
+        }
         wanted = self.configuration.changed(**options)
         differs = wanted.block != self.configuration.block
         if differs:
@@ -273,13 +313,16 @@ class LMS2xx(Closed):
         try:
             self._mode(INSTALLATION + self._password, "the password of the installation mode")
             self._link.ask(wire.CONFIGURE, wanted.block)
-        except NoReply as error:  # the reply may be lost and the flash written: read it, do not write again
+        except NoReply as error:
+            # the reply may be lost and the flash written: read it, do not write again
             LOG.warning("%s; reading the configuration", error)
         finally:
             self._mode(wire.ON_REQUEST, "to leave the installation mode")
         self._read_configuration()
         if self.configuration.block != wanted.block:
-            raise Refused(f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}")
+            raise Refused(
+                f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
+            )
 
     # ---------------------------------------------------------------------------------------------------- scans
 
@@ -292,10 +335,13 @@ class LMS2xx(Closed):
             left = max(0.0, end - self._host.now())
             arrival = self._opened().ask(wire.VALUES, ALL_VALUES, limit_s=left)
             late = arrival.time_s - self._link.asked_s > REPLY_S + self._assembler.duration_s
-            reading = None if late else self._scan(arrival)  # nobody knows the instant of a scan that came late
+            # nobody knows the instant of a scan that came late
+            reading = None if late else self._scan(arrival)
             if reading is not None:
                 return reading
-        raise NoReply(f"{self.port}: scans arrive, but too late, not new, or not of the variant {self.variant}")
+        raise NoReply(
+            f"{self.port}: scans arrive, but too late, not new, or not of the variant {self.variant}"
+        )
 
     def _scan(self, arrival):
         return self._assembler.feed(arrival.raw, arrival.time_s) if arrival.code == SCAN else None
@@ -311,7 +357,9 @@ class LMS2xx(Closed):
         if interlaced:
             self.set_variant(100, 0.25)
         self._stream()
-        self._readings, self._trouble, self._thread = [], None, self._host.thread(self._run, "LMS2xx reader")
+        self._readings = []
+        self._trouble = None
+        self._thread = self._host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
     interval_s = property(lambda self: (4 if self._interlaced else 1) * self._assembler.interval_s,
@@ -334,7 +382,8 @@ class LMS2xx(Closed):
             except DeviceError as error:
                 if lost:
                     self._interrupted.wait(AGAIN_S)
-                self._trouble, lost = str(error), True
+                self._trouble = str(error)
+                lost = True
                 LOG.warning("LMS2xx: %s; looking for the device", error)
             except Exception as error:  # told to whoever waits, who would wait for nothing
                 self._trouble = f"the reader thread failed: {error!r}"
@@ -349,7 +398,8 @@ class LMS2xx(Closed):
             if any(one.code == POWER_ON for one in found):
                 raise NoReply("the device started anew")
             if fresh := [reading for one in found if (reading := self._scan(one)) is not None]:
-                self._readings, self._trouble = [*self._readings, *fresh][-KEPT:], None
+                self._readings = [*self._readings, *fresh][-KEPT:]
+                self._trouble = None
                 self._news.set()
                 last = self._host.now()
             if self._host.now() - last > max(LEAST_QUIET_S, 2.2 * self.interval_s + 0.15):
@@ -364,14 +414,17 @@ class LMS2xx(Closed):
         if self._thread is None:
             raise DeviceError(f"{self.port}: the device does not stream; call start() first")
         limit = 2 + 2 * (count + 2) * self.interval_s if timeout is None else timeout
-        found, last_s, end = [], self._host.time() if after is None else after, self._host.now() + limit
+        found = []
+        last_s = self._host.time() if after is None else after
+        end = self._host.now() + limit
         while True:
             self._news.clear()
             alive = self._thread.is_alive()
             found += [one for one in self._readings if one.time_s > last_s]
             if len(found) >= count:
                 return found[:count]
-            last_s, left = found[-1].time_s if found else last_s, end - self._host.now()
+            last_s = found[-1].time_s if found else last_s
+            left = end - self._host.now()
             if left <= 0 or not alive:
                 state = "the stream is silent" if alive else "the reader thread ended"
                 raise NoReply(f"no new scan within {limit:g} s: {self._trouble or state}")

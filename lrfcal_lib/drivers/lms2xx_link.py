@@ -11,9 +11,18 @@ import numpy as np
 from lrfcal_lib.drivers.port import REAL, NoReply, PortError, Refused, WrongDevice, line_lost
 from lrfcal_lib.session import lms2xx_codec as codec
 
-ACK, NAK = 0x06, 0x15
-MODE, VALUES, STATUS, ERRORS, TYPE, VARIANT, CONFIGURATION, CONFIGURE = 0x20, 0x30, 0x31, 0x32, 0x3A, 0x3B, 0x74, 0x77
-POWER_ON, NOT_UNDERSTOOD = 0x90, 0x92
+ACK = 0x06
+NAK = 0x15
+MODE = 0x20
+VALUES = 0x30
+STATUS = 0x31
+ERRORS = 0x32
+TYPE = 0x3A
+VARIANT = 0x3B
+CONFIGURATION = 0x74
+CONFIGURE = 0x77
+POWER_ON = 0x90
+NOT_UNDERSTOOD = 0x92
 ON_REQUEST = b"\x25"  # data of MODE
 RATES = {38400: 0x40, 9600: 0x42, 19200: 0x41, 500000: 0x48}  # and the data of MODE that sets them
 TURN_S = 0.01332  # of the mirror
@@ -59,15 +68,24 @@ class Link:
     """
 
     def __init__(self, path, baudrate, *, address=0, interrupted=None, host=REAL):
-        self.path, self.address, self.host = path, address, host
+        self.path = path
+        self.address = address
+        self.host = host
         self.interrupted = interrupted or host.event()
-        self.senders, self.deadline, self.asked_s, self.heard = None, math.inf, 0.0, 0
+        self.senders = None
+        self.deadline = math.inf
+        self.asked_s = 0.0
+        self.heard = 0
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
 
     baudrate = property(lambda self: self._port.baudrate, doc="Of this end of the line.")
-    silent_s = property(lambda self: self.host.now() - self._last, doc="Seconds since the last byte, or request.")
-    acknowledged = property(lambda self: self._stray == ACK, doc="Whether the last stray byte is ACK.")
+    silent_s = property(
+        lambda self: self.host.now() - self._last, doc="Seconds since the last byte, or request."
+    )
+    acknowledged = property(
+        lambda self: self._stray == ACK, doc="Whether the last stray byte is ACK."
+    )
 
     @property
     def declined(self):
@@ -84,7 +102,10 @@ class Link:
         self._port.close()
 
     def _forget(self):
-        self._rest, self._stray, self._last, self._kept = b"", None, self.host.now(), []
+        self._rest = b""
+        self._stray = None
+        self._last = self.host.now()
+        self._kept = []
 
     def send(self, code, data=b""):
         """Send a request; what arrived before it is thrown away."""
@@ -106,15 +127,19 @@ class Link:
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
         if self._kept:
-            kept, self._kept = self._kept, []
+            kept = self._kept
+            self._kept = []
             return kept
-        whole = int.from_bytes(self._rest[2:4], "little") + codec.OVERHEAD if len(self._rest) >= 4 else 0
+        whole = 0  # bytes of the telegram that has begun
+        if len(self._rest) >= 4:
+            whole = int.from_bytes(self._rest[2:4], "little") + codec.OVERHEAD
         with line_lost(self.path):
             data = self._port.read(max(1, whole - len(self._rest)))
             data += self._port.read(self._port.in_waiting)
         if not data:
             return []
-        now, self._last = self.host.time(), self.host.now()
+        now = self.host.time()
+        self._last = self.host.now()
         self.heard += len(data)
         data = self._rest + data
         stream = codec.split_stream(data)
@@ -123,7 +148,10 @@ class Link:
         self._stray = stray[-1] if stray else None if ends else self._stray
         self._rest = data[stream.pending :]
         spans = zip(stream.offset.tolist(), ends, strict=True)
-        found = [Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate) for begin, end in spans]
+        found = [
+            Arrival(data[begin:end], now - (len(data) - end) * 10 / self.baudrate)
+            for begin, end in spans
+        ]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]
 
     # ---------------------------------------------------------------------------------------------- requests
@@ -136,7 +164,8 @@ class Link:
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
         end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
-        said, self.asked_s = None, self.host.time()
+        said = None
+        self.asked_s = self.host.time()
         for _ in range(TRIES):
             self.send(code, data)
             reply, said = self._await(code | 0x80, sign, again_s, end)
@@ -148,11 +177,14 @@ class Link:
                 self.host.sleep(NAK_PAUSE_S)
         if said:
             raise Refused(f"{self.path}: the device refuses command {code:02X}: {said}")
-        raise NoReply(f"{self.path}: no reply to command {code:02X} at {self.baudrate} Bd; is the device on?")
+        raise NoReply(
+            f"{self.path}: no reply to command {code:02X} at {self.baudrate} Bd; is the device on?"
+        )
 
     def _await(self, code, sign, again_s, end):
         """The reply, or None and why the device declined (None if it said nothing until it is time to ask again)."""
-        begin, acknowledged = self.host.now(), False
+        begin = self.host.now()
+        acknowledged = False
         while (now := self.host.now()) < end:
             found = self.receive()
             for at, one in enumerate(found):
@@ -176,12 +208,16 @@ class Link:
 
         Raises NoReply if nothing was heard at any rate, WrongDevice if only bytes that make no telegram.
         """
-        end, heard, windows = self.host.now() + limit_s, self.heard, itertools.cycle(WINDOWS_S)
+        end = self.host.now() + limit_s
+        heard = self.heard
+        windows = itertools.cycle(WINDOWS_S)
         while self.host.now() < end:
             window = next(windows)
             if any(self._answers(rate, window, end) for rate in rates):
                 return
-        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}" + " (any)" * (self.address == 0)
+        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}"
+        if self.address == 0:
+            tried += " (any)"
         if self.heard > heard:
             raise WrongDevice(f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
                               "another device, wires that echo, or a line that damages everything")  # fmt: skip
@@ -194,7 +230,8 @@ class Link:
             self.set_rate(rate)
         except PortError:  # most RS-232 ports lack 500000 Bd
             return False
-        begin, sent = self.host.now(), -math.inf
+        begin = self.host.now()
+        sent = -math.inf
         until = begin + window
         while (now := self.host.now()) < min(until, end):
             if now - sent > (NAK_PAUSE_S if self.declined else 1.0):
@@ -210,20 +247,23 @@ class Link:
     def hush(self):
         """See that nothing comes in, else ask again to stop streaming; raises NoReply, Refused or LineLost."""
         for _ in range(TRIES):
-            begin, heard = self.host.now(), self.heard
+            begin = self.host.now()
+            heard = self.heard
             while self.host.now() < begin + 5 * SILENCE_S and self.heard == heard:
                 self.receive()
             if self.heard == heard:
                 return
             self.ask(MODE, ON_REQUEST)
-        raise Refused(f"{self.path}: the device confirms to stop streaming and goes on; switch it off and on")
+        raise Refused(
+            f"{self.path}: the device confirms to stop streaming and goes on; switch it off and on"
+        )
 
 
 POINTS = {(100, 1.0): 101, (100, 0.5): 201, (100, 0.25): 401, (180, 1.0): 181, (180, 0.5): 361}
 WINDOW_S = 2.0  # arrivals in the last so many seconds tell the host's clock from the device's
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
 JITTER_S = 0.05  # corrections of the clock up to this are spread over scans; at larger ones scans are left out
-LEAST_S = TURN_S / 100  # between two instants told; far less than between two scans, emulated ones sped up included
+LEAST_S = TURN_S / 100  # between two instants told; far less than between two scans
 FORGET_S = 30.0  # after such a pause the number of turns in between is not known
 STUBBORN = 5  # so many implausible scan indices in a row: the device counts anew
 
@@ -238,7 +278,8 @@ class Reading:
     bearings: np.ndarray  # (B,), radians in the LRF frame, ascending
     time_s: float  # clock of the host at the first beam
     beam_times_s: np.ndarray  # (B,), the same for every beam
-    scan_index: int | None  # of the (first) telegram, modulo 256; None where the device does not send it
+    # of the (first) telegram, modulo 256; None where the device does not send them
+    scan_index: int | None
     telegram_index: int | None
 
 
@@ -251,7 +292,9 @@ class ScanClock:
     """
 
     def __init__(self):
-        self._seen, self._refused, self._told = deque(), 0, -np.inf
+        self._seen = deque()
+        self._refused = 0
+        self._told = -np.inf
 
     def place(self, index, time_s):
         """Instant of a scan, and turns since the last one.
@@ -262,7 +305,8 @@ class ScanClock:
         """
         if index < 0:
             return time_s, 0
-        turn, step = index, 0
+        turn = index
+        step = 0
         if self._seen:
             elapsed_s = time_s - self._instant()
             if elapsed_s > FORGET_S or self._refused >= STUBBORN:
@@ -286,7 +330,8 @@ class ScanClock:
 
     def _instant(self):
         """Of the last scan, by the earliest arrival of the window."""
-        return self._seen[-1][0] * TURN_S + min(time_s - turn * TURN_S for turn, time_s in self._seen)
+        earliest = min(time_s - turn * TURN_S for turn, time_s in self._seen)
+        return self._seen[-1][0] * TURN_S + earliest
 
 
 class Assembler:
@@ -299,10 +344,17 @@ class Assembler:
     """
 
     def __init__(self, variant, configuration, baudrate, interlaced, counts, clock=None):
-        self.variant, self.configuration, self.baudrate, self.interlaced = variant, configuration, baudrate, interlaced
-        self.counts, self._clock, self._parts, self._first = counts, clock or ScanClock(), [], True
+        self.variant = variant
+        self.configuration = configuration
+        self.baudrate = baudrate
+        self.interlaced = interlaced
+        self.counts = counts
+        self._clock = clock or ScanClock()
+        self._parts = []
+        self._first = True
         self.turns = 1 if interlaced else round(1 / variant[1])
-        size = 10 + 2 * (181 if interlaced else POINTS[variant]) + 2 * configuration.realtime_indices
+        values = 181 if interlaced else POINTS[variant]
+        size = 10 + 2 * values + 2 * configuration.realtime_indices
         self.duration_s = self.turns * TURN_S + transfer_s(size, baudrate)
         self.interval_s = interval_s(size, baudrate, self.turns * TURN_S)
 
@@ -316,9 +368,12 @@ class Assembler:
             scan = codec.decode_scan(raw, own.measuring_mode)
         except codec.TelegramError:
             return None
-        count, index, partial = scan.words.shape[1], int(scan.scan_index[0]), int(scan.partial[0])
+        count = scan.words.shape[1]
+        index = int(scan.scan_index[0])
+        partial = int(scan.partial[0])
         wanted = 181 - (partial > 0) if self.interlaced else POINTS[self.variant]
-        if (count, scan.unit, index >= 0, partial >= 0) != (wanted, own.unit, own.realtime_indices, self.interlaced):
+        kind = (count, scan.unit, index >= 0, partial >= 0)
+        if kind != (wanted, own.unit, own.realtime_indices, self.interlaced):
             return None
         start_s = arrival_s - transfer_s(len(raw), self.baudrate) - self.turns * TURN_S
         start_s, step = self._clock.place(index, start_s)
@@ -328,10 +383,19 @@ class Assembler:
         self.counts["dropped"] += 0 if self._first else max(0, step // self.turns - 1)
         self._first = False
         quarters = codec.scan_quarters(count, partial)
-        times = start_s + (np.arange(count) % self.turns + quarters / 1440) * TURN_S  # the first turn begins at 0 deg
+        # the first turn begins at 0 deg
+        times = start_s + (np.arange(count) % self.turns + quarters / 1440) * TURN_S
         ranges = np.where(np.isfinite(scan.ranges[0]), scan.ranges[0], np.nan)
         indices = [None if i < 0 else int(i) for i in (index, scan.telegram_index[0])]
-        one = Reading((raw,), ranges, scan.reasons[0], np.radians(quarters / 4), float(times[0]), times, *indices)
+        one = Reading(
+            (raw,),
+            ranges,
+            scan.reasons[0],
+            np.radians(quarters / 4),
+            float(times[0]),
+            times,
+            *indices,
+        )
         return self._merged(partial, one) if self.interlaced else one
 
     def _merged(self, partial, part):
@@ -350,8 +414,11 @@ class Assembler:
             self._parts.append(part)
         if len(self._parts) < 4:
             return None
-        parts, self._parts = self._parts, []
+        parts = self._parts
+        self._parts = []
         order = np.argsort(np.concatenate([one.bearings for one in parts]))
         columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
                    for name in ("ranges", "reasons", "bearings", "beam_times_s")}  # fmt: skip
-        return replace(parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns)
+        return replace(
+            parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns
+        )

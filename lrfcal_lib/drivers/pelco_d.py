@@ -9,17 +9,26 @@ from lrfcal_lib.drivers.port import REAL, LineLost, PortError, line_lost
 
 LOG = logging.getLogger(__name__)
 SYNC = 0xFF
-FRAME, SHORT, GENERAL = 7, 5, 4  # bytes of a frame, of a short reply, of a confirmation
-UP, DOWN = 0x08, 0x10  # bits of command 2; without them, and those of the pan, it is a stop
+# bytes
+FRAME = 7
+SHORT = 5  # a short reply
+GENERAL = 4  # a confirmation
+# bits of command 2; without them, and those of the pan, it is a stop
+UP = 0x08
+DOWN = 0x10
 FASTEST = 0x3F  # speed byte; 0 is very slow, not stop
 SET_TILT = 0x4D
-QUERY_TILT, TILT = 0x53, 0x5B  # and its reply
+QUERY_TILT = 0x53
+TILT = 0x5B  # its reply
 TURN = 36000  # hundredths of a degree
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame without sync byte and checksum. An odd `command2` is the opcode of an extended command or reply."""
+    """A frame without sync byte and checksum.
+
+    An odd `command2` is the opcode of an extended command or reply.
+    """
 
     address: int
     command1: int = 0
@@ -41,9 +50,9 @@ class Received:
 
 
 def encode_frame(address, command1=0, command2=0, data1=0, data2=0):
-    """The 7 bytes of a frame, all 0 that of a stop; a motion is obeyed until the next one, a stop, or the head's limit.
+    """The 7 bytes of a frame, all 0 that of a stop; ValueError for numbers that are no bytes.
 
-    ValueError for numbers that are no bytes.
+    A motion is obeyed until the next one, a stop, or the head's limit.
     """
     body = bytes([address, command1, command2, data1, data2])
     return bytes([SYNC, *body, sum(body) & 0xFF])
@@ -55,16 +64,24 @@ def encode_extended(address, opcode, value=0):
 
 
 def split_frames(data):
-    """The Frames in a stream of commands, of overlapping ones the first, and from where on bytes must be kept.
+    """The Frames in a stream of commands, of overlapping ones the first.
 
-    A frame may begin there whose end has not come yet.
+    Returns
+    -------
+    frames : tuple of Frame
+    pending : int
+        From where on bytes must be kept: a frame may begin there whose end has not come yet.
     """
-    data, frames, at = bytes(data), [], 0
+    data = bytes(data)
+    frames = []
+    at = 0
     while (at := data.find(SYNC, at)) >= 0 and at + FRAME <= len(data):
-        good = data[at + 6] == sum(data[at + 1 : at + 6]) & 0xFF
-        if good:
-            frames.append(Frame(*data[at + 1 : at + 6]))
-        at += FRAME if good else 1
+        body = data[at + 1 : at + 6]
+        if data[at + 6] == sum(body) & 0xFF:
+            frames.append(Frame(*body))
+            at += FRAME
+        else:
+            at += 1
     return tuple(frames), at if at >= 0 else len(data)
 
 
@@ -77,40 +94,71 @@ def encode_tilt(elevation):
 
 
 def decode_tilt(value):
-    """Elevation of a head's tilt reply, radians in [-pi, pi): the inverse of :func:`encode_tilt`."""
+    """Elevation of a head's tilt reply, radians in [-pi, pi): inverse of :func:`encode_tilt`."""
     return -math.radians((value if value <= TURN // 2 else value - TURN) / 100)
 
 
 def tilt_in(raw, address):
-    """Number of the frame with which the head of an address tells its tilt, in a tuple; angles end at 359.99 deg."""
+    """Numbers of the frames with which the head of an address tells its tilt, a tuple.
+
+    Angles end at 359.99 deg.
+    """
+    frames, _ = split_frames(raw)
+    wanted = (address, 0, TILT)
     return tuple(
-        frame.value for frame in split_frames(raw)[0]
-        if (frame.address, frame.command1, frame.command2) == (address, 0, TILT) and frame.value < TURN
-    )  # fmt: skip
+        frame.value
+        for frame in frames
+        if (frame.address, frame.command1, frame.command2) == wanted and frame.value < TURN
+    )
+
+
+def confirms(data, sent):
+    """Whether bytes begin with the confirmation of a command that was sent.
+
+    What may as well be the beginning of an echo is none; a query is not confirmed.
+    """
+    general = data[:GENERAL]
+    if len(general) < GENERAL or sent[3] == QUERY_TILT or sent.startswith(general):
+        return False
+    return general[0] == SYNC and general[3] == (sent[6] + general[2]) & 0xFF
+
+
+def echo_in(data, sent):
+    """How many bytes in front are the end of the frame that was sent; 0 for none."""
+    return next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)
 
 
 def split_replies(data, sent):
     """What a head, and an adapter that echoes, sent back after one frame, as Received.
 
-    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a command: a byte of alarm
-    bits, and a checksum that continues that of the command. Every place is tried, and one that fits nothing is skipped;
-    so are frames of other senders, and the single byte 01 of some heads. What looks like a confirmation may as well be
-    the beginning of an echo, and is none then; of echoes the beginning may be lost.
+    7 bytes answer a query, so do 5 bytes, the same without sync and address; 4 bytes confirm a
+    command: a byte of alarm bits, and a checksum that continues that of the command. Every place is
+    tried, and one that fits nothing is skipped; so are frames of other senders, and the single byte
+    01 of some heads. What looks like a confirmation may as well be the beginning of an echo, and is
+    none then; of echoes the beginning may be lost.
     """
-    tilts, acknowledged, echoed, skipped = [], False, 0, 0
+    tilts = []
+    acknowledged = False
+    echoed = 0
+    skipped = 0
+    first = True
     while data:
-        short, size, fresh = data[:GENERAL], 1, not (tilts or acknowledged or echoed or skipped)
+        size = 1
         if data.startswith(sent):
-            echoed += (size := FRAME)
-        elif found := tilt_in(data[:FRAME], sent[1]) or tilt_in(bytes([SYNC, 0]) + data[:SHORT], 0):
-            tilts, size = [*tilts, *found], FRAME if data[0] else SHORT
-        elif (len(short) == GENERAL and sent[3] != QUERY_TILT and not sent.startswith(short)
-              and short[0] == SYNC and short[3] == (sent[6] + short[2]) & 0xFF):  # fmt: skip
-            acknowledged, size = True, GENERAL
-        elif fresh and (end := next((n for n in range(FRAME - 1, 0, -1) if data.startswith(sent[-n:])), 0)):
-            echoed += (size := end)
+            size = FRAME
+            echoed += size
+        elif tilt := tilt_in(data[:FRAME], sent[1]) or tilt_in(bytes([SYNC, 0]) + data[:SHORT], 0):
+            size = FRAME if data[0] else SHORT
+            tilts += tilt
+        elif confirms(data, sent):
+            size = GENERAL
+            acknowledged = True
+        elif first and (size_of_end := echo_in(data, sent)):
+            size = size_of_end
+            echoed += size
         else:
             skipped += 1
+        first = False
         data = data[size:]
     return Received(tuple(tilts), acknowledged, echoed, skipped)
 
@@ -120,16 +168,24 @@ MOST = 512  # bytes looked at after a frame: a head sends up to 18, the rest is 
 
 
 class HeadLine:
-    """Line to one head; a lock keeps threads apart. Calls raise LineLost if the port vanished and did not come back.
+    """Line to one head; a lock keeps threads apart.
 
-    `counts` has frames sent, bytes echoed and skipped, and reconnects.
+    Calls raise LineLost if the port vanished and did not come back. `counts` has frames sent, bytes
+    echoed and skipped, and reconnects.
     """
 
     def __init__(self, path, settings, host=REAL):
-        self.path, self.settings, self.host = path, settings, host
+        self.path = path
+        self.settings = settings
+        self.host = host
         self.counts = dict.fromkeys(("frames", "echoed", "skipped", "reconnects"), 0)
-        self.lock, self._stop, self._port = host.lock(), encode_frame(settings.address), None
-        self._free, self._sent, self._late, self._acknowledges = 0.0, 0.0, False, False
+        self.lock = host.lock()
+        self._stop = encode_frame(settings.address)
+        self._port = None
+        self._free = 0.0  # when the next frame may be sent
+        self._sent = 0.0  # when the last one was
+        self._late = False  # the reply to the last query did not come in time
+        self._acknowledges = False
         self._open()
 
     def _open(self):
@@ -139,22 +195,25 @@ class HeadLine:
         """Seconds that bytes take on the line."""
         return count * 10 / self.settings.baudrate
 
-    # -------------------------------------------------------------------------------------------------- frames
+    # ------------------------------------------------------------------------------------- frames
 
     def pitch(self, retries):
         """Instant of the host and pitch that the head tells, rad; None if no reply came.
 
-        After a time-out the next reply may be the late one, so it is thrown away and the head asked again. The head
-        looks at its encoder about half-way between the beginning of the query and the end of the reply.
+        After a time-out the next reply may be the late one, so it is thrown away and the head asked
+        again. The head looks at its encoder about half-way between the beginning of the query and
+        the end of the reply.
         """
         frame = encode_extended(self.settings.address, QUERY_TILT)
         for _ in range(1 + retries + self._late):
             with self.lock:
-                suspect, begun = self._late, self.host.now()
-                told = self._exchange(frame, self.settings.reply_s, again=True).tilts
-                self._late = not told
-            if told and not suspect:
-                return (begun + self.host.now()) / 2, self.settings.pitch(decode_tilt(told[-1]))
+                suspect = self._late
+                begun = self.host.now()
+                tilts = self._exchange(frame, self.settings.reply_s, again=True).tilts
+                self._late = not tilts
+            if tilts and not suspect:
+                halfway = (begun + self.host.now()) / 2
+                return halfway, self.settings.pitch(decode_tilt(tilts[-1]))
         return None
 
     def command(self, frame):
@@ -167,7 +226,10 @@ class HeadLine:
             return self._sent
 
     def stop(self):
-        """Send the stop until it is acknowledged, at least twice by heads that acknowledge nothing; its instant."""
+        """Send the stop until it is acknowledged; its instant.
+
+        To heads that acknowledge nothing it is sent at least twice.
+        """
         instants = []
         for _ in range(2 + self.settings.retries * self._acknowledges):
             with self.lock:
@@ -179,7 +241,7 @@ class HeadLine:
         return instants[0]
 
     def blurt_stop(self):
-        """Send the stop at once, whatever another thread is doing on the line; errors are logged, not raised."""
+        """Send the stop at once, whatever another thread does on the line; errors are logged."""
         held = self.lock.acquire(timeout=0.5)
         try:
             with line_lost(self.path):
@@ -193,21 +255,29 @@ class HeadLine:
                 self.lock.release()
 
     def _exchange(self, frame, wait_s=None, *, again=False):
-        """Send a frame, `again` where the port was lost and came back, and collect what is Received until a reply.
+        """Send a frame, and collect what is Received until a reply.
 
-        The wait (by default that of an acknowledgement) counts from the end of the transmission of frame and reply.
+        With `again` also where the port was lost and came back. The wait (by default that of an
+        acknowledgement) counts from the end of the transmission of frame and reply.
         """
         with self.lock:
             self.host.sleep(max(0.0, self._free - self.host.now()))
-            data, received = b"", Received()
+            data = b""
+            received = Received()
             try:
                 with line_lost(self.path):
                     port = self.opened()
                     port.reset_input_buffer()
                     port.write(frame)
                     self._sent = self.host.now()
-                    end = self._sent + self.wire_s(len(frame) + FRAME) + (wait_s or self.settings.gap_s)
-                    while not (received.tilts or received.acknowledged or self.host.now() >= end or len(data) >= MOST):
+                    end = (
+                        self._sent
+                        + self.wire_s(len(frame) + FRAME)
+                        + (wait_s or self.settings.gap_s)
+                    )
+                    while not (received.tilts or received.acknowledged):
+                        if self.host.now() >= end or len(data) >= MOST:
+                            break
                         data += port.read(max(1, min(port.in_waiting, MOST)))
                         received = split_replies(data, frame[:FRAME])
             except LineLost:
@@ -217,15 +287,20 @@ class HeadLine:
                 if not (again and there):
                     raise
                 return self._exchange(frame, wait_s)
-            self._free = max(self.host.now(), self._sent + self.wire_s(len(frame))) + self.settings.gap_s
-            for name, count in (("frames", 1), ("echoed", received.echoed), ("skipped", received.skipped)):
-                self.counts[name] += count
+            out = self._sent + self.wire_s(len(frame))
+            self._free = max(self.host.now(), out) + self.settings.gap_s
+            self.counts["frames"] += 1
+            self.counts["echoed"] += received.echoed
+            self.counts["skipped"] += received.skipped
             return received
 
-    # ---------------------------------------------------------------------------------------------------- port
+    # --------------------------------------------------------------------------------------- port
 
     def opened(self):
-        """The port; after it was lost it is waited for, and the head, which went on with what it was told, stopped."""
+        """The port; after it was lost it is waited for.
+
+        The head, which went on with what it was told, is stopped then.
+        """
         with self.lock, line_lost(self.path):
             deadline = self.host.now() + self.settings.reconnect_s
             while self._port is None:
@@ -245,5 +320,6 @@ class HeadLine:
     def close(self):
         """Close the port; nothing is sent."""
         with self.lock, contextlib.suppress(Exception):
-            port, self._port = self._port, None
+            port = self._port
+            self._port = None
             port.close()

@@ -59,7 +59,8 @@ def guard(device):
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) not in (_on_signal, signal.SIG_IGN):  # nohup ignores SIGHUP: go on
+            # nohup ignores SIGHUP: go on
+            if signal.getsignal(number) not in (_on_signal, signal.SIG_IGN):
                 _before[number] = signal.signal(number, _on_signal)
 
 
@@ -110,7 +111,9 @@ def open_port(path, baudrate, *, timeout):
             present = ", ".join(sorted(one.device for one in comports())) or "none"
             reason = f"there is no port {path}: check cable and power; present are {present}"
         elif number in (errno.EACCES, errno.EPERM):
-            reason = f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
+            reason = (
+                f"no permission for {path}: run 'sudo usermod -aG dialout $USER', then log in again"
+            )
         elif number in (errno.EBUSY, errno.EAGAIN):
             reason = f"the port {path} is busy, held by {_holder(path)}: close that program"
         else:
@@ -126,11 +129,14 @@ def open_port(path, baudrate, *, timeout):
 
 def _holder(path):
     """The processes that have a port open, as far as this user may see."""
-    found, real = set(), os.path.realpath(path)
+    found = set()
+    real = os.path.realpath(path)
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         try:
             if os.readlink(link) == real:
-                found.add(f"{(link.parents[1] / 'comm').read_text().strip()} (process {link.parts[2]})")
+                found.add(
+                    f"{(link.parents[1] / 'comm').read_text().strip()} (process {link.parts[2]})"
+                )
         except OSError:  # that process ended, or belongs to somebody else
             continue
     return ", ".join(sorted(found)) or "another program"
@@ -167,9 +173,12 @@ MOMENT_S = 1e-3
 class Host:
     """What drivers have of this machine, named as in `time` and `threading`; tests have another one."""
 
-    now, _zero = staticmethod(time.monotonic), time.time() - time.monotonic()
-    event, lock = threading.Event, staticmethod(threading.RLock)
-    port, set_rate = staticmethod(open_port), staticmethod(set_rate)
+    now = staticmethod(time.monotonic)
+    _zero = time.time() - time.monotonic()
+    event = threading.Event
+    lock = staticmethod(threading.RLock)
+    port = staticmethod(open_port)
+    set_rate = staticmethod(set_rate)
 
     def time(self):
         """A date, s, that nobody sets while this program runs: a step would tear scans and pitch apart."""

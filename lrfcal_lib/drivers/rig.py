@@ -72,7 +72,9 @@ OBEYED = 204  # answer of a control; a redirection or a page moved nothing
 LONGEST_REASON = 200  # characters of another answer that are told
 GAP_S = 4.0  # without a scan, after which a continuous sweep is given up
 SAME_STOP = 1e-3  # radians; an image and a scan this near share a stop
-FEWEST_SCANS, LEAST_SWEEP = 8, math.radians(10)  # of which can be told whether the view changed, even of a bare wall
+# of which can be told whether the view changed, even of a bare wall
+FEWEST_SCANS = 8
+LEAST_SWEEP = math.radians(10)
 STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
 
 
@@ -83,8 +85,13 @@ class Rig(Closed):
     """
 
     def __init__(self, stated, lrf, head, cameras, *, host=REAL):
-        self.stated, self.lrf, self.head, self.cameras, self.clock = stated, lrf, head, cameras, host.time
-        self._closing, self._now = contextlib.ExitStack(), host.now
+        self.stated = stated
+        self.lrf = lrf
+        self.head = head
+        self.cameras = cameras
+        self.clock = host.time
+        self._closing = contextlib.ExitStack()
+        self._now = host.now
 
     @classmethod
     def open(cls, stated, *, host=REAL, camera=None):
@@ -94,7 +101,9 @@ class Rig(Closed):
         than the source stated. DeviceError, with the device in the message: those opened before are closed again.
         """
         devices = stated.devices
-        skipped = {"port", "interlaced"} | ({"variant"} if devices.lrf.interlaced else set())  # it chooses its own
+        skipped = {"port", "interlaced"}
+        if devices.lrf.interlaced:  # it chooses its own
+            skipped.add("variant")
         asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
         openers = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
@@ -126,9 +135,11 @@ class Rig(Closed):
     @property
     def lrf_info(self):
         """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
-        stated, lrf = self.stated.lrf, self.lrf
+        stated = self.stated.lrf
+        lrf = self.lrf
         view, step = (180, 0.25) if self.stated.devices.lrf.interlaced else lrf.variant
-        unit, largest = METRES[lrf.configuration.unit], MODES[lrf.configuration.measuring_mode].largest
+        unit = METRES[lrf.configuration.unit]
+        largest = MODES[lrf.configuration.measuring_mode].largest
         seen = {"field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
                 "bearing_step": math.radians(step), "range_resolution": unit, "max_range": largest * unit}  # fmt: skip
         return replace(stated, model=stated.model or lrf.type, **seen)
@@ -178,13 +189,18 @@ class Rig(Closed):
         is closed, the head is stopped, and the scans are. DeviceError, too, after a sweep with a head that tells
         nothing if the scans are all alike: it did not move.
         """
-        sweep, seen = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go, []
+        sweep = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go
+        seen = []
         try:
             for event in sweep(placement):
                 if isinstance(event, Scanned) and not self.head.has_feedback:
                     seen += [one.ranges for one in event.readings]
                 yield event
-            if len(seen) >= FEWEST_SCANS and np.ptp(placement.pitch) >= LEAST_SWEEP and unchanged(seen):
+            if (
+                len(seen) >= FEWEST_SCANS
+                and np.ptp(placement.pitch) >= LEAST_SWEEP
+                and unchanged(seen)
+            ):
                 head = self.stated.devices.head
                 raise NoReply(
                     f"the head did not move: all {len(seen)} scans of the sweep show the same; check its power, the "
@@ -208,10 +224,14 @@ class Rig(Closed):
             try:
                 device.stop()
             except DeviceError as error:
-                LOG.error("the %s could not be stopped (%s): cut its power if it moves", name, error)
+                LOG.error(
+                    "the %s could not be stopped (%s): cut its power if it moves", name, error
+                )
 
     def _stop_and_go(self, placement):
-        interlaced, scans, images = self.stated.devices.lrf.interlaced, placement.pitch, placement.image_pitch
+        interlaced = self.stated.devices.lrf.interlaced
+        scans = placement.pitch
+        images = placement.image_pitch
         alone = [image for image in images if np.abs(scans - image).min() >= SAME_STOP]
         stops = sorted([*scans.tolist(), *alone], reverse=placement.direction < 0)
         if interlaced:
@@ -221,9 +241,13 @@ class Rig(Closed):
             yield moved
             if pitch not in alone:
                 readings = self._scans(moved.time_s, interlaced)
-                yield Scanned(placement.number, tuple(readings), np.full(len(readings), moved.pitch))
+                yield Scanned(
+                    placement.number, tuple(readings), np.full(len(readings), moved.pitch)
+                )
             if any(abs(pitch - image) < SAME_STOP for image in images):
-                yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
+                yield from self._photograph(
+                    self.cameras, placement.number, moved, placement.purpose
+                )
         self.lrf.stop()
 
     def _scans(self, after, interlaced):
@@ -231,7 +255,9 @@ class Rig(Closed):
         count = self.stated.plan.scans_per_stop
         if interlaced:
             return self.lrf.take(count, after=after, timeout=SCAN_S * count)
-        found, mended, end = [], False, self._now() + SCAN_S
+        found = []
+        mended = False
+        end = self._now() + SCAN_S
         while len(found) < count:
             try:
                 reading = self.lrf.request()
@@ -243,9 +269,13 @@ class Rig(Closed):
                 mended = True
                 continue
             if reading.time_s > after:
-                found, after, end = [*found, reading], reading.time_s, self._now() + SCAN_S
+                found = [*found, reading]
+                after = reading.time_s
+                end = self._now() + SCAN_S
             elif self._now() > end:
-                raise NoReply(f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s")
+                raise NoReply(
+                    f"the laser range finder gives no scan later than the stop in {SCAN_S:g} s"
+                )
         return found
 
     def _move(self, placement, pitch, number, of):
@@ -264,19 +294,26 @@ class Rig(Closed):
             moved = self._move(placement.number, float(pitch), number, len(images) + 1)
             yield moved
             if number <= len(images):
-                yield from self._photograph(self.cameras, placement.number, moved, placement.purpose)
+                yield from self._photograph(
+                    self.cameras, placement.number, moved, placement.purpose
+                )
         self.lrf.start()
         held = self.lrf.take(1, timeout=SCAN_S)
-        heard, newest = self._now(), held[-1].time_s
+        heard = self._now()
+        newest = held[-1].time_s
         self.head.start_sweep(last, self.stated.plan.sweep_speed)
         while self.head.moving():
             fresh = self._since(newest)
             if fresh:
-                heard, newest = self._now(), fresh[-1].time_s
+                heard = self._now()
+                newest = fresh[-1].time_s
             elif self._now() - heard > GAP_S:
-                raise NoReply(f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder")
+                raise NoReply(
+                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder"
+                )
             sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
-            known, held = _placed(held + fresh, sure)  # what is not measured may change until the next reading
+            # what is not measured may change until the next reading
+            known, held = _placed(held + fresh, sure)
             if known:
                 share = float(np.clip((known[1][-1] - first) / (last - first), 0, 1))
                 yield Scanned(placement.number, *known, share)
@@ -289,7 +326,8 @@ class Rig(Closed):
 
     def _since(self, instant):
         """All scans after an instant that come within the time of a batch."""
-        end, found = self._now() + BATCH_S, []
+        end = self._now() + BATCH_S
+        found = []
         with contextlib.suppress(NoReply):
             while self._now() < end:
                 found += self.lrf.take(1, after=instant, timeout=BATCH_S)
@@ -303,7 +341,8 @@ def _placed(readings, track):
         return None, readings
     times, pitch = np.array([point[:2] for point in track], float).T
     middle = np.array([np.mean(one.beam_times_s[[0, -1]]) for one in readings])
-    inside, later = (middle >= times[0]) & (middle <= times[-1]), list(compress(readings, middle > times[-1]))
+    inside = (middle >= times[0]) & (middle <= times[-1])
+    later = list(compress(readings, middle > times[-1]))
     known = tuple(compress(readings, inside)), np.interp(middle[inside], times, pitch)
     return known if inside.any() else None, later
 
@@ -318,15 +357,18 @@ def unchanged(scans):
     """
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
-    steps, spread = (np.diff(ranges, axis=0) ** 2).sum(axis=0), ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
+    steps = (np.diff(ranges, axis=0) ** 2).sum(axis=0)
+    spread = ((ranges - ranges.mean(axis=0)) ** 2).sum(axis=0)
     ratio = np.divide(steps, spread, out=np.full(len(steps), 2.0), where=steps > 0)
     return ratio.size > 0 and bool(ratio.mean() > STILL)
 
 
 def _camera(stated, name):
     """A camera that gives images of the size stated."""
-    asked, info = stated.devices.cameras[name], stated.cameras[name]
-    size, options = (info.width, info.height), asked.model_dump(exclude_none=True, exclude={"source", "size"})
+    asked = stated.devices.cameras[name]
+    info = stated.cameras[name]
+    size = (info.width, info.height)
+    options = asked.model_dump(exclude_none=True, exclude={"source", "size"})
     camera = Camera(asked.source, name=name, size=size, **options)
     if (got := camera.size) not in (None, size):
         camera.close()

@@ -18,12 +18,17 @@ from urllib3.exceptions import HTTPError
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, LineLost, NoReply, PortError
 
 LOG = logging.getLogger(__name__)
-BEGIN, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG file; inside of its image data they cannot occur
+# of a JPEG file; inside of its image data they cannot occur
+BEGIN = b"\xff\xd8"
+END = b"\xff\xd9"
 LENGTH = re.compile(rb"content-length:\s*(\d+)", re.IGNORECASE)
-CHUNK, LONGEST = 1 << 16, 1 << 26
+CHUNK = 1 << 16
+LONGEST = 1 << 26
 EXPOSURE_UNIT_S = 1e-4  # of V4L2
 MANUAL = 1  # exposure mode of V4L2
-WIDTH, HEIGHT, FPS = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS
+WIDTH = cv2.CAP_PROP_FRAME_WIDTH
+HEIGHT = cv2.CAP_PROP_FRAME_HEIGHT
+FPS = cv2.CAP_PROP_FPS
 IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
@@ -37,7 +42,8 @@ class Images:
     """Encoded images that are read like cv2.VideoCapture; ``take()`` gives the next one, None at the end."""
 
     def __init__(self):
-        self._image, self._held = b"", False
+        self._image = b""
+        self._held = False
 
     def grab(self):
         """Take the next image, if there is one."""
@@ -48,7 +54,11 @@ class Images:
 
     def retrieve(self):
         """Decode the image grabbed last: (True, image) or (False, None)."""
-        image = cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR) if self._image else None
+        image = (
+            cv2.imdecode(np.frombuffer(self._image, np.uint8), cv2.IMREAD_COLOR)
+            if self._image
+            else None
+        )
         return image is not None, image
 
     def get(self, key):
@@ -69,7 +79,9 @@ class MjpegStream(Images):
 
     def __init__(self, url, timeout):
         super().__init__()
-        self._buffer, self.waited, session = b"", False, requests.Session()
+        self._buffer = b""
+        self.waited = False
+        session = requests.Session()
         session.trust_env = False  # no proxy: cameras are near
         try:
             self._answer = session.get(url, stream=True, timeout=timeout).raw
@@ -91,7 +103,8 @@ class MjpegStream(Images):
             stated = LENGTH.findall(self._buffer[: max(begin, 0)])
             end = begin + int(stated[-1]) if stated else self._buffer.find(END, begin) + len(END)
             if begin >= 0 and len(END) <= end <= len(self._buffer):
-                image, self._buffer = self._buffer[begin:end], self._buffer[end:]
+                image = self._buffer[begin:end]
+                self._buffer = self._buffer[end:]
                 return image
             if self._answer.closed or len(self._buffer) > LONGEST:  # at its end or after a silence
                 return None
@@ -145,7 +158,9 @@ def _open_device(path):
         there = ", ".join(sorted(glob.glob("/dev/video*"))) or "none"
         raise PortError(f"there is no camera {path}: check its plug; present are {there}")
     if not os.access(path, os.R_OK | os.W_OK):
-        raise PortError(f"no permission for {path}: run 'sudo usermod -aG video $USER', then log in again")
+        raise PortError(
+            f"no permission for {path}: run 'sudo usermod -aG video $USER', then log in again"
+        )
     busy = f"{path} gives no video: close other programs that use it, or name another device"
     return _opened(busy, path, cv2.CAP_V4L2)
 
@@ -168,7 +183,9 @@ def remedy_of(path):
     if "://" in path:
         return f"open {path} in a browser, and check network and power of the camera"
     is_device = path.startswith("/dev/")
-    return f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows" if is_device else ""
+    return (
+        f"check the plug of {path}, and what 'v4l2-ctl --list-devices' shows" if is_device else ""
+    )
 
 
 def open_source(path, silence_s):
@@ -181,7 +198,9 @@ def open_source(path, silence_s):
     if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
         return Files(path)
     if not os.path.exists(path):
-        raise PortError(f"there is no video {path}: name a file, a device, a folder of images or a URL")
+        raise PortError(
+            f"there is no video {path}: name a file, a device, a folder of images or a URL"
+        )
     return _opened(f"{path} is no video that OpenCV can read", path)
 
 
@@ -228,12 +247,22 @@ class Camera(Closed):
     """
 
     def __init__(self, source, *, name, size=None, exposure=None, fps=None, silence_s=10.0):
-        self._asked = {"size": None if size is None else tuple(size), "exposure": exposure, "fps": fps}
-        self.name, self.lost, self._told = name, False, set()
+        self._asked = {
+            "size": None if size is None else tuple(size),
+            "exposure": exposure,
+            "fps": fps,
+        }
+        self.name = name
+        self.lost = False
+        self._told = set()
         path = os.fspath(source) if not isinstance(source, int) else str(source)
-        self._path, self._silence_s = f"/dev/video{path}" if path.isdigit() else path, silence_s
+        self._path = f"/dev/video{path}" if path.isdigit() else path
+        self._silence_s = silence_s
         self._remedy = remedy_of(self._path)
-        self._frame, self._count, self._new, self._quit = None, 0, threading.Condition(), threading.Event()
+        self._frame = None
+        self._count = 0
+        self._new = threading.Condition()
+        self._quit = threading.Event()
         self._capture = open_source(self._path, self._silence_s)
         self._apply()
         self._thread = None
@@ -303,7 +332,8 @@ class Camera(Closed):
             if self._capture is None or not self._capture.grab():
                 self._lose()
                 continue
-            now = REAL.time()  # what was there at once may have come at any time since the frame before
+            now = REAL.time()
+            # what was there at once may have come at any time since the frame before
             self._keep(now if getattr(self._capture, "waited", True) else self._before)
             self._before = now
         self._release()
@@ -314,7 +344,9 @@ class Camera(Closed):
         if done:
             grey = image.ndim == 2 or image.shape[2] == 1
             with self._new:
-                self._frame = Frame(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count)
+                self._frame = Frame(
+                    cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image, instant, self._count
+                )
                 self._count += 1
                 if self.lost:
                     LOG.warning("camera %s is back", self.name)
@@ -327,7 +359,8 @@ class Camera(Closed):
         with self._new:
             if not self.lost:
                 LOG.warning("camera %s is lost: %s", self.name, self._remedy)
-            self.lost, self._frame = True, None
+            self.lost = True
+            self._frame = None
         self._release()
         if not self._quit.wait(AGAIN_S):
             with contextlib.suppress(PortError):
@@ -336,20 +369,31 @@ class Camera(Closed):
 
     def _apply(self):
         """Set what was asked for, of devices, read it back, and say what is different."""
-        self._before, capture, asked, ticks = REAL.time(), self._capture, self._asked, 0
+        self._before = REAL.time()
+        capture = self._capture
+        asked = self._asked
+        ticks = 0
         if self._path.startswith("/dev/"):
-            exposure = None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
+            exposure = (
+                None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
+            )
             wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
                       FPS: asked["fps"], cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,
                       cv2.CAP_PROP_EXPOSURE: exposure}  # fmt: skip
-            done = {key: capture.set(key, value) for key, value in wanted.items() if value is not None}
+            done = {
+                key: capture.set(key, value) for key, value in wanted.items() if value is not None
+            }
             ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
         size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
         self.size = size if all(size) else None
         found = {"size": self.size, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
                  "fps": capture.get(FPS) or None}  # fmt: skip
         for key, got in found.items():
-            if asked[key] is None or got is not None and np.allclose(asked[key], got, rtol=0.05, atol=0):
+            if (
+                asked[key] is None
+                or got is not None
+                and np.allclose(asked[key], got, rtol=0.05, atol=0)
+            ):
                 continue
             text = f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, asked {asked[key]}"
             if text not in self._told:  # once, however often it is opened again

@@ -1,4 +1,4 @@
-"""A Pelco-D pan-tilt head, as good or as bad as heads are; how it moves is known at every instant."""
+"""A Pelco-D pan-tilt head, as good or as bad as heads are; how it moves is always known."""
 
 import math
 from collections import deque
@@ -16,31 +16,42 @@ WOBBLE = 0.015  # amplitude after a stop, radians for each rad/s of speed
 WOBBLE_HZ = 4.0
 KEPT = 2000  # pieces of motion; ten times as many frames
 TURN_AROUND_S = 0.010  # from the end of a frame to a reply
-ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}  # to queries of pan, tilt, zoom, magnification
+# to queries of pan, tilt, zoom, magnification
+ANSWERS = {0x51: 0x59, QUERY_TILT: TILT, 0x55: 0x5D, 0x61: 0x63}
 FRAGMENT_S = 0.1  # a frame begun is forgotten after so long
 
 
 class Head:
-    """Tilt of a head and the pitch that the sensors on it have; a Platform tells how well it is made.
+    """Tilt of a head and the pitch that the sensors on it have.
 
-    Its motor runs at constant speed to where it is told, or until it is stopped. The pitch at the start is in radians.
+    Its motor runs at constant speed to where it is told, or until it is stopped. A Platform tells
+    how well it is made; the pitch at the start is in radians.
     """
 
     def __init__(self, platform=None, seed=0, pitch=0.0):
-        self.platform, self.rng = platform or Platform(), np.random.default_rng([seed, 2])
+        self.platform = platform or Platform()
         self.limits = self.platform.limits
-        # rows: instant from which it holds, motor from, to, rad/s, and where the head was within its play when the
-        # command came. One thread writes them, any may look: a look sees the table of before or of after.
-        self._pieces = np.array([(-np.inf, pitch, pitch, 0.0, (1 + self.platform.stretch) * pitch)])
+        self.rng = np.random.default_rng([seed, 2])
+        # rows: instant from which it holds, motor from, to, rad/s, and where the head was within
+        # its play when the command came. One thread writes them, any may look: a look sees the
+        # table of before or of after.
+        dragged = (1 + self.platform.stretch) * pitch
+        self._pieces = np.array([(-np.inf, pitch, pitch, 0.0, dragged)])
 
     def move(self, instant, goal, speed):
-        """Tilt towards an angle, at most to a limit, at a speed, radians; the motor reacts a little later."""
+        """Tilt towards an angle, at most to a limit, at a speed, radians.
+
+        The motor reacts a little later.
+        """
         self._run(instant + REACT_S, goal, speed)
 
     def _run(self, instant, goal, speed):
-        now, goal = float(self.motor(instant)), float(np.clip(goal, *self.limits))
-        piece = instant, now, goal, abs(speed) * np.sign(goal - now), float(self._dragged(instant))
-        self._pieces = np.vstack([self._pieces[self._pieces[:, 0] <= instant][-KEPT:], piece])
+        now = float(self.motor(instant))
+        goal = float(np.clip(goal, *self.limits))
+        velocity = abs(speed) * np.sign(goal - now)
+        piece = instant, now, goal, velocity, float(self._dragged(instant))
+        before = self._pieces[self._pieces[:, 0] <= instant]
+        self._pieces = np.vstack([before[-KEPT:], piece])
 
     def go(self, instant, goal, speed):
         """Tilt to an angle, missed by the noise of the platform."""
@@ -48,21 +59,25 @@ class Head:
 
     def stop(self, instant):
         """Stop tilting; what rests already goes on resting."""
-        if self.moving(instant + REACT_S):
-            self._run(instant + REACT_S, self.motor(instant + REACT_S), 0.0)
+        reacts = instant + REACT_S
+        if self.moving(reacts):
+            self._run(reacts, self.motor(reacts), 0.0)
 
     def motor(self, instant):
         """Angle of the motor at one instant or many."""
         begun, first, last, speed, _ = self._held(instant)
-        way = np.where(speed == 0, 0.0, speed * np.where(np.isfinite(begun), instant - begun, 0.0))
+        elapsed = np.where(np.isfinite(begun), instant - begun, 0.0)
+        way = np.where(speed == 0, 0.0, speed * elapsed)
         return np.clip(first + way, np.minimum(first, last), np.maximum(first, last))
 
     def resting(self, instant):
         """Seconds since the motor came to rest, negative while it runs; and the speed it had."""
         begun, first, last, speed, _ = self._held(instant)
         if speed != 0:
-            return float(instant - begun - abs((last - first) / speed)), float(speed)
-        return float(instant - begun), float(self._held(instant, back=1)[3])
+            runs = abs((last - first) / speed)
+            return float(instant - begun - runs), float(speed)
+        speed_before = self._held(instant, back=1)[3]
+        return float(instant - begun), float(speed_before)
 
     def moving(self, instant):
         """Whether the motor runs, or is about to."""
@@ -73,18 +88,22 @@ class Head:
         return not self.moving(instant) and self.resting(instant)[0] >= self.platform.settle
 
     def pitch(self, instant):
-        """True pitch at one instant or many, radians; after a stop it wobbles until it has settled."""
-        instant, settle = np.asarray(instant, float), self.platform.settle
-        since, speed = self.resting(float(np.max(instant)))
+        """True pitch at one instant or many, radians; after a stop it wobbles until it settled."""
+        instant = np.asarray(instant, float)
+        settle = self.platform.settle
+        latest = np.max(instant)
+        since, speed = self.resting(float(latest))
         if not 0 < since < settle + np.ptp(instant) or not settle:
             return self._dragged(instant) + 0.0
-        after = np.clip(since - (np.max(instant) - instant), 0, None)
-        swing = WOBBLE * speed * np.exp(-5 * after / settle) * np.sin(2 * np.pi * WOBBLE_HZ * after)
+        after = np.clip(since - (latest - instant), 0, None)
+        amplitude = WOBBLE * speed * np.exp(-5 * after / settle)
+        swing = amplitude * np.sin(2 * np.pi * WOBBLE_HZ * after)
         return self._dragged(instant) + np.where(after < settle, swing, 0.0)
 
     def measured(self, instant):
         """What the encoder says, radians; it sits on the motor and is late."""
-        angle, step = self.motor(instant - self.platform.latency), self.platform.encoder_step
+        angle = self.motor(instant - self.platform.latency)
+        step = self.platform.encoder_step
         return float(np.rint(angle / step) * step if step else angle)
 
     def _held(self, instant, back=0):
@@ -94,10 +113,13 @@ class Head:
         return np.moveaxis(pieces[np.maximum(row, 0)], -1, 0)
 
     def _dragged(self, instant):
-        """The gear drags the head along only when it has run through its play: within a piece of motion, which goes
-        one way, the head stays where it was until the motor is half the play ahead of it.
+        """Where the gear, which has some play, has dragged the head.
+
+        Within a piece of motion, which goes one way, the head stays where it was until the motor is
+        half the play ahead of it.
         """
-        half, motor = self.platform.backlash / 2, (1 + self.platform.stretch) * self.motor(instant)
+        half = self.platform.backlash / 2
+        motor = (1 + self.platform.stretch) * self.motor(instant)
         return np.clip(self._held(instant)[4], motor - half, motor + half)
 
 
@@ -112,14 +134,16 @@ class EmulatedHead(SerialDevice):
         Of the port to appear.
     baudrate, address : int
     feedback : {'full', 'partial', 'none'}
-        'full': tells its position except during an absolute move, and makes absolute moves. 'partial': tells its
-        position at rest only, and ignores absolute moves. 'none': neither; nothing is ever answered.
+        'full': tells its position except during an absolute move, and makes absolute moves.
+        'partial': tells its position at rest only, and ignores absolute moves. 'none': neither;
+        nothing is ever answered.
     confirms : bool
         Answers commands by 4 bytes.
     echo : bool
         The two-wire line hands back what the host sends.
     speeds, go_speed : tuple of float, float
-        Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; of absolute moves; degrees a second.
+        Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; of absolute moves;
+        degrees a second.
     watchdog_s : float, optional
         Stops when no frame came for so long.
     invert : bool
@@ -128,14 +152,37 @@ class EmulatedHead(SerialDevice):
         As for :class:`EmulatedLms`. `frames` holds host time and sound frames to this address.
     """
 
-    def __init__(self, head=None, *, path, baudrate=2400, address=1, feedback="full", confirms=False, echo=False,
-                 speeds=(0.5, 12.0), go_speed=8.0, watchdog_s=None, invert=False, seed=0, host=REAL):  # fmt: skip
+    def __init__(
+        self,
+        head=None,
+        *,
+        path,
+        baudrate=2400,
+        address=1,
+        feedback="full",
+        confirms=False,
+        echo=False,
+        speeds=(0.5, 12.0),
+        go_speed=8.0,
+        watchdog_s=None,
+        invert=False,
+        seed=0,
+        host=REAL,
+    ):
         super().__init__(path, host, seed)
-        self.head, self.baudrate, self.address = head or Head(seed=seed), baudrate, address
-        self.feedback, self.confirms, self.echo = feedback, confirms and feedback != "none", echo
-        self.speeds, self.go_speed = np.radians(speeds), math.radians(go_speed)
-        self.watchdog_s, self.sign, self.frames = watchdog_s, -1 if invert else 1, deque(maxlen=10 * KEPT)
-        self._buffer, self.absolute_until = b"", -math.inf
+        self.head = head or Head(seed=seed)
+        self.baudrate = baudrate
+        self.address = address
+        self.feedback = feedback
+        self.confirms = confirms and feedback != "none"
+        self.echo = echo
+        self.speeds = np.radians(speeds)
+        self.go_speed = math.radians(go_speed)
+        self.watchdog_s = watchdog_s
+        self.sign = -1 if invert else 1
+        self.frames = deque(maxlen=10 * KEPT)
+        self.absolute_until = -math.inf  # an absolute move is under way
+        self._buffer = b""  # bytes of a frame that is not whole
 
     def pitch(self, instant=None):
         """True pitch now, or at instants, radians."""
@@ -163,21 +210,32 @@ class EmulatedHead(SerialDevice):
             self.at(at + self.watchdog_s, self.stop, "watchdog")
         if frame.command2 in ANSWERS:
             return self.tell(frame.command2, at)
-        head, way = self.head, {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
         if not frame.command2 & 1:
-            if way is None:  # without a direction it is a stop whatever the speeds say
-                self.stop(at)
-            else:
-                self.absolute_until = -math.inf
-                speed = self.speeds[0] + np.ptp(self.speeds) * min(frame.data2, FASTEST) / FASTEST
-                head.move(at, way * math.tau, speed)
-        elif frame.command2 == pelco_d.SET_TILT and self.feedback == "full" and frame.value < pelco_d.TURN:
-            if at >= self.absolute_until:  # a second absolute move is lost
-                goal = float(np.clip(self.sign * pelco_d.decode_tilt(frame.value), *head.limits))
-                self.absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
-                head.go(at, goal, self.go_speed)
+            self._turn(frame, at)
+        elif frame.command2 == pelco_d.SET_TILT:
+            self._set_tilt(frame.value, at)
         if self.confirms:
-            self.reply(bytes([SYNC, self.address, 0, sum(vars(frame).values()) % 256]), at + TURN_AROUND_S)
+            checksum = sum(vars(frame).values()) % 256
+            self.reply(bytes([SYNC, self.address, 0, checksum]), at + TURN_AROUND_S)
+        return None
+
+    def _turn(self, frame, at):
+        """Move up or down; without a direction it is a stop, whatever the speeds say."""
+        way = {UP: self.sign, DOWN: -self.sign}.get(frame.command2 & (UP | DOWN))
+        if way is None:
+            return self.stop(at)
+        self.absolute_until = -math.inf
+        share = min(frame.data2, FASTEST) / FASTEST
+        return self.head.move(at, way * math.tau, self.speeds[0] + np.ptp(self.speeds) * share)
+
+    def _set_tilt(self, value, at):
+        """Move to an elevation; a second such move is lost while the first is under way."""
+        if self.feedback != "full" or value >= pelco_d.TURN or at < self.absolute_until:
+            return
+        head = self.head
+        goal = float(np.clip(self.sign * pelco_d.decode_tilt(value), *head.limits))
+        self.absolute_until = at + abs(goal - float(head.motor(at))) / self.go_speed
+        head.go(at, goal, self.go_speed)
 
     def stop(self, at):
         """Stop the motor."""
@@ -187,6 +245,9 @@ class EmulatedHead(SerialDevice):
     def tell(self, opcode, at):
         """Answer a query, unless the head is too busy or does not know how."""
         busy = at < self.absolute_until or (self.feedback == "partial" and self.head.moving(at))
-        if self.feedback != "none" and not busy:
-            tilt = pelco_d.encode_tilt(self.sign * self.head.measured(at)) if opcode == QUERY_TILT else 0
-            self.reply(encode_extended(self.address, ANSWERS[opcode], tilt), at + TURN_AROUND_S)
+        if self.feedback == "none" or busy:
+            return
+        value = 0
+        if opcode == QUERY_TILT:
+            value = pelco_d.encode_tilt(self.sign * self.head.measured(at))
+        self.reply(encode_extended(self.address, ANSWERS[opcode], value), at + TURN_AROUND_S)

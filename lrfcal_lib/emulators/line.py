@@ -1,7 +1,7 @@
 """A device at the end of a serial line: the times of its bytes, and the port it is at.
 
-The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong one garbles bytes as
-on a real line.
+The port is a pseudo-terminal served by a thread, whose rate is read at the master so that a wrong
+one garbles bytes as on a real line.
 """
 
 import contextlib
@@ -19,7 +19,9 @@ import numpy as np
 
 from lrfcal_lib.drivers.port import REAL
 
-RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+# code of a rate in termios -> baud
+NAMES = [name for name in dir(termios) if name[0] == "B" and name[1:].isdigit()]
+RATES = {getattr(termios, name): int(name[1:]) for name in NAMES}
 CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
@@ -29,7 +31,8 @@ SENDING = "sending"  # tag of what is planned for the bytes on their way out
 class SerialDevice:
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that it lives on.
+    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that
+    it lives on.
 
     Parameters
     ----------
@@ -45,10 +48,15 @@ class SerialDevice:
     """
 
     def __init__(self, path, host, seed=0):
-        self.path, self.host, self.error = str(path), host, None
+        self.path = str(path)
+        self.host = host
+        self.error = None
         self.port = getattr(host, "terminal", Terminal)(self)  # a test's is in memory
-        self._noise, self._agenda, self._order = np.random.default_rng([seed, 4]), [], itertools.count()
-        self.busy_until, self._heard = 0.0, 0.0
+        self.busy_until = 0.0  # of the line to the host
+        self._heard = 0.0  # the last byte from the host
+        self._noise = np.random.default_rng([seed, 4])
+        self._agenda = []  # heap of instant, order, action, tag
+        self._order = itertools.count()
 
     byte_s = property(lambda self: 10 / self.baudrate, doc="Seconds a byte takes.")
 
@@ -79,18 +87,21 @@ class SerialDevice:
         self.busy_until = 0.0
 
     def write(self, data, at, then=None):
-        """Send bytes after those given before; ``then(instant)`` is called when the last one is out."""
-        begin, byte_s = max(at, self.busy_until), self.byte_s
-        self.busy_until, some = begin + len(data) * byte_s, max(1, int(CHUNK_S / byte_s))
-        for first in range(0, len(data), some):
-            chunk = data[first : first + some]
-            self.at(begin + (first + len(chunk)) * byte_s, lambda _, chunk=chunk: self._put(chunk), SENDING)
+        """Send bytes after those given before; ``then(instant)`` is called when the last is out."""
+        byte_s = self.byte_s
+        begin = max(at, self.busy_until)
+        self.busy_until = begin + len(data) * byte_s
+        at_once = max(1, int(CHUNK_S / byte_s))
+        for first in range(0, len(data), at_once):
+            chunk = data[first : first + at_once]
+            out = begin + (first + len(chunk)) * byte_s
+            self.at(out, lambda _, chunk=chunk: self._put(chunk), SENDING)
         if then is not None:
             self.at(self.busy_until, then, SENDING)
 
     reply = write
 
-    # -------------------------------------------------------------------------------------------- for the port
+    # ------------------------------------------------------------------------------- for the port
 
     def due(self):
         """When something is to be done."""
@@ -110,7 +121,10 @@ class SerialDevice:
             self.receive(data, self._heard)
 
     def through(self, data, sent, read):
-        """Bytes after the line; as much noise as fits into their time where its ends are set to different rates."""
+        """Bytes after the line.
+
+        As much noise as fits into their time where its ends are set to different rates.
+        """
         if sent == read:
             return data
         return self._noise.bytes(math.ceil(len(data) * read / sent) if sent else 0)
@@ -121,11 +135,17 @@ class SerialDevice:
 
 
 class Terminal(threading.Thread):
-    """A pseudo-terminal, and the thread that serves it; it sleeps until bytes come, something is due, or LOOK_S."""
+    """A pseudo-terminal, and the thread that serves it.
+
+    It sleeps until bytes come, something is due, or LOOK_S.
+    """
 
     def __init__(self, device):
         super().__init__(name=f"emulated {Path(device.path).name}", daemon=True)
-        self._device, self._quit, self._master, self.open = device, False, None, False
+        self.open = False
+        self._device = device
+        self._quit = False
+        self._master = None
 
     there = property(lambda self: self._master is not None)
     rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
@@ -145,7 +165,7 @@ class Terminal(threading.Thread):
                 if self.there:
                     self._listen()
                 self._device.advance()
-        except Exception as error:  # a device that dies must say so: the next look at `error` shows it
+        except Exception as error:  # a device that dies must say so: a look at `error` shows it
             self._device.error = error
             raise
         finally:
@@ -159,9 +179,12 @@ class Terminal(threading.Thread):
         if event & select.POLLIN:
             with contextlib.suppress(OSError):
                 self._device.hear(os.read(self._master, 4096))
-        if self.open and event & select.POLLHUP:  # a port forgets what nobody read when it is closed
+        # a port forgets what nobody read when it is closed
+        if self.open and event & select.POLLHUP:
             with contextlib.suppress(OSError, termios.error):
-                slave = os.open(os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                slave = os.open(
+                    os.readlink(self._device.path), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK
+                )
                 termios.tcflush(slave, termios.TCIFLUSH)
                 os.close(slave)
         self.open = not event & select.POLLHUP
@@ -193,4 +216,5 @@ class Terminal(threading.Thread):
         if self.there:
             Path(self._device.path).unlink(missing_ok=True)
             os.close(self._master)
-            self._master, self.open = None, False
+            self._master = None
+            self.open = False

@@ -366,7 +366,7 @@ class EmulatedLms(SerialDevice):
     # ------------------------------------------------------------------------------------ scans
 
     def _turn_of(self, instant, turns, rounded):
-        """First turn of the scan that is being measured (math.floor), or of the next (math.ceil)."""
+        """First turn of the scan that is measured then (math.floor), or of the next (math.ceil)."""
         return rounded((instant - self._zero) / MIRROR_TURN / turns) * turns
 
     def _request(self, at):

@@ -1,6 +1,7 @@
-"""The one simulated world that all emulated devices look at, and its cameras as MJPEG over HTTP on this machine.
+"""The one simulated world that all emulated devices look at, and its cameras as MJPEG over HTTP.
 
-No image shows a head that moves: while it does none is sent, and one that was begun before a move is not sent after it.
+No image shows a head that moves: while it does none is sent, and one that was begun before a move
+is not sent after it.
 """
 
 import contextlib
@@ -34,12 +35,14 @@ class Place:
     """Where the board is; places are told apart by their key."""
 
     key: tuple
-    T_platform_board: RigidTransform | None = field(default=None, compare=False)  # None: no board, a table with things
-    stand: bool = field(default=True, compare=False)  # on its stand, or held by nothing close to a camera
+    # None: no board, a table with things
+    T_platform_board: RigidTransform | None = field(default=None, compare=False)
+    # on its stand, or held by nothing close to a camera
+    stand: bool = field(default=True, compare=False)
 
 
 class EmulatedWorld:
-    """The world of a simulated setup at the present; the source of the scans of :class:`EmulatedLms`.
+    """The world of a simulated setup at the present; the source of scans of :class:`EmulatedLms`.
 
     `placements` are where the board can be put; by default those of the setup.
     """
@@ -47,13 +50,21 @@ class EmulatedWorld:
     place = property(lambda self: self._scene[0], doc="Where the board is.")
 
     def __init__(self, setup, host=REAL, seed=0, placements=None):
-        self.setup, self.host, self.head = setup, host, Head(setup.rig.platform, seed)
+        self.setup = setup
+        self.host = host
+        self.head = Head(setup.rig.platform, seed)
         self.placements = {p.number: p for p in placements or placements_of(setup)}
-        self._rng, self._still = np.random.default_rng([seed, 3]), (None, None)
+        self._rng = np.random.default_rng([seed, 3])
+        # what a head at rest saw last, and without noise
+        self._still_key = None
+        self._still = None
         self.put(None)
 
     def put(self, number):
-        """Put the board at a placement; None takes it away. ValueError for one that the setup does not have."""
+        """Put the board at a placement; None takes it away.
+
+        ValueError for one that the setup does not have.
+        """
         if number is not None and number not in self.placements:
             known = ", ".join(map(str, self.placements))
             raise ValueError(f"no placement {number}; there are {known}, and none")
@@ -61,39 +72,73 @@ class EmulatedWorld:
         self._set(Place(("placement", number), pose))
 
     def hold_close(self, camera, view):
-        """Hold the board close to a camera, in one of the views for its intrinsics, counted from 0 (ValueError)."""
-        names, count = [c.name for c in self.setup.rig.cameras], self.setup.intrinsics_views
+        """Hold the board close to a camera, in one of the views for its intrinsics, from 0.
+
+        ValueError for a camera or view that there is not.
+        """
+        names = [c.name for c in self.setup.rig.cameras]
+        count = self.setup.intrinsics_views
         if camera not in names or not 0 <= view < count:
-            raise ValueError(f"no view {view} of camera '{camera}'; there are 0 to {count - 1} of {', '.join(names)}")
+            known = f"0 to {count - 1} of {', '.join(names)}"
+            raise ValueError(f"no view {view} of camera '{camera}'; there are {known}")
         pose = close_views(self.setup, names.index(camera))[view]
         self._set(Place(("close", camera, view), pose, stand=False))
 
     def _set(self, place):
+        # in one go, as a scan may be cast meanwhile
         self._scene = place, world_of(self.setup, place.T_platform_board, stand=place.stand)
 
     def scan(self, turn, quarters, times):
-        """Readings of a scan, whose first turn of the mirror, bearings (B,) in quarters of a degree and beams' instants
-        (B,), seconds of the devices, are given.
+        """Readings of a scan.
 
-        Ranges (B,), metres; index into `REASONS` (B,), 0 for a range; pitch (2,) of the head at the first and the last.
+        Parameters
+        ----------
+        turn : int
+            Of the mirror, the scan's first.
+        quarters : ndarray, shape (B,)
+            Bearings, quarters of a degree.
+        times : ndarray, shape (B,)
+            Instants of the beams, seconds of the devices.
+
+        Returns
+        -------
+        ranges : ndarray, shape (B,)
+            Metres.
+        reasons : ndarray, shape (B,)
+            Index into `REASONS`, 0 for a range.
+        pitch : ndarray, shape (2,)
+            Of the head at the first beam and the last, radians.
         """
-        (place, world), rig = self._scene, self.setup.rig
-        pitch, key = np.broadcast_to(self.head.pitch(times), times.shape), None
+        place, world = self._scene
+        rig = self.setup.rig
+        pitch = np.broadcast_to(self.head.pitch(times), times.shape)
+        key = None
         if np.ptp(pitch) < STILL:  # a head at rest sees the same again and again
             key = place.key, len(quarters), quarters[0], round(float(pitch[0]) / STILL)
-        if key is None or self._still[0] != key:
-            self._still = key, lrf.ideal_readings(rig.beam, world, np.radians(quarters / 4), pitch, rig.T_head_lrf)
-        return *lrf.measured(rig.beam, *self._still[1], self._rng), pitch[[np.argmin(times), np.argmax(times)]]
+        if key is None or self._still_key != key:
+            self._still_key = key
+            bearings = np.radians(quarters / 4)
+            self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
+        ranges, reasons = lrf.measured(rig.beam, *self._still, self._rng)
+        return ranges, reasons, pitch[[np.argmin(times), np.argmax(times)]]
 
 
 def scaled(rig, width):
     """The rig with images of another width, the same field of view."""
     cameras = []
     for camera in rig.cameras:
-        m, scale = camera.model, width / camera.model.width
-        changed = {"width": width, "height": round(m.height * scale), "fx": m.fx * scale, "fy": m.fy * scale}
-        changed |= {"cx": (m.cx + 0.5) * scale - 0.5, "cy": (m.cy + 0.5) * scale - 0.5}
-        cameras.append(replace(camera, model=replace(m, **changed)))
+        m = camera.model
+        scale = width / m.width
+        model = replace(
+            m,
+            width=width,
+            height=round(m.height * scale),
+            fx=m.fx * scale,
+            fy=m.fy * scale,
+            cx=(m.cx + 0.5) * scale - 0.5,
+            cy=(m.cy + 0.5) * scale - 0.5,
+        )
+        cameras.append(replace(camera, model=model))
     return replace(rig, cameras=tuple(cameras))
 
 
@@ -108,23 +153,37 @@ class CameraServer:
     world : EmulatedWorld
     seed : int
     rest_s : float
-        Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its image is wanted;
-        most stops of a sweep need none and are shorter.
+        Seconds that the head must rest before an image is drawn. Nobody tells a camera whether its
+        image is wanted; most stops of a sweep need none and are shorter.
     """
 
     def __init__(self, world, *, seed=0, rest_s=0.5):
-        self.world, self.seed, self.rest_s, self.quit = world, seed, rest_s, threading.Event()
+        self.world = world
+        self.seed = seed
+        self.rest_s = rest_s
+        self.quit = threading.Event()
         self.cameras = {camera.name: camera for camera in world.setup.rig.cameras}
-        self._imager = lru_cache(lambda name: Imager(self.cameras[name].model, self.cameras[name].exposure))
-        self._scene = lru_cache(2)(lambda place: world_of(world.setup, place.T_platform_board, stand=place.stand))
-        self._images, self._count, self._lock = {}, itertools.count(), threading.Lock()
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"server_of": self}))
+        self._imager = lru_cache(self._imager_of)
+        self._scene = lru_cache(2)(self._scene_of)
+        self._images = {}
+        self._count = itertools.count()
+        self._lock = threading.Lock()
+        handler = type("Handler", (_Handler,), {"server_of": self})
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
         self.host = f"127.0.0.1:{self._server.server_port}"
         self.url = f"http://{self.host}"
         self.token = secrets.token_urlsafe()
         self.control = f"{self.url}/{self.token}"
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        serve = self._server.serve_forever
+        self._thread = threading.Thread(target=serve, args=(0.2,), daemon=True)
         self.start = self._thread.start
+
+    def _imager_of(self, name):
+        camera = self.cameras[name]
+        return Imager(camera.model, camera.exposure)
+
+    def _scene_of(self, place):
+        return world_of(self.world.setup, place.T_platform_board, stand=place.stand)
 
     def close(self):
         """End the server, started or not, and wait for the end of a drawing."""
@@ -136,39 +195,53 @@ class CameraServer:
             self._images.clear()
 
     def image(self, name, timeout=1.0):
-        """What a camera's image shows (a key), and the image of the rig as it stands now, a JPEG file.
+        """The image of the rig as it stands now.
 
-        (None, None) where the head does not rest within the timeout, seconds, long enough to draw it.
+        Returns
+        -------
+        key : tuple or None
+            What it shows: see `_key`.
+        data : bytes or None
+            A JPEG file. None both where the head does not rest within the timeout, seconds, long
+            enough to draw it.
         """
         end = time.monotonic() + timeout
         while not self.quit.is_set() and time.monotonic() < end:
             with self._lock:
                 key = self._key(name)
-                if key is not None and self._images.get(name, (None,))[0] != key:
-                    self._images[name] = key, self._draw(*key, [self.seed, next(self._count)])
-                if key is not None and self._key(name) == key:
-                    return self._images[name]
+                if key is not None:
+                    if self._images.get(name, (None,))[0] != key:
+                        self._images[name] = key, self._draw(*key, [self.seed, next(self._count)])
+                    if self._key(name) == key:
+                        return self._images[name]
             self.quit.wait(LOOK_S)
         return None, None
 
     def _key(self, name):
-        """What the camera shows now: its name, the place, the pitch; None while the head moves or hardly rests."""
-        head, now = self.world.head, self.world.host.now()
+        """What the camera shows now: its name, the place, the pitch.
+
+        None while the head moves or hardly rests.
+        """
+        head = self.world.head
+        now = self.world.host.now()
         rests = head.settled(now) and head.resting(now)[0] >= self.rest_s + head.platform.settle
-        return (name, self.world.place, round(float(head.pitch(now)), 7)) if rests and not self.quit.is_set() else None
+        if not rests or self.quit.is_set():
+            return None
+        return name, self.world.place, round(float(head.pitch(now)), 7)
 
     def _draw(self, name, place, pitch, seed):
         """JPEG of what a camera sees."""
         pose = self.world.setup.rig.camera_pose(self.cameras[name], pitch)
         image = self._imager(name).render(self._scene(place), pose, np.random.default_rng(seed))
-        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        return encoded.tobytes()
 
 
 class _Handler(BaseHTTPRequestHandler):
     """Sends the images of a camera as a stream, or moves the board; see :mod:`http.server`."""
 
     def parse_request(self):
-        """Refuse what was sent to another name, as by a web page whose name leads to this machine."""
+        """Refuse what was sent to another name, as by a web page whose name leads here."""
         if not super().parse_request():
             return False
         known = self.headers["Host"] == self.server_of.host
@@ -190,7 +263,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             match self.path.strip("/").split("/"):
                 case [token, *_] if token != self.server_of.token:
-                    return self.send_error(403, "the address of devices.control in the rig file is needed")
+                    return self.send_error(
+                        403, "the address of devices.control in the rig file is needed"
+                    )
                 case [_, "place", number]:
                     world.put(None if number == "none" else int(number))
                 case [_, "close", camera, view]:
@@ -214,8 +289,9 @@ class _Handler(BaseHTTPRequestHandler):
                 if data is None:
                     self.wfile.write(b"\r\n")  # a blank line: the camera lives, its head moves
                 else:
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                    self.wfile.write(head.encode() + data + b"\r\n")
+                    length = f"Content-Length: {len(data)}\r\n\r\n".encode()
+                    head = b"--frame\r\nContent-Type: image/jpeg\r\n" + length
+                    self.wfile.write(head + data + b"\r\n")
                     server.quit.wait(1 / FPS)
 
     def log_message(self, *_):
