@@ -21,8 +21,10 @@ from lrfcal_lib.solvers import CANDIDATES
 
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
-    "about 1.2 m ahead, a little to the left, turned by a third of a turn, facing left by 30 degrees",
-    "about 2 m ahead, a little to the right, turned by another third of a turn, facing right by 30 degrees",
+    "about 1.2 m ahead, a little to the left, turned by a third of a turn, "
+    "facing left by 30 degrees",
+    "about 2 m ahead, a little to the right, turned by another third of a turn, "
+    "facing right by 30 degrees",
     "about 2.5 m ahead, higher or lower than before, leaning back by 30 degrees",
     "about 1 m ahead, turned by half a turn, leaning forward by 30 degrees",
     "about 1.7 m ahead, at the edge of what all cameras see",
@@ -36,7 +38,7 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: object = None
-    close: tuple | None = None  # camera and number of a view of the board held close, for its intrinsics
+    close: tuple | None = None  # of the board held close to a camera: its name, number of the view
 
 
 def next_task(recording, advice=""):
@@ -51,7 +53,8 @@ def next_task(recording, advice=""):
     plan = recording.rig.stated.plan
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
-        guidance = "hold the board close, tilted otherwise than before, all of its pattern in the image"
+        how = "tilted otherwise than before, all of its pattern in the image"
+        guidance = f"hold the board close, {how}"
         return Task(title, guidance, close=(camera, view))
 
     finished = recording.finished
@@ -126,7 +129,7 @@ def calibrate_recording(path):
         return Result(judged.answer, sentences, "", {}, None, calibration)
     method = handed_over(calibration)
     solutions = calibration.solutions
-    poses = {camera: pose_of(solutions[camera, name]) for camera, name in solutions if name == method}
+    poses = {c: pose_of(solutions[c, name]) for c, name in solutions if name == method}
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
     write_calibration(file, calibration_record(calibration, method, judged))
     sentences = tuple(judged.sentences())
@@ -170,15 +173,15 @@ class View:
     pitch: float = 0.0  # of the head, radians
     measured: bool = False  # the head tells its pitch
     frames: dict = field(default_factory=dict)  # newest Frame by camera
-    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement being recorded or recorded last
+    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement recorded last
     trouble: str = ""  # what cannot be seen, and why
 
 
 class Collector(Closed):
-    """Connects a rig, records placements with it and calibrates what was recorded; a context manager.
+    """Connects a rig, records with it and calibrates what was recorded; a context manager.
 
-    All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
-    at any time. What needs a rig raises DeviceError without one.
+    All methods may be called from any thread; two that need the devices exclude each other (Busy).
+    :meth:`stop` works at any time. What needs a rig raises DeviceError without one.
 
     Attributes
     ----------
@@ -219,11 +222,23 @@ class Collector(Closed):
         return () if self.recording is None else self.recording.finished
 
     def connect(self, rig, session):
-        """Open a rig and a session (a folder); a session that was recorded with the same rig goes on.
+        """Open a rig and a session; one that was recorded with the same rig goes on.
 
-        The rig is a rig file, or the name of an emulated rig. RigFileError if there is no such file or rig, or it
-        cannot be used; DeviceError if a device does not open (those opened before are closed again); SessionError or
-        RecordingError if the session states another rig, or cannot be written.
+        Parameters
+        ----------
+        rig : path-like or str
+            A rig file, or the name of an emulated rig.
+        session : path-like
+            Its folder.
+
+        Raises
+        ------
+        RigFileError
+            If there is no such file or rig, or it cannot be used.
+        DeviceError
+            If a device does not open; those opened before are closed again.
+        SessionError, RecordingError
+            If the session states another rig, or cannot be written.
         """
         self.close()
         with self._own(), contextlib.ExitStack() as stack:
@@ -266,11 +281,12 @@ class Collector(Closed):
 
     def _needed(self):
         if self.rig is None:
-            raise DeviceError("no rig is connected: name a rig file or an emulated rig, and press connect")
+            remedy = "name a rig file or an emulated rig, and press connect"
+            raise DeviceError(f"no rig is connected: {remedy}")
         return self.rig
 
     def move_to(self, pitch):
-        """Move the head to a pitch, radians; returns where it settled. OutOfRange beyond its limits."""
+        """Move the head to a pitch, radians; where it settled. OutOfRange beyond its limits."""
         rig = self._needed()
         with self._own():
             self.stopped.clear()
@@ -325,15 +341,28 @@ class Collector(Closed):
         return None if self.recording is None else next_task(self.recording, self._advice)
 
     def capture(self, progress=lambda share, text: None):
-        """Record the next task, the board being where it should, or put there by an emulated rig; the Lights of checks.
+        """Record the next task, the board being where it should; an emulated rig puts it there.
 
-        ``progress(share, text)`` is called after every event. DeviceError, RecordingError, or Interrupted if it was
-        stopped: the placement does not count.
+        Parameters
+        ----------
+        progress : callable
+            ``progress(share, text)`` is called after every event.
+
+        Returns
+        -------
+        list of Light
+            What the checks of the placement say.
+
+        Raises
+        ------
+        DeviceError, RecordingError, Interrupted
+            Or if it was stopped: the placement does not count.
         """
         self._needed()
         task = self.task()
         if task is None:
-            raise RecordingError("the plan of this rig is done: calibrate, or connect with another session")
+            remedy = "calibrate, or connect with another session"
+            raise RecordingError(f"the plan of this rig is done: {remedy}")
         with self._own():
             self.stopped.clear()
             if task.close:
@@ -390,13 +419,14 @@ class Collector(Closed):
         return self._advice
 
     def again(self):
-        """Take the placement recorded last out of the session, to record it again; returns its number.
+        """Take the placement recorded last out of the session, to record it again; its number.
 
         RecordingError if there is none.
         """
         self._needed()
         if not self.finished:
-            raise RecordingError("there is no placement to record again: press capture to record one")
+            remedy = "press capture to record one"
+            raise RecordingError(f"there is no placement to record again: {remedy}")
         with self._own():
             number = next(reversed(self.lights), self.finished[-1])
             self.recording.drop(number)
@@ -406,11 +436,12 @@ class Collector(Closed):
     def calibrate(self):
         """The Result of what was recorded so far; the recording can go on afterwards.
 
-        RecordingError if nothing was recorded yet, ValueError if it does not determine a calibration.
+        RecordingError if nothing was recorded yet, ValueError if it determines no calibration.
         """
         self._needed()
         if not self.finished:
-            raise RecordingError("nothing was recorded yet: capture at least three placements of the board")
+            remedy = "capture at least three placements of the board"
+            raise RecordingError(f"nothing was recorded yet: {remedy}")
         return calibrate_recording(self.recording.path)
 
 
