@@ -44,6 +44,18 @@ PICTURES = ("scene", "cloud", "clouds_of_boards", "frames")  # of the first scre
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
+USUAL_SECONDS = {  # by number, two at a time on two busy cores; only their ratios count
+    "00": 22.0,
+    "01": 28.0,
+    "02": 22.0,
+    "03": 29.0,
+    "04": 79.0,
+    "05": 64.0,
+    "06": 124.0,
+    "07": 117.0,
+    "08": 129.0,
+    "09": 144.0,
+}
 _CLIENTS = set()  # of the notebooks that are being executed
 MEASURED = ("combined", "fused", "likelihood", "half_step", "last_beam")  # edge lengths, the best way first
 
@@ -229,7 +241,7 @@ def _execute_all(paths, environment, jobs):
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:
-            _show_progress(futures)
+            _show_progress(futures, max(1, jobs))
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
@@ -241,21 +253,37 @@ def _execute_all(paths, environment, jobs):
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _show_progress(futures):
-    """Wait for notebooks (paths by future) with a bar, or where there is no terminal a line for each."""
+def _show_progress(futures, jobs):
+    """Wait for notebooks with a bar, or where there is no terminal a line for each.
+
+    `futures` are paths by future, each of a Run; so many `jobs` go on at the same time.
+    """
     progress = Progress()
-    with tqdm(total=len(futures), desc="notebooks", unit="notebook", disable=None) as bar:
+    count = len(futures)
+    total = sum(_usual_seconds(path) for path in futures.values())
+    usual = 0.0  # seconds of those that are done, and what they took
+    taken = 0.0
+    shape = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}]{postfix}"
+    with tqdm(total=count, desc="notebooks", bar_format=shape, disable=None) as bar:
         if bar.disable:
-            print(f"lrfcal: {len(futures)} notebooks begun", file=sys.stderr, flush=True)
+            print(f"lrfcal: {count} notebooks begun", file=sys.stderr, flush=True)
         for done, future in enumerate(as_completed(futures), start=1):
+            usual += _usual_seconds(futures[future])
+            taken += future.result().seconds
+            expected = total * taken / usual / jobs
             name = futures[future].stem
-            bar.set_postfix_str(name)
+            left = progress.left(progress.seconds / expected) if done < count else ""
+            words = ", ".join(filter(None, [name, left]))
+            bar.set_postfix_str(words)
             bar.update()
             if bar.disable:
-                words = f"{done} of {len(futures)} done after {duration(progress.seconds)} ({name})"
-                if left := progress.left(done / len(futures)):
-                    words = f"{words}, {left}"
-                print(f"lrfcal: {words}", file=sys.stderr, flush=True)
+                said = f"{done} of {count} done after {duration(progress.seconds)}"
+                print(f"lrfcal: {said} ({words})", file=sys.stderr, flush=True)
+
+
+def _usual_seconds(path):
+    """How long a notebook takes beside others, on the shipped session."""
+    return USUAL_SECONDS.get(path.stem[:2], 60.0)
 
 
 def _run(path, environment):
