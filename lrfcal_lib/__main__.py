@@ -3,29 +3,17 @@
 import argparse
 import sys
 
-FEW = 6  # placements
+FEW = 6  # placements, with fewer of which no error of the model shows
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def run(args):
-    """Do what a verb asks for; nothing is imported that another one needs."""
+    """Do what a verb asks for: its exit code or None. What another verb needs is not imported."""
     match args.verb:
         case "import":
-            from lrfcal_lib.session.importers import import_lasersetero
-
-            miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
-            print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+            return import_recording(args)
         case "check":
-            from lrfcal_lib.session.read import open_session, validate
-            from lrfcal_lib.session.stated import printable
-
-            problems = validate(args.session)
-            print("\n".join(problems) or f"{printable(args.session)}: nothing to complain about")
-            if problems:
-                return 1
-            count = len(open_session(args.session).board_placements)
-            if count < FEW:
-                print(f"warning: {count} placements of the board; {FEW} or more are needed to see errors of the model")
+            return check(args)
         case "calibrate":
             from lrfcal_lib.evaluate.export import calibrate_session
             from lrfcal_lib.session.cache import all_processors
@@ -41,7 +29,8 @@ def run(args):
         case "record":
             from lrfcal_lib.acquire.record import main
 
-            return main(args.rig_file, args.session, resume=args.resume, count=args.placements, mode=args.mode)
+            options = {"resume": args.resume, "count": args.placements, "mode": args.mode}
+            return main(args.rig_file, args.session, **options)
         case "report":
             from lrfcal_lib.report.report import main
 
@@ -50,6 +39,30 @@ def run(args):
             from lrfcal_lib.emulators.rig import main
 
             return main(args.setup, args.rig_file, seed=args.seed, feedback=args.feedback)
+
+
+def import_recording(args):
+    """Make a session of a recording by other people."""
+    from lrfcal_lib.session.importers import import_lasersetero
+
+    miss = import_lasersetero(args.src, args.dst, intrinsics=args.intrinsics)
+    print(f"{args.dst}: imported; the points rebuild to {1000 * miss:.4f} mm")
+
+
+def check(args):
+    """Say what is wrong with a session: 0 where nothing is, else 1."""
+    from lrfcal_lib.session.read import open_session, validate
+    from lrfcal_lib.session.stated import printable
+
+    problems = validate(args.session)
+    if problems:
+        print("\n".join(problems))
+        return 1
+    print(f"{printable(args.session)}: nothing to complain about")
+    count = len(open_session(args.session).board_placements)
+    if count < FEW:
+        needed = f"{FEW} or more are needed to see errors of the model"
+        print(f"warning: {count} placements of the board; {needed}")
     return 0
 
 
@@ -63,42 +76,102 @@ def how_many(text):
 
 def parser():
     """The command line, an ArgumentParser."""
-    top = argparse.ArgumentParser(prog="python -m lrfcal_lib", description=__doc__.replace("``", ""))
+    top = argparse.ArgumentParser(
+        prog="python -m lrfcal_lib", description=__doc__.replace("``", "")
+    )
     verbs = top.add_subparsers(title="verbs", metavar="VERB", dest="verb", required=True)
+    _add_import(verbs)
+    _add_sessions(verbs)
+    _add_rigs(verbs)
+    _add_report(verbs)
+    return top
+
+
+def _add_import(verbs):
     kinds = verbs.add_parser("import", help="make a session of a recording by other people")
     kinds = kinds.add_subparsers(title="recordings", metavar="KIND", required=True)
-    add = kinds.add_parser("lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)")
-    add.add_argument("src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m")
+    add = kinds.add_parser(
+        "lasersetero", help="LMS400 on a pitching stage + ZED (LaserSeteroCalibration)"
+    )
+    add.add_argument(
+        "src", help="folder with plane_NN.pcd, left_NN.png, right_NN.png, Calib_Results_*.m"
+    )
     add.add_argument("dst", help="folder of the new session")
-    choices = {"choices": ("own", "published"), "default": "own"}
-    add.add_argument("--intrinsics", **choices, help="estimate them from the images (default), or take the authors'")
+    add.add_argument(
+        "--intrinsics",
+        choices=("own", "published"),
+        default="own",
+        help="estimate them from the images (default), or take the authors'",
+    )
+
+
+def _add_sessions(verbs):
+    """Verbs that make or use a session without devices."""
     check = verbs.add_parser("check", help="say what is wrong with a session")
     check.add_argument("session")
+
     simulate = verbs.add_parser("simulate", help="record a session with a simulated rig")
     simulate.add_argument("setup", help="sim_lms221 or sim_quick, as shipped in data/")
     simulate.add_argument("dst", help="folder of the new session")
-    simulate.add_argument("--workers", type=int, default=2, help="processes that render images (default 2)")
+    simulate.add_argument(
+        "--workers", type=int, default=2, help="processes that render images (default 2)"
+    )
+
     calibrate = verbs.add_parser("calibrate", help="calibrate the rig of a session")
     calibrate.add_argument("session")
-    calibrate.add_argument("--out", help="folder of its files (default reports/<session> under this folder)")
+    calibrate.add_argument(
+        "--out", help="folder of its files (default reports/<session> under this folder)"
+    )
+
+
+def _add_rigs(verbs):
+    """Verbs that have to do with devices."""
     record = verbs.add_parser("record", help="record a session with a rig, real or emulated")
-    record.add_argument("rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)")
+    record.add_argument(
+        "rig_file", help="JSON: the rig, its devices and what to record ('emulate' writes one)"
+    )
     record.add_argument("session", help="folder of the new session")
-    record.add_argument("--resume", action="store_true", help="go on with a session; finished placements stay")
-    record.add_argument("--placements", type=how_many, metavar="N", help="record N placements of the plan")
-    record.add_argument("--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's")
+    record.add_argument(
+        "--resume", action="store_true", help="go on with a session; finished placements stay"
+    )
+    record.add_argument(
+        "--placements", type=how_many, metavar="N", help="record N placements of the plan"
+    )
+    record.add_argument(
+        "--mode", choices=("stop-and-go", "continuous"), help="instead of the plan's"
+    )
+
     emulate = verbs.add_parser("emulate", help="emulate the devices of a rig")
-    emulate.add_argument("setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221")
-    emulate.add_argument("--rig-file", help="write a new file for 'record', removed at the end unless changed")
+    emulate.add_argument(
+        "setup", nargs="?", default="sim_quick", help="sim_quick (default) or sim_lms221"
+    )
+    emulate.add_argument(
+        "--rig-file", help="write a new file for 'record', removed at the end unless changed"
+    )
     emulate.add_argument("--seed", type=int, default=0, help="of noise")
-    told = {"choices": ("full", "partial", "none"), "default": "full"}
-    emulate.add_argument("--feedback", **told, help="what the head tells of its position")
-    report = verbs.add_parser("report", help="execute the notebooks on a session and write what they found")
-    report.add_argument("sessions", nargs="*", metavar="session", help="folders of sessions (default: the shipped one)")
+    emulate.add_argument(
+        "--feedback",
+        choices=("full", "partial", "none"),
+        default="full",
+        help="what the head tells of its position",
+    )
+
+
+def _add_report(verbs):
+    report = verbs.add_parser(
+        "report", help="execute the notebooks on a session and write what they found"
+    )
+    report.add_argument(
+        "sessions",
+        nargs="*",
+        metavar="session",
+        help="folders of sessions (default: the shipped one)",
+    )
     report.add_argument("--out", help="folder of the report (default reports/<session>)")
     report.add_argument("--jobs", type=int, default=2, help="notebooks executed at the same time")
-    report.add_argument("--store", action="store_true", help="store the executed notebooks instead of a report")
-    return top
+    report.add_argument(
+        "--store", action="store_true", help="store the executed notebooks instead of a report"
+    )
 
 
 def main(argv=None):
@@ -112,8 +185,9 @@ def main(argv=None):
     Returns
     -------
     int
-        0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after Ctrl-C. ``record`` has
-        its own: 2 after a message that says what to do; ``calibrate`` has 3 where the verdict is 'no'.
+        0, 1 after a message on stderr (a ``ValueError`` is bad input, not a bug), 130 after
+        Ctrl-C. ``record`` has its own: 2 after a message that says what to do; ``calibrate`` has 3
+        where the verdict is 'no'.
     """
     args = parser().parse_args(argv)
     try:

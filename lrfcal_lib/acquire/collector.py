@@ -21,8 +21,10 @@ from lrfcal_lib.solvers import CANDIDATES
 
 GUIDE = (
     "about 1.5 m ahead, turned in its plane so that no edge is upright or level",
-    "about 1.2 m ahead, a little to the left, turned by a third of a turn, facing left by 30 degrees",
-    "about 2 m ahead, a little to the right, turned by another third of a turn, facing right by 30 degrees",
+    "about 1.2 m ahead, a little to the left, turned by a third of a turn, "
+    "facing left by 30 degrees",
+    "about 2 m ahead, a little to the right, turned by another third of a turn, "
+    "facing right by 30 degrees",
     "about 2.5 m ahead, higher or lower than before, leaning back by 30 degrees",
     "about 1 m ahead, turned by half a turn, leaning forward by 30 degrees",
     "about 1.7 m ahead, at the edge of what all cameras see",
@@ -36,26 +38,59 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: object = None
-    close: tuple | None = None  # camera and number of a view of the board held close, for its intrinsics
+    close: tuple | None = None  # of the board held close to a camera: its name, number of the view
 
 
 def next_task(recording, advice=""):
-    """The Task that is next in a recording, None where the plan is done; `advice` says where to put the board."""
-    plan, finished = recording.rig.stated.plan, recording.finished
+    """What to record next, a Task; None where the plan is done.
+
+    Parameters
+    ----------
+    recording : Recording
+    advice : str
+        Where to put the board, instead of the guide.
+    """
+    plan = recording.rig.stated.plan
     for camera, view in recording.close_views_to_do():
         title = f"Close view {view + 1} of {plan.intrinsics_images}, camera '{camera}'"
-        guidance = "hold the board close, tilted otherwise than before, all of its pattern in the image"
+        how = "tilted otherwise than before, all of its pattern in the image"
+        guidance = f"hold the board close, {how}"
         return Task(title, guidance, close=(camera, view))
+
+    finished = recording.finished
     left = recording.to_do()
     if not left and not plan.placements:  # nothing is listed: one more can always be had
         left = [p for p in plan.to_do(max(finished) + 1) if p.number not in finished]
     if not left:
         return None
+    placement = left[0]
     done = sum(p.number in finished for p in recording.plan)
     guidance = advice or f"put the board {GUIDE[done % len(GUIDE)]}"
-    if left[0].purpose == "scene":
+    if placement.purpose == "scene":
         guidance = "take the board away: this sweep shows the room"
-    return Task(f"Placement {done + 1} of {max(len(recording.plan), left[0].number)}", guidance, left[0])
+    count = max(len(recording.plan), placement.number)
+    return Task(f"Placement {done + 1} of {count}", guidance, placement)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a camera is, as people read it: degrees and millimetres, three of each."""
+
+    turn: np.ndarray  # rotation vector
+    shift: np.ndarray
+    turn_sigma: np.ndarray
+    shift_sigma: np.ndarray
+
+
+def pose_of(solution):
+    """The Pose of a camera's Solution."""
+    sigma = solution.trusted_sigma
+    return Pose(
+        turn=np.degrees(solution.transform.rotation.as_rotvec()),
+        shift=1000 * solution.transform.translation,
+        turn_sigma=np.degrees(sigma[:3]),
+        shift_sigma=1000 * sigma[3:6],
+    )
 
 
 @dataclass(frozen=True)
@@ -65,29 +100,40 @@ class Result:
     answer: str  # whether to trust it: yes, with care, no
     sentences: tuple
     method: str  # whose poses are handed over; '' where none is
-    poses: dict  # by camera: rotation vector (deg), translation (mm), and their standard deviations, each (3,)
+    poses: dict  # Pose by camera
     file: Path | None  # calibration.json
     calibration: object
 
 
 def calibrate_recording(path):
-    """The Result of a session that may still be growing, with ``<session>_calibration/calibration.json`` beside it.
+    """Calibrate a session that may still be growing.
 
-    ValueError if the session cannot be used.
+    Parameters
+    ----------
+    path : Path
+        Of the session; ``<session>_calibration/calibration.json`` is written beside it.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    ValueError
+        If the session cannot be used.
     """
-    found = calibrate(open_session(path), CANDIDATES)
-    judged, poses = judge(found), {}
+    calibration = calibrate(open_session(path), CANDIDATES)
+    judged = judge(calibration)
     if not judged.errors:
-        return Result(judged.answer, (*judged.sentences(), "Nothing is written."), "", {}, None, found)
-    method = handed_over(found)
-    for (camera, name), solution in found.solutions.items():
-        if name == method:
-            scale, pose = np.repeat([np.degrees(1), 1000.0], 3), solution.transform
-            values = np.concatenate([pose.rotation.as_rotvec(), pose.translation, solution.trusted_sigma[:6]])
-            poses[camera] = tuple((values.reshape(2, 6) * scale).reshape(4, 3))
+        sentences = (*judged.sentences(), "Nothing is written.")
+        return Result(judged.answer, sentences, "", {}, None, calibration)
+    method = handed_over(calibration)
+    solutions = calibration.solutions
+    poses = {c: pose_of(solutions[c, name]) for c, name in solutions if name == method}
     file = path.with_name(f"{path.name}_calibration") / "calibration.json"
-    write_calibration(file, calibration_record(found, method, judged))
-    return Result(judged.answer, tuple(judged.sentences()), method, poses, file, found)
+    write_calibration(file, calibration_record(calibration, method, judged))
+    sentences = tuple(judged.sentences())
+    return Result(judged.answer, sentences, method, poses, file, calibration)
 
 
 def advise(session):
@@ -127,15 +173,15 @@ class View:
     pitch: float = 0.0  # of the head, radians
     measured: bool = False  # the head tells its pitch
     frames: dict = field(default_factory=dict)  # newest Frame by camera
-    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement being recorded or recorded last
+    rows: dict = field(default_factory=dict)  # ranges by pitch, of the placement recorded last
     trouble: str = ""  # what cannot be seen, and why
 
 
 class Collector(Closed):
-    """Connects a rig, records placements with it and calibrates what was recorded; a context manager.
+    """Connects a rig, records with it and calibrates what was recorded; a context manager.
 
-    All methods may be called from any thread; two that need the devices exclude each other (Busy). :meth:`stop` works
-    at any time. What needs a rig raises DeviceError without one.
+    All methods may be called from any thread; two that need the devices exclude each other (Busy).
+    :meth:`stop` works at any time. What needs a rig raises DeviceError without one.
 
     Attributes
     ----------
@@ -145,43 +191,65 @@ class Collector(Closed):
     recording : Recording or None
     """
 
-    connected = property(lambda self: self.rig is not None, doc="Whether a rig is open.")
-    emulated = property(lambda self: self.connected and self.rig.stated.devices.control is not None,
-                        doc="Whether the board moves by itself.")  # fmt: skip
-    limits_deg = property(lambda self: self._needed().stated.devices.head.pitch_limits_deg,
-                          doc="Lowest and highest pitch of the head.")  # fmt: skip
-    finished = property(lambda self: () if self.recording is None else self.recording.finished,
-                        doc="Numbers of the placements that are recorded and safe.")  # fmt: skip
-
     def __init__(self):
-        self.rig, self.recording = None, None
-        self.view, self.lights, self._told = View(), {}, ""
-        self._devices, self.stopped, self._closing = threading.Lock(), threading.Event(), contextlib.ExitStack()
+        self.rig = None
+        self.recording = None
+        self.view = View()
+        self.lights = {}
+        self.stopped = threading.Event()
+        self._advice = ""
+        self._devices = threading.Lock()
+        self._closing = contextlib.ExitStack()
+
+    @property
+    def connected(self):
+        """Whether a rig is open."""
+        return self.rig is not None
+
+    @property
+    def emulated(self):
+        """Whether the board moves by itself."""
+        return self.connected and self.rig.stated.devices.control is not None
+
+    @property
+    def limits_deg(self):
+        """Lowest and highest pitch of the head."""
+        return self._needed().stated.devices.head.pitch_limits_deg
+
+    @property
+    def finished(self):
+        """Numbers of the placements that are recorded and safe."""
+        return () if self.recording is None else self.recording.finished
 
     def connect(self, rig, session):
-        """Open a rig and a session (a folder); a session that was recorded with the same rig goes on.
+        """Open a rig and a session; one that was recorded with the same rig goes on.
 
-        The rig is a rig file, or the name of an emulated rig. RigFileError if there is no such file or rig, or it
-        cannot be used; DeviceError if a device does not open (those opened before are closed again); SessionError or
-        RecordingError if the session states another rig, or cannot be written.
+        Parameters
+        ----------
+        rig : path-like or str
+            A rig file, or the name of an emulated rig.
+        session : path-like
+            Its folder.
+
+        Raises
+        ------
+        RigFileError
+            If there is no such file or rig, or it cannot be used.
+        DeviceError
+            If a device does not open; those opened before are closed again.
+        SessionError, RecordingError
+            If the session states another rig, or cannot be written.
         """
         self.close()
         with self._own(), contextlib.ExitStack() as stack:
-            if str(rig) in PRACTICE_RIGS:
-                from lrfcal_lib.emulators.rig import emulated
-
-                made, data = emulated(str(rig))
-                stack.enter_context(made)
-                stated = rig_of(data(), Path(f"emulated {made.setup.name}"))
-            elif not Path(rig).suffix and not Path(rig).exists():
-                known = ", ".join(PRACTICE_RIGS)
-                raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
-            else:
-                stated = read_rig_file(rig)
-            opened = stack.enter_context(Rig.open(stated))
+            opened = stack.enter_context(Rig.open(_stated(rig, stack)))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
-            self.rig, self.recording, self._closing = opened, recording, stack.pop_all()
-            self.view, self.lights, self._told = View(), {}, ""
+            self.rig = opened
+            self.recording = recording
+            self._closing = stack.pop_all()
+            self.view = View()
+            self.lights = {}
+            self._advice = ""
 
     def close(self):
         """Stop the head, finish the session, close all devices; a second call does nothing.
@@ -192,9 +260,11 @@ class Collector(Closed):
             return
         self.stop()
         with self._own():
-            rig, recording, closing = self.rig, self.recording, self._closing
-            self.rig = self.recording = None
-            with closing:
+            rig = self.rig
+            recording = self.recording
+            self.rig = None
+            self.recording = None
+            with self._closing:
                 rig.halt()
                 if recording.finished:
                     recording.finish()
@@ -211,20 +281,23 @@ class Collector(Closed):
 
     def _needed(self):
         if self.rig is None:
-            raise DeviceError("no rig is connected: name a rig file or an emulated rig, and press connect")
+            remedy = "name a rig file or an emulated rig, and press connect"
+            raise DeviceError(f"no rig is connected: {remedy}")
         return self.rig
 
     def move_to(self, pitch):
-        """Move the head to a pitch, radians; returns where it settled. OutOfRange beyond its limits."""
+        """Move the head to a pitch, radians; where it settled. OutOfRange beyond its limits."""
         rig = self._needed()
         with self._own():
             self.stopped.clear()
-            self.view.pitch, self.view.measured = rig.head.move_to(pitch), rig.head.has_feedback
+            self.view.pitch = rig.head.move_to(pitch)
+            self.view.measured = rig.head.has_feedback
         return self.view.pitch
 
     def stop(self):
         """Stop the head at once, and whatever was under way; returns when it has ended."""
-        rig, end = self.rig, time.monotonic() + WAIT_S
+        rig = self.rig
+        end = time.monotonic() + WAIT_S
         self.stopped.set()
         while rig is not None and time.monotonic() < end:
             rig.head.emergency_stop()  # again: the next move of a sweep may have begun in between
@@ -237,9 +310,11 @@ class Collector(Closed):
 
         What could not be read is said in `trouble`; nothing is raised for it.
         """
-        rig, view, troubles = self.rig, self.view, []
+        rig = self.rig
+        view = self.view
         if rig is None:
             return view
+        troubles = []
         for name, camera in rig.cameras.items():
             try:
                 view.frames[name] = camera.newest(timeout=0)
@@ -251,12 +326,9 @@ class Collector(Closed):
         if self._devices.acquire(blocking=False):
             try:
                 view.pitch, view.measured = rig.head.pitch()
-                try:
-                    reading = rig.lrf.request()
-                except LineLost:
-                    rig.lrf.reconnect(RECONNECT_S)
-                    reading = rig.lrf.request()
-                view.ranges, view.bearings = reading.ranges, reading.bearings
+                reading = _scan(rig.lrf)
+                view.ranges = reading.ranges
+                view.bearings = reading.bearings
             except DeviceError as error:
                 troubles.append(str(error))
             finally:
@@ -266,68 +338,95 @@ class Collector(Closed):
 
     def task(self):
         """What to record next, a Task; None where the plan is done."""
-        return None if self.recording is None else next_task(self.recording, self._told)
+        return None if self.recording is None else next_task(self.recording, self._advice)
 
     def capture(self, progress=lambda share, text: None):
-        """Record the next task, the board being where it should, or put there by an emulated rig; the Lights of checks.
+        """Record the next task, the board being where it should; an emulated rig puts it there.
 
-        ``progress(share, text)`` is called after every event. DeviceError, RecordingError, or Interrupted if it was
-        stopped: the placement does not count.
+        Parameters
+        ----------
+        progress : callable
+            ``progress(share, text)`` is called after every event.
+
+        Returns
+        -------
+        list of Light
+            What the checks of the placement say.
+
+        Raises
+        ------
+        DeviceError, RecordingError, Interrupted
+            Or if it was stopped: the placement does not count.
         """
         self._needed()
         task = self.task()
         if task is None:
-            raise RecordingError("the plan of this rig is done: calibrate, or connect with another session")
+            remedy = "calibrate, or connect with another session"
+            raise RecordingError(f"the plan of this rig is done: {remedy}")
         with self._own():
             self.stopped.clear()
             if task.close:
                 self.rig.hold_close(*task.close)
                 return [self.recording.run_close(task.close[0])]
-            number, self.view.rows = task.placement.number, {}
+            number = task.placement.number
+            self.view.rows = {}
             self.rig.move_board(number)
-            with contextlib.closing(self.recording.run(task.placement)) as events:
-                try:
-                    for event in events:
-                        self._note(event, progress)
-                        if self.stopped.is_set():
-                            raise DeviceError("stopped")
-                except DeviceError as error:
-                    if not self.stopped.is_set():
-                        raise
-                    raise Interrupted(f"stopped: placement {number} does not count, record it again") from error
+            self._record(task.placement, progress)
         progress(1.0, "checking what was recorded")
-        scenes = {placement.number for placement in self.recording.plan if placement.purpose == "scene"}
-        enough = len({*self.finished} - scenes) >= ADVICE_FROM
-        self.lights[number] = self.recording.check(number, self._advise if enough else None)
+        self.lights[number] = self.recording.check(number, self._adviser())
         return self.lights[number]
+
+    def _record(self, placement, progress):
+        """Record a placement; Interrupted if the user stops it."""
+        with contextlib.closing(self.recording.run(placement)) as events:
+            try:
+                for event in events:
+                    self._note(event, progress)
+                    if self.stopped.is_set():
+                        raise DeviceError("stopped")
+            except DeviceError as error:
+                if not self.stopped.is_set():
+                    raise
+                words = f"placement {placement.number} does not count, record it again"
+                raise Interrupted(f"stopped: {words}") from error
+
+    def _adviser(self):
+        """What says where the next board helps most; None while every other one does."""
+        scenes = {p.number for p in self.recording.plan if p.purpose == "scene"}
+        enough = len({*self.finished} - scenes) >= ADVICE_FROM
+        return self._advise if enough else None
 
     def _note(self, event, progress):
         """Put an event into the view."""
         view = self.view
         if isinstance(event, Moved):
-            view.pitch, view.measured = event.pitch, event.measured
+            view.pitch = event.pitch
+            view.measured = event.measured
             progress((event.number - 1) / event.of, f"stop {event.number} of {event.of}")
         elif isinstance(event, Scanned):
             for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
                 view.rows[pitch] = reading.ranges
-                view.ranges, view.bearings, view.pitch = reading.ranges, reading.bearings, pitch
+                view.ranges = reading.ranges
+                view.bearings = reading.bearings
+                view.pitch = pitch
             if np.isfinite(event.share):
                 progress(event.share, f"{100 * event.share:.0f} % of the sweep")
         elif isinstance(event, Photographed):
             view.frames[event.camera] = event.frame
 
     def _advise(self, session):
-        self._told = advise(session)
-        return self._told
+        self._advice = advise(session)
+        return self._advice
 
     def again(self):
-        """Take the placement recorded last out of the session, to record it again; returns its number.
+        """Take the placement recorded last out of the session, to record it again; its number.
 
         RecordingError if there is none.
         """
         self._needed()
         if not self.finished:
-            raise RecordingError("there is no placement to record again: press capture to record one")
+            remedy = "press capture to record one"
+            raise RecordingError(f"there is no placement to record again: {remedy}")
         with self._own():
             number = next(reversed(self.lights), self.finished[-1])
             self.recording.drop(number)
@@ -337,9 +436,33 @@ class Collector(Closed):
     def calibrate(self):
         """The Result of what was recorded so far; the recording can go on afterwards.
 
-        RecordingError if nothing was recorded yet, ValueError if it does not determine a calibration.
+        RecordingError if nothing was recorded yet, ValueError if it determines no calibration.
         """
         self._needed()
         if not self.finished:
-            raise RecordingError("nothing was recorded yet: capture at least three placements of the board")
+            remedy = "capture at least three placements of the board"
+            raise RecordingError(f"nothing was recorded yet: {remedy}")
         return calibrate_recording(self.recording.path)
+
+
+def _stated(rig, stack):
+    """The RigFile of a rig file, or of an emulated rig, which lives as long as the stack."""
+    if str(rig) in PRACTICE_RIGS:
+        from lrfcal_lib.emulators.rig import emulated
+
+        devices, data = emulated(str(rig))
+        stack.enter_context(devices)
+        return rig_of(data(), Path(f"emulated {devices.setup.name}"))
+    if not Path(rig).suffix and not Path(rig).exists():
+        known = ", ".join(PRACTICE_RIGS)
+        raise RigFileError(f"there is no rig file or emulated rig '{rig}'; emulated are {known}")
+    return read_rig_file(rig)
+
+
+def _scan(lrf):
+    """A Reading, after a reconnection where the line was lost."""
+    try:
+        return lrf.request()
+    except LineLost:
+        lrf.reconnect(RECONNECT_S)
+        return lrf.request()

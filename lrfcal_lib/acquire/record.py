@@ -1,4 +1,4 @@
-"""A recording: the events of a rig written to a session; ``python -m lrfcal_lib record`` asks for the board."""
+"""A recording: the events of a rig written to a session; ``record`` asks for the board."""
 
 import contextlib
 import logging
@@ -21,9 +21,14 @@ from lrfcal_lib.session.write import SessionRecorder, not_written
 
 FAILED, INTERRUPTED = 2, 130  # exit codes
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
-HOW = {
-    "stop-and-go": "stop-and-go: the head rests at every pitch step, scans and images are taken at rest",
-    "continuous": "continuous: scans are taken while the head moves, each with the pitch at its middle beam",
+HOW = {  # a session was recorded, by the mode of the plan
+    "stop-and-go": (
+        "stop-and-go: the head rests at every pitch step, scans and images are taken at rest"
+    ),
+    "continuous": (
+        "continuous: scans are taken while the head moves, "
+        "each with the pitch at its middle beam"
+    ),
 }
 
 
@@ -48,7 +53,7 @@ class Recording(Closed):
     Raises
     ------
     SessionError
-        If `path` exists (without `resume`), states another rig, or is being recorded by somebody else.
+        If `path` exists (without `resume`), states another rig, or is recorded by somebody else.
     RecordingError
         If the session cannot be written.
 
@@ -64,23 +69,47 @@ class Recording(Closed):
     ...     recording.finish()
     """
 
-    finished = property(lambda self: self.writer.finished, doc="Numbers of the placements that are complete and safe.")
-
     def __init__(self, rig, path, *, resume=False, count=None):
-        self.rig, self.path, self.plan, stated = rig, Path(path), rig.stated.plan.to_do(count), rig.stated
-        reference = {
-            "recording": HOW[stated.plan.mode],
-            "pitch": "told by the head" if rig.head.has_feedback else "dead reckoning: the head does not tell it",
-            "scene_placements": [placement.number for placement in self.plan if placement.purpose == "scene"],
-        }
-        about = {**stated.about, "source": stated.about["source"] or f"recorded with {stated.path.name}",
-                 "reference": reference, "platform_sigma": stated.platform_sigma, "resume": resume}  # fmt: skip
+        self.rig = rig
+        self.path = Path(path)
+        self.plan = rig.stated.plan.to_do(count)
         with self._safely(), contextlib.ExitStack() as stack:
-            writer = SessionRecorder(self.path, stated.board, rig.lrf_info, stated.cameras.values(), stated.T_head_lrf,
-                                     **about)  # fmt: skip
+            writer = self._open(resume)
             stack.callback(writer.close)
             writer.add_telegrams(-1, rig.begin_telegrams(), time_s=rig.clock())
-            self.writer, _ = writer, stack.pop_all()
+            self.writer = writer
+            stack.pop_all()
+
+    def _open(self, resume):
+        """The session, to write to."""
+        rig = self.rig
+        stated = rig.stated
+        pitch = "dead reckoning: the head does not tell it"
+        if rig.head.has_feedback:
+            pitch = "told by the head"
+        reference = {
+            "recording": HOW[stated.plan.mode],
+            "pitch": pitch,
+            "scene_placements": [p.number for p in self.plan if p.purpose == "scene"],
+        }
+        about = dict(stated.about)
+        about["source"] = about["source"] or f"recorded with {stated.path.name}"
+        return SessionRecorder(
+            self.path,
+            stated.board,
+            rig.lrf_info,
+            stated.cameras.values(),
+            stated.T_head_lrf,
+            platform_sigma=stated.platform_sigma,
+            reference=reference,
+            resume=resume,
+            **about,
+        )
+
+    @property
+    def finished(self):
+        """Numbers of the placements that are complete and safe."""
+        return self.writer.finished
 
     def close(self):
         """Record nothing any more: the session is free for others, who may go on with it."""
@@ -91,15 +120,17 @@ class Recording(Closed):
         return [placement for placement in self.plan if placement.number not in self.finished]
 
     def close_views_to_do(self):
-        """Images of the board held close still to be taken: camera and number of the view, counted from 0."""
-        wanted, taken = self.rig.stated.plan.intrinsics_images, self.writer.shots_of("intrinsics")
+        """Images of the board held close still to be taken: camera, number of the view from 0."""
+        wanted = self.rig.stated.plan.intrinsics_images
+        taken = self.writer.shots_of("intrinsics")
         return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
 
     def run(self, placement):
-        """Record a placement of :meth:`to_do`: a generator that yields every event of the rig once it is on the disk.
+        """Record a placement of :meth:`to_do`, and yield every event once it is on the disk.
 
-        When the generator ends the placement is finished. When it is closed or raises (DeviceError, or RecordingError
-        if the disk is full or gone), the head is stopped and the placement is not part of the session.
+        When the generator ends the placement is finished. When it is closed or raises (DeviceError,
+        or RecordingError if the disk is full or gone), the head is stopped and the placement is not
+        part of the session.
         """
         with self._safely():
             self.writer.begin_placement(placement.number)
@@ -111,7 +142,10 @@ class Recording(Closed):
             self.writer.finish_placement()
 
     def run_close(self, camera):
-        """Take an image of the board held close to a camera; the Light is 'bad' where it was not kept: no pattern."""
+        """Take an image of the board held close to a camera: its Light.
+
+        It is 'bad' where the image shows no pattern and was not kept.
+        """
         with contextlib.closing(self.rig.acquire_close(camera)) as events:
             *_, event = events
         model = self.rig.stated.cameras[camera].model
@@ -143,33 +177,53 @@ class Recording(Closed):
         """What is safe on the disk and, if asked for, how to go on; half a sentence."""
         there = self._readable()
         if there is None or set(self.finished) - there:
-            return "the session was removed or damaged while it was recorded: record again, to another folder"
+            lost = "the session was removed or damaged while it was recorded"
+            return f"{lost}: record again, to another folder"
         numbers = ", ".join(map(str, self.finished))
         safe = f"placements {numbers} are safe" if numbers else "no placement was finished"
         return f"{safe}; --resume goes on from there" if resume else safe
 
     def _readable(self):
-        """Numbers of the finished placements that a reader finds with their scans; None where there is no session."""
+        """Finished placements that a reader finds with their scans; None without a session."""
         try:
-            return set(open_session(self.path).scans["placement"].tolist()) & set(self.finished)
+            found = set(open_session(self.path).scans["placement"].tolist())
         except (SessionError, OSError):
             return None if self.finished or not self.path.exists() else set()
+        return found & set(self.finished)
 
     def write(self, event):
         """Put an event on the disk; the parts of an interlaced scan share its pitch."""
         writer = self.writer
         with self._safely():
             if isinstance(event, Moved):
-                writer.add_platform([(event.time_s, event.commanded, event.pitch if event.measured else math.nan)])
+                measured = event.pitch if event.measured else math.nan
+                writer.add_platform([(event.time_s, event.commanded, measured)])
             elif isinstance(event, Scanned):
-                rows = [(raw, pitch, one.time_s) for one, pitch in zip(event.readings, event.pitch, strict=True)
-                        for raw in one.telegrams]  # fmt: skip
-                writer.add_telegrams(event.placement, *zip(*rows, strict=True))
+                self._write_scans(event)
             elif isinstance(event, Photographed):
-                about = {"pitch": event.pitch, "time_s": event.frame.time_s, "purpose": event.purpose}
-                writer.add_image(event.camera, event.frame.image, event.placement, **about)
+                writer.add_image(
+                    event.camera,
+                    event.frame.image,
+                    event.placement,
+                    pitch=event.pitch,
+                    time_s=event.frame.time_s,
+                    purpose=event.purpose,
+                )
             elif isinstance(event, Tracked):
-                writer.add_platform([(t, event.commanded, pitch) for t, pitch, measured in event.track if measured])
+                known = [(t, pitch) for t, pitch, measured in event.track if measured]
+                writer.add_platform([(t, event.commanded, pitch) for t, pitch in known])
+
+    def _write_scans(self, event):
+        """Put the telegrams of readings on the disk."""
+        telegrams = []
+        pitches = []
+        times = []
+        for reading, pitch in zip(event.readings, event.pitch, strict=True):
+            for raw in reading.telegrams:
+                telegrams.append(raw)
+                pitches.append(pitch)
+                times.append(reading.time_s)
+        self.writer.add_telegrams(event.placement, telegrams, pitches, times)
 
     @contextlib.contextmanager
     def _safely(self):
@@ -247,16 +301,22 @@ def show(light, name=None):
 
 
 def record_session(rig, path, *, resume=False, count=None):
-    """Record a session with an open rig, from the first placement that is missing to the last of the plan.
+    """Record a session with an open rig, from the first placement that is missing to the last.
 
     Parameters
     ----------
     rig, path, resume, count
-        As of :class:`Recording`, which is returned: finished, with all placements or those that the user wanted.
+        As of :class:`Recording`.
+
+    Returns
+    -------
+    Recording
+        Finished, with all placements or those that the user wanted.
 
     Raises
     ------
     DeviceError, SessionError, RecordingError
+        With a note that says what is safe.
     """
     with Recording(rig, path, resume=resume, count=count) as recording:
         if recording.finished:
@@ -265,7 +325,7 @@ def record_session(rig, path, *, resume=False, count=None):
             _close_views(recording)
             _placements(recording)
             recording.finish()
-        except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:  # SystemExit: a signal
+        except (DeviceError, SessionError, KeyboardInterrupt, SystemExit) as error:
             error.add_note(recording.safe(resume=True))
             raise
     return recording
@@ -275,7 +335,8 @@ def _close_views(recording):
     """Images for the intrinsics; by hand each until it shows the pattern."""
     wanted = recording.rig.stated.plan.intrinsics_images
     for camera, view in recording.close_views_to_do():
-        title, kept = f"camera '{camera}', view {view + 1} of {wanted}", False
+        title = f"camera '{camera}', view {view + 1} of {wanted}"
+        kept = False
         while not kept:
             emulated = recording.rig.hold_close(camera, view)
             if not emulated:
@@ -287,16 +348,14 @@ def _close_views(recording):
 
 def _placements(recording):
     """Each placement that is missing; the user may have the one before again (r), or end (q)."""
-    before, of = None, len(recording.plan)
+    before = None
+    of = len(recording.plan)
     recorded = []  # seconds of each placement of this run
     while todo := recording.to_do():
-        placement, answer = todo[0], ""
+        placement = todo[0]
+        answer = ""
         if not recording.rig.move_board(placement.number):
-            again = "" if before is None else f", r: placement {before} again"
-            what = "take the board away" if placement.purpose == "scene" else "put the board"
-            text = f"placement {placement.number}: {what}, then press Enter{again} (q: end here) "
-            while (answer := ask(text)) not in ("", "q", "r" if again else ""):
-                pass
+            answer = _ask_for_board(placement, before)
         if answer == "q":
             return
         if answer == "r":
@@ -314,11 +373,38 @@ def _placements(recording):
             print(f"  {left} of {of} placements left: about {expected} of recording", flush=True)
 
 
-def main(rig_file, path, *, resume=False, count=None, mode=None):
-    """Record from the command line; options as of :func:`record_session`, `mode` instead of the plan's.
+def _ask_for_board(placement, before):
+    """Wait until the board is where it should be: '', or what else the user wants, 'q' or 'r'."""
+    what = "put the board"
+    if placement.purpose == "scene":
+        what = "take the board away"
+    again = ""
+    possible = ["", "q"]
+    if before is not None:
+        again = f", r: placement {before} again"
+        possible.append("r")
+    text = f"placement {placement.number}: {what}, then press Enter{again} (q: end here) "
+    while (answer := ask(text)) not in possible:
+        pass
+    return answer
 
-    0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number after a signal. The head
-    is stopped in any case.
+
+def main(rig_file, path, *, resume=False, count=None, mode=None):
+    """Record from the command line.
+
+    Parameters
+    ----------
+    rig_file, path : path-like
+    resume, count
+        As of :func:`record_session`.
+    mode : str, optional
+        Instead of the plan's.
+
+    Returns
+    -------
+    int
+        0; 2 after a message on stderr that says what to do; 130 after Ctrl-C, 128 and its number
+        after a signal. The head is stopped in any case.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     try:
@@ -327,11 +413,14 @@ def main(rig_file, path, *, resume=False, count=None, mode=None):
         with Rig.open(stated) as rig:
             recording = record_session(rig, path, resume=resume, count=count)
     except (DeviceError, RecordingError, ValueError, KeyboardInterrupt, SystemExit) as error:
-        text, code = f"error: {error}", FAILED
+        text = f"error: {error}"
+        code = FAILED
         if isinstance(error, KeyboardInterrupt):
-            text, code = "\nstopped by Ctrl-C", INTERRUPTED
+            text = "\nstopped by Ctrl-C"
+            code = INTERRUPTED
         elif isinstance(error, SystemExit):
-            text, code = f"\nstopped by {signal.Signals(error.code - 128).name}", error.code
+            text = f"\nstopped by {signal.Signals(error.code - 128).name}"
+            code = error.code
         with contextlib.suppress(OSError):  # after SIGHUP the terminal may be gone
             print("; ".join([text, *getattr(error, "__notes__", [])]), file=sys.stderr)
         return code

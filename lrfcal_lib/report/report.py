@@ -41,10 +41,24 @@ OWN_FILES = (  # folders, files to link to, the page itself
     "findings.json", "index.html",
 )  # fmt: skip
 BESIDE = ("Expected error", "In the image of")  # begin sentences of a verdict that the first screen tells in numbers
-AT_WORKING_FOLDER, EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux, see renameat2(2)
+AT_WORKING_FOLDER = -100  # AT_FDCWD, see renameat2(2)
+EXCHANGE = 2  # RENAME_EXCHANGE of Linux
+PICTURES = ("scene", "cloud", "clouds_of_boards", "frames")  # of the first screen, the best first
 PART = ".report-"  # begins the names of folders in which a report is being written
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CELL_SECONDS = 600
+USUAL_SECONDS = {  # by number, two at a time on two busy cores; only their ratios count
+    "00": 22.0,
+    "01": 28.0,
+    "02": 22.0,
+    "03": 29.0,
+    "04": 79.0,
+    "05": 64.0,
+    "06": 124.0,
+    "07": 117.0,
+    "08": 129.0,
+    "09": 144.0,
+}
 _CLIENTS = set()  # of the notebooks that are being executed
 MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way first
 
@@ -258,7 +272,7 @@ def _execute_all(paths, environment, jobs):
         # later notebooks go through more stages and take longer, so they start first
         futures = {pool.submit(_run, path, environment): path for path in reversed(paths)}
         try:
-            _show_progress(futures)
+            _show_progress(futures, max(1, jobs))
         finally:  # end the notebooks that are being executed and leave out the others
             for future in futures:
                 future.cancel()
@@ -270,81 +284,179 @@ def _execute_all(paths, environment, jobs):
     return sorted((future.result() for future in futures), key=lambda run: run.name)
 
 
-def _show_progress(futures):
-    """Wait for notebooks (paths by future) with a bar, or where there is no terminal a line for each."""
+def _show_progress(futures, jobs):
+    """Wait for notebooks with a bar, or where there is no terminal a line for each.
+
+    `futures` are paths by future, each of a Run; so many `jobs` go on at the same time.
+    """
     progress = Progress()
-    with tqdm(total=len(futures), desc="notebooks", unit="notebook", disable=None) as bar:
+    count = len(futures)
+    total = sum(_usual_seconds(path) for path in futures.values())
+    usual = 0.0  # seconds of those that are done, and what they took
+    taken = 0.0
+    shape = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}]{postfix}"
+    with tqdm(total=count, desc="notebooks", bar_format=shape, disable=None) as bar:
         if bar.disable:
-            print(f"lrfcal: {len(futures)} notebooks begun", file=sys.stderr, flush=True)
+            print(f"lrfcal: {count} notebooks begun", file=sys.stderr, flush=True)
         for done, future in enumerate(as_completed(futures), start=1):
+            usual += _usual_seconds(futures[future])
+            taken += future.result().seconds
+            expected = total * taken / usual / jobs
             name = futures[future].stem
-            bar.set_postfix_str(name)
+            left = progress.left(progress.seconds / expected) if done < count else ""
+            words = ", ".join(filter(None, [name, left]))
+            bar.set_postfix_str(words)
             bar.update()
             if bar.disable:
-                words = f"{done} of {len(futures)} done after {duration(progress.seconds)} ({name})"
-                if left := progress.left(done / len(futures)):
-                    words = f"{words}, {left}"
-                print(f"lrfcal: {words}", file=sys.stderr, flush=True)
+                said = f"{done} of {count} done after {duration(progress.seconds)}"
+                print(f"lrfcal: {said} ({words})", file=sys.stderr, flush=True)
+
+
+def _usual_seconds(path):
+    """How long a notebook takes beside others, on the shipped session."""
+    return USUAL_SECONDS.get(path.stem[:2], 60.0)
 
 
 def _run(path, environment):
     """Execute one notebook."""
     begin = time.monotonic()
     notebook, error = execute(path, environment | {"LRFCAL_NOTEBOOK": path.stem})
-    # first heading and first paragraph
+    title, thesis = _beginning(notebook)
+    seconds = time.monotonic() - begin
+    return Run(path.stem, title or path.stem, thesis, seconds, error, notebook)
+
+
+def _beginning(notebook):
+    """First heading and first paragraph of a notebook, '' where there is none."""
     text = "\n\n".join(cell.source for cell in notebook.cells[:2] if cell.cell_type == "markdown")
     blocks = [block.strip() for block in re.split(r"\n\s*\n", text) if block.strip()]
-    title = next((block.lstrip("# ").splitlines()[0] for block in blocks if block.startswith("#")), path.stem)
-    thesis = next((re.sub(r"[*`>]", "", block) for block in blocks if not block.startswith("#")), "")
-    return Run(path.stem, title, " ".join(thesis.split()), time.monotonic() - begin, error, notebook)
+    headings = [block for block in blocks if block.startswith("#")]
+    paragraphs = [block for block in blocks if not block.startswith("#")]
+    title = headings[0].lstrip("# ").splitlines()[0] if headings else ""
+    thesis = re.sub(r"[*`>]", "", paragraphs[0]) if paragraphs else ""
+    return title, " ".join(thesis.split())
 
 
 def write_pages(out, session, runs, found, seconds):
-    """The pages of the notebooks and the first one, of what is in the report's folder."""
+    """The pages of the notebooks and the first one, of what is in the report's folder.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the report.
+    session : Session
+    runs : list of Run
+    found : dict of str to dict
+        What each notebook kept: its figures, tables, findings and verdicts.
+    seconds : float
+        That the notebooks took.
+    """
+    jinja = _templates()
+    numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
+    drawn = {}  # figures and tables of each notebook, as HTML
+    for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
+        body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
+        file = out / f"{run.name}.html"
+        around = {"before": before, "after": after}
+        _write_page(jinja, file, "notebook.html.jinja", session=session, run=run, body=body, **around)
+
+    verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
+    main = _main_verdict(verdicts)
+    _write_page(
+        jinja,
+        out / "index.html",
+        "report.html.jinja",
+        session=session,
+        runs=runs,
+        found=found,
+        seconds=seconds,
+        failed=[run for run in runs if run.error],
+        numbers=numbers,
+        drawn=drawn,
+        verdicts=verdicts,
+        told={entry["key"]: entry for run in runs for entry in found[run.name]["findings"]},
+        main=main,
+        headline=_headline(out, main),
+        rest=_sentences_below(main),
+        picture=_first_picture(drawn),
+        files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
+        provenance=_provenance(session),
+    )
+
+
+def _templates():
+    """The templates of pages, in which methods are called by their labels."""
     loader = FileSystemLoader(Path(__file__).parent)
     jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
     quoted = r"(?<=')\w+(?=')"  # methods named in sentences
     jinja.filters["words"] = lambda text: re.sub(quoted, lambda m: label_of(m[0]), label_of(text))
-    numbers = {run.name: run.name[:2].removeprefix("0") for run in runs}
-    drawn = {}
-    for before, run, after in zip([None, *runs], runs, [*runs[1:], None], strict=False):
-        body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
-        template = jinja.get_template("notebook.html.jinja")
-        made = template.render(session=session, run=run, body=body, before=before, after=after)
-        (out / f"{run.name}.html").write_text(made, encoding="utf-8")
-    figures = {name: figure for shown, _ in drawn.values() for name, figure in shown.items()}
-    verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
-    main = max(verdicts, key=lambda entry: entry["record"] is not None, default=None)  # the first one without a record
-    told = {entry["key"]: entry for run in runs for entry in found[run.name]["findings"]}
-    made = jinja.get_template("report.html.jinja").render(
-        session=session, runs=runs, found=found, seconds=seconds, failed=[run for run in runs if run.error],
-        numbers=numbers, drawn=drawn, verdicts=verdicts, told=told, main=main, headline=_headline(out, main),
-        rest=[s for s in main["sentences"][1:] if not s.startswith(BESIDE)] if main else [],
-        picture=next((figures[n] for n in ("scene", "cloud", "clouds_of_boards", "frames") if figures.get(n)), ""),
-        files=[name for name in OWN_FILES[3:-1] if (out / name).is_file()],
-        provenance=_provenance(session),
-    )  # fmt: skip
-    (out / "index.html").write_text(made, encoding="utf-8")
+    return jinja
+
+
+def _write_page(jinja, file, template, **values):
+    """Write a page made by a template."""
+    file.write_text(jinja.get_template(template).render(**values), encoding="utf-8")
+
+
+def _main_verdict(verdicts):
+    """The verdict that stands first: one with a record, else any; None without."""
+    with_record = [entry for entry in verdicts if entry["record"] is not None]
+    return next(iter(with_record or verdicts), None)
+
+
+def _sentences_below(verdict):
+    """Sentences of a verdict that the first screen does not tell in numbers."""
+    if verdict is None:
+        return []
+    return [words for words in verdict["sentences"][1:] if not words.startswith(BESIDE)]
+
+
+def _first_picture(drawn):
+    """The figure of the first screen, as HTML; '' where no notebook drew one of them."""
+    figures = {}
+    for of_notebook, _ in drawn.values():
+        figures |= of_notebook
+    return next((figures[name] for name in PICTURES if figures.get(name)), "")
 
 
 def _headline(out, verdict):
-    """Numbers of the first screen as far as there are any: expected errors by distance, measured edge lengths."""
-    numbers, tables = {}, out / "tables"
+    """Numbers of the first screen as far as there are any, by kind: expected errors, edges."""
+    numbers = {}
     if verdict and verdict["record"] and verdict["record"]["expected_error_at_m"]:
         errors = pd.DataFrame(verdict["record"]["expected_error_at_m"])
-        numbers = {"cloud": dict(errors.loc["cloud_mm"]), "image": dict(errors.drop("cloud_mm").max())}
-        # a standard deviation from n placements is itself known to one part in sqrt(2 (n - 1))
-        used = pd.read_csv(tables / "placements.csv").used.sum() if (tables / "placements.csv").is_file() else 0
-        numbers["known"] = (2 * (used - 1)) ** -0.5 if used > 1 else 0.0
-    if (tables / "edge_lengths.csv").is_file():
-        lengths = pd.read_csv(tables / "edge_lengths.csv").dropna(subset="error_mm")
-        lengths, own = lengths.assign(error=lengths.error_mm.abs()), lengths.source != "paper"
-        if len(best := next((way for way in MEASURED if (own & (lengths.variant == way)).any()), "")):
-            part = lengths[own & (lengths.variant == best)]
-            spread = part.groupby("placement").error.mean().sem()
-            numbers["edges"] = {"n": len(part), "mean": part.error.mean(), "sigma": spread,
-                                "paper": lengths[~own].error.mean()}  # fmt: skip
+        numbers["cloud"] = dict(errors.loc["cloud_mm"])
+        numbers["image"] = dict(errors.drop("cloud_mm").max())
+        numbers["known"] = _known_share(out / "tables" / "placements.csv")
+    if (out / "tables" / "edge_lengths.csv").is_file():
+        edges = _edge_numbers(pd.read_csv(out / "tables" / "edge_lengths.csv"))
+        if edges:
+            numbers["edges"] = edges
     return numbers
+
+
+def _known_share(file):
+    """How well a standard deviation from n placements is known: to one part in sqrt(2 (n - 1))."""
+    used = 0
+    if file.is_file():
+        used = pd.read_csv(file).used.sum()
+    return (2 * (used - 1)) ** -0.5 if used > 1 else 0.0
+
+
+def _edge_numbers(lengths):
+    """Number, mean absolute error and its scatter of measured edges, the best way; {} without."""
+    lengths = lengths.dropna(subset="error_mm")
+    lengths = lengths.assign(error=lengths.error_mm.abs())
+    own = lengths[lengths.source != "paper"]
+    best = next((way for way in MEASURED if (own.variant == way).any()), None)
+    if best is None:
+        return {}
+    part = own[own.variant == best]
+    return {
+        "n": len(part),
+        "mean": part.error.mean(),
+        "sigma": part.groupby("placement").error.mean().sem(),
+        "paper": lengths[lengths.source == "paper"].error.mean(),
+    }
 
 
 def _provenance(session):
