@@ -1,7 +1,7 @@
 """What the cameras of a session see of the board: intrinsics, poses, turns, edges, the outline that nobody measured."""
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import PurePath
 
 import numpy as np
@@ -20,7 +20,7 @@ UPRIGHT = 0.05  # weight of the turn between two cameras where few placements te
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
-REMEMBERED_IMAGES = 128
+REMEMBERED_BYTES = 100_000_000  # of images that are looked at again: 40 of a megapixel; prepare stays below 500 MB
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 
 
@@ -101,7 +101,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
         the board does not have.
     """
-    read, marks = lru_cache(maxsize=REMEMBERED_IMAGES)(read), _marks(picks, board)
+    read = _remembering(read)
+    marks = _marks(picks, board)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
         lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
@@ -168,6 +169,22 @@ def all_views(prepared):
         same = replace(prepared.views[r.camera][r.placement], file=_view(r).file, pitch=r.pitch)
         views[r.camera].append(same if view is None else view)
     return views
+
+
+def _remembering(read):
+    """The same function; the images that it read first are kept, as many as there is room for."""
+    kept = {}
+
+    def read_once(record):
+        """The image of a record."""
+        if record in kept:
+            return kept[record]
+        image = read(record)
+        if sum(other.nbytes for other in kept.values()) + image.nbytes <= REMEMBERED_BYTES:
+            kept[record] = image
+        return image
+
+    return read_once
 
 
 def _marks(picks, board):
