@@ -54,16 +54,16 @@ def cached(stage):
         """The kept result of the same call, or else what the stage makes now."""
         if not os.environ.get(VARIABLE):
             return stage(of, *args, **options)
-        folder, session = Path(os.environ[VARIABLE]), getattr(getattr(of, "prepared", of), "session", of)
-        if folder.exists():
-            _refuse_shared(folder)
+        folder = Path(os.environ[VARIABLE])
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_shared(folder)
+        session = getattr(getattr(of, "prepared", of), "session", of)
         key = hashlib.sha256(pickle.dumps((stage.__qualname__, of, args, sorted(options.items()))))
         for file in (Path(record.file) for record in session.image_records):
             key.update(file.read_bytes() if file.is_file() else b"missing")
         key.update(library())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
                 if not file.is_file():

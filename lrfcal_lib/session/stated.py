@@ -88,15 +88,22 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     OSError
         If it cannot be opened.
     """
-    file = Path(os.path.realpath(file)) if within is None else checked(file, within)
+    file = Path(file)
+    writes = flags != os.O_RDONLY
+    if within is not None:
+        checked(file, within)
+        flags |= os.O_NOFOLLOW
     with suppress(FileNotFoundError):  # a device is not even opened
-        found = file.lstat()
+        found = os.stat(file, follow_symlinks=within is None)
         _refuse_other(file, found, "-", "a file")
-        if flags == os.O_RDONLY and found.st_size > most:
+        if not writes and found.st_size > most:
             raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
-    inner = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-    stream = os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
-    if flags != os.O_RDONLY and os.fstat(inner).st_nlink > 1:
+    inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    mode = "rb"
+    if writes:
+        mode = "r+b" if flags & os.O_RDWR else "wb"
+    stream = os.fdopen(inner, mode)
+    if writes and os.fstat(inner).st_nlink > 1:
         stream.close()
         remedy = "copy the session's folder and write to the copy"
         raise SessionError(f"{file}: has another name elsewhere (a hard link); {remedy}")
@@ -184,9 +191,12 @@ def read_bytes(file, within=None, most=LARGEST_FILE):
     """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
     try:
         with opened(file, within, most=most) as stream:
-            return stream.read()
+            data = stream.read(most + 1)
     except OSError as error:
         raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
+    if len(data) > most:  # files of the system do not tell their size
+        raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
+    return data
 
 
 def read_json(file, within):
