@@ -109,7 +109,11 @@ def all_processors():
     """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays alone."""
     global _processes
     alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
-    before, _processes = _processes, 1 if alone else len(os.sched_getaffinity(0))
+    before = _processes
+    if alone:
+        _processes = 1
+    else:
+        _processes = len(os.sched_getaffinity(0))
     try:
         yield
     finally:
@@ -124,7 +128,10 @@ def spread(work, items):
     Pickles are read from the pipes of our own children only.
     """
     global _processes
-    items, done, others, count = list(items), {}, [], _processes
+    items = list(items)
+    count = _processes
+    done = {}  # results by number of the item
+    others = []  # processes, and the files that their results come from
     if min(count, len(items)) < 2:
         return [pickle.loads(pickle.dumps(work(item))) for item in items]
     queue, end = os.pipe()  # of the numbers of items
@@ -162,4 +169,7 @@ def spread(work, items):
             file.close()
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-    return [done[i] if i in done else pickle.loads(pickle.dumps(work(item))) for i, item in enumerate(items)]
+    for number, item in enumerate(items):
+        if number not in done:
+            done[number] = pickle.loads(pickle.dumps(work(item)))
+    return [done[number] for number in range(len(items))]
