@@ -20,7 +20,8 @@ UPRIGHT = 0.05  # weight of the turn between two cameras where few placements te
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
-REMEMBERED_BYTES = 100_000_000  # of images that are looked at again: 40 of a megapixel; prepare stays below 500 MB
+# of images that are looked at again: 40 of a megapixel; with more, prepare takes above 500 MB
+REMEMBERED_BYTES = 100_000_000
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 
 

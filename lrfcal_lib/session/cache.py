@@ -72,7 +72,8 @@ def cached(stage):
                         part.write(result)
                     os.replace(part.name, file)  # whole or not at all
         with opened(file, folder, most=LARGEST_RESULT) as stream:
-            _refuse_others(file, os.fstat(stream.fileno()))  # of what is open: the name may be another's file by now
+            # of what is open: the name may be another's file by now
+            _refuse_others(file, os.fstat(stream.fileno()))
             return pickle.load(stream)
 
     return look_first
@@ -89,9 +90,10 @@ def _refuse_shared(folder):
 
 
 def _refuse_others(place, status):
-    """Refuse a file or folder that is somebody else's, but for root's, or that somebody else may write to."""
+    """Refuse what is somebody else's, but for root's, or what somebody else may write to."""
     if status.st_uid not in (os.geteuid(), 0) or status.st_mode & 0o022:
-        may = f"others may write to '{place}' (owner {status.st_uid}, mode {status.st_mode & 0o7777:o})"
+        mode = f"{status.st_mode & 0o7777:o}"
+        may = f"others may write to '{place}' (owner {status.st_uid}, mode {mode})"
         raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
 
 

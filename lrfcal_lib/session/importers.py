@@ -35,7 +35,8 @@ LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
 STEP_DEG, FIRST, LAST = 0.1, 550, 1250  # the LMS400 sees 70 deg: from the first to the last of these steps
 COUNT = 0.001  # metres, one count of the LMS400
 LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
-LINE_JUMP = 1e-4  # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
+# radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
+LINE_JUMP = 1e-4
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
 
 
@@ -77,7 +78,8 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
         cameras.append(CameraInfo(name, "platform", width, height, model))
     pattern = Chessboard(columns=8, rows=6, square=0.0775)
     edges = ("top", "right", "bottom", "left")
-    board = Board("chessboard 9 x 7", edges, corners=None, pattern=pattern, features=("left", "top"))
+    features = ("left", "top")
+    board = Board("chessboard 9 x 7", edges, corners=None, pattern=pattern, features=features)
     lrf = LrfInfo(
         model="SICK LMS400",
         field_of_view=tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG])),
@@ -204,7 +206,8 @@ def read_pcd(file):
         points = np.array(body.split(), dtype=float)
         promised = int(count[1])
     if points.size != 3 * promised or points.size == 0:
-        raise SessionError(f"{file}: {points.size / 3:g} points, the header states {promised}; truncated?")
+        found = f"{points.size / 3:g} points, the header states {promised}"
+        raise SessionError(f"{file}: {found}; truncated?")
     if not np.isfinite(points).all():
         raise SessionError(f"{file}: holds coordinates that are not finite; damaged?")
     return points.reshape(-1, 3)
@@ -218,13 +221,16 @@ def read_bouguet(file):
     """
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     with naming(file):
-        values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
+        values = {}
+        for key, many, one in found:
+            values[key] = np.array((many or one).replace(";", " ").split(), float)
         return _from_bouguet(values)
 
 
 def _from_bouguet(values):
-    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a missing or impossible one."""
-    lengths = {"fc": 2, "cc": 2, "kc": 5, "nx": 1, "ny": 1, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a wrong one."""
+    lengths = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+    lengths |= {"nx": 1, "ny": 1}
     if lacking := [key for key, length in lengths.items() if len(values.get(key, ())) != length]:
         raise ValueError(f"no value of {', '.join(lacking)}; is this a Calib_Results.m?")
     if endless := [key for key, array in values.items() if not np.isfinite(array).all()]:

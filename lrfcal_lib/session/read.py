@@ -26,8 +26,8 @@ DROPPED = "dropped"  # purpose of an image of a placement that was recorded agai
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
-PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; of bzip2 and LZMA, zipfile unpacks as much as there is at once
-LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, but reads them first
+PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
+LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, once it has them
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -94,7 +94,7 @@ def read_npz(file, within):
 
 
 def _check_entries(file, stream):
-    """Refuse an archive with a long table of contents, of which ZipFile makes objects before it can be asked."""
+    """Refuse an archive with a long table of contents, of which ZipFile makes objects at once."""
     parts = iter(partial(stream.read, 1_000_000), b"")
     entries = sum(part.count(ENTRY) for part in parts)
     if entries > MOST_ENTRIES:
@@ -177,7 +177,8 @@ def missing_parts(placements, scans, records, cameras, unfinished=None):
         again = "its recording was not finished, ignored; 'record --resume' records it again"
         problems.append(f"placement {placement}: {again}")
     for placement in sorted(scanned - {*placements, *unfinished}):
-        problems.append(f"placement {placement}: in the scan lines but not in session.json, ignored")
+        unknown = "in the scan lines but not in session.json, ignored"
+        problems.append(f"placement {placement}: {unknown}")
     for placement in placements:
         for camera in cameras:
             if (camera, placement) not in shot:
@@ -220,8 +221,10 @@ def read_images(path, facts, unfinished=None):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
-            if (first := lines.setdefault(target, number)) < number:
-                raise ValueError(f"'{row['file']}' stands in line {first} already; remove one of the two rows")
+            first = lines.setdefault(target, number)
+            if first < number:
+                already = f"stands in line {first} already; remove one of the two rows"
+                raise ValueError(f"'{row['file']}' {already}")
             out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
             check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
     return tuple(out)
@@ -253,9 +256,10 @@ def read_edges(path, facts, records):
 
 
 def image_size(file, data):
-    """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither.
+    """Width and height of a PNG or JPEG image from its header.
 
-    Also for a JPEG that takes long to decode, or much memory, by its number of scans or of segments with remarks.
+    SessionError if it is cut off, or neither; also for a JPEG that would take long to decode, or
+    much memory, by its number of scans or of segments with remarks.
     """
     size = None
     if data.startswith(PNG):
@@ -263,9 +267,12 @@ def image_size(file, data):
             size = struct.unpack(">II", data[16:24])
         end = b"IEND"
     elif data.startswith(JPEG):
-        for mark, most, things in ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks")):
-            if (count := data.count(mark)) > most:
-                raise SessionError(f"{file}: a JPEG of {count} {things}, more than {most}; write the image again")
+        limits = ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks"))
+        for mark, most, things in limits:
+            count = data.count(mark)
+            if count > most:
+                found = f"a JPEG of {count} {things}, more than {most}"
+                raise SessionError(f"{file}: {found}; write the image again")
         size = _jpeg_size(data)
         end = b"\xff\xd9"
     else:
@@ -276,7 +283,7 @@ def image_size(file, data):
 
 
 def _jpeg_size(data):
-    """Width and height from the frame header of a JPEG, None where it does not come within some segments."""
+    """Width and height from the frame header of a JPEG, None where it does not come soon."""
     at = len(JPEG)
     for _ in range(MOST_SEGMENTS):
         if len(data) < at + 9 or data[at] != 0xFF:
@@ -300,13 +307,15 @@ def check_image_size(file, data, camera, size=None):
         raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")
 
 
-SMALLEST_MOVE = 1e-4  # radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
+# radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
+SMALLEST_MOVE = 1e-4
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
 SCAN, REMARK = b"\xff\xda", b"\xff\xe1"  # markers, which do not occur within coded pixels
-MOST_SCANS = 100  # of a JPEG, each of which takes up to 30 ms at 30 megapixels; programs write about ten
-MOST_SEGMENTS = 10_000  # of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
+MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write about ten
+# of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
+MOST_SEGMENTS = 10_000
 
 # tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
 ORDERED = {
@@ -513,12 +522,13 @@ def _rows_twice(file, rows, once):
     for line, row in enumerate(rows, start=2):
         values = tuple(row[key] for key in once)
         if values in first:
-            yield f"{file} line {line}: {', '.join(values)} stands in line {first[values]} already; remove one of them"
+            already = f"stands in line {first[values]} already; remove one of them"
+            yield f"{file} line {line}: {', '.join(values)} {already}"
         first.setdefault(values, line)
 
 
 def _times_back(file, rows, group):
-    """Sentences about times that run back between rows with the same values of the columns `group`."""
+    """Sentences about times that run back between rows of one `group`, by these columns."""
     last = {}
     for line, row in enumerate(rows, start=2):
         if not row.get("t_s") or not row["placement"] or row.get("purpose") == DROPPED:

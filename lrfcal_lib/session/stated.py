@@ -44,7 +44,7 @@ KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "
 
 
 def printable(text):
-    """Text as a terminal may show it: what steers the terminal, or cannot be encoded, stands there in letters."""
+    """Text as a terminal may show it: what steers it, or cannot be encoded, stands in letters."""
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
@@ -83,8 +83,9 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     Raises
     ------
     SessionError
-        If the file, or a folder between it and the session's, is a link, or the file is none (a pipe, a device), too
-        large to be read, or to be written and known by another name as well (a hard link, maybe outside).
+        If the file, or a folder between it and the session's, is a link, or the file is none (a
+        pipe, a device), too large to be read, or to be written and known by another name as well
+        (a hard link, maybe outside).
     OSError
         If it cannot be opened.
     """
@@ -144,7 +145,8 @@ def _locked(file, path):
     except BlockingIOError:
         with stream:
             holder = stream.read(200).decode(errors="replace") or "another process"
-        raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+        remedy = "end that first, or choose another one"
+        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
     return stream
 
 

@@ -182,7 +182,8 @@ def _modes(data, index, rows):
 def _lines(groups, index):
     """Scan lines on one grid of bearings; refuses a mixture of variants."""
     n = len(index["offset"])
-    partial = np.full(n, -2)  # which quarter of a degree the scan is turned by; -1 a whole scan, -2 no scan
+    # which quarter of a degree the scan is turned by; -1 a whole scan, -2 no scan
+    partial = np.full(n, -2)
     number = np.full(n, -2)  # of the scan, as the device counts; -1 where it does not
     for rows, group in groups:
         partial[rows] = group.partial
@@ -216,7 +217,7 @@ def _lines(groups, index):
 
 
 def _goes_on(partial, number, index, rows):
-    """Whether each scan but the first is a later part of the line that the scan before began, shape (n - 1,)."""
+    """Whether each scan but the first goes on with the line of the one before, shape (n - 1,)."""
     step = np.diff(partial)
     rises = (partial[:-1] >= 0) & (step > 0)
     stays = (np.diff(index["placement"][rows]) == 0) & (np.diff(index["pitch_deg"][rows]) == 0)

@@ -66,7 +66,7 @@ class SessionWriter:
         rig = {
             "lrf": stated.lrf_to_json(lrf),
             "platform": platform,
-            "cameras": {camera.name: stated.camera_to_json(camera) for camera in self.cameras.values()},
+            "cameras": {name: stated.camera_to_json(info) for name, info in self.cameras.items()},
         }
         self.data = {
             "schema": stated.SCHEMA,
@@ -198,8 +198,9 @@ class SessionWriter:
         offsets = offset + np.cumsum([0, *lengths[:-1]])
         number = number_cell(placement)
         rows = []
-        for begin, length, time, angle in zip(offsets, lengths, time_s, np.degrees(pitch), strict=True):
-            rows.append([cell(time), begin, length, number, cell(angle)])
+        pitch_deg = np.degrees(pitch)
+        for begin, length, at, angle in zip(offsets, lengths, time_s, pitch_deg, strict=True):
+            rows.append([cell(at), begin, length, number, cell(angle)])
         self._append_rows("lrf/index.csv", rows)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
@@ -225,7 +226,8 @@ class SessionWriter:
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
-        row = [cell(time_s), camera, name, number_cell(placement), cell(math.degrees(pitch)), purpose]
+        number = number_cell(placement)
+        row = [cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]
         self._append_rows("images.csv", [row])
 
 
@@ -357,7 +359,8 @@ class SessionRecorder(SessionWriter):
             for key in ("board", "rig"):
                 if data[key] != mine[key]:
                     where = _first_difference(data[key], mine[key], key)
-                    raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
+                    remedy = "go on with the same rig file, or begin another one"
+                    raise ValueError(f"{where}, unlike the rig now: {remedy}")
         self.data = dict(data)
         self.data["placements"] = list(known["placements"])
         self.data["unfinished"] = list(known["unfinished"] or ())
@@ -403,7 +406,8 @@ class SessionRecorder(SessionWriter):
         """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN where unknown."""
         cells = []
         for time_s, commanded, measured in rows:
-            cells.append([cell(time_s), cell(math.degrees(commanded)), cell(math.degrees(measured))])
+            angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
+            cells.append([cell(time_s), *angles])
         self._append_rows("platform.csv", cells)
 
     def finish(self):
