@@ -15,7 +15,7 @@ from pathlib import Path
 import fuzz
 import numpy as np
 import pytest
-from shared import campaign
+from shared import DATA, campaign
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
@@ -186,23 +186,36 @@ DAMAGE = {
 
 LIMITED = """import resource, sys
 import fuzz
-from lrfcal_lib.session.read import validate
+from lrfcal_lib.calibrate.pipeline import prepare
+from lrfcal_lib.session.read import open_session, validate
 resource.setrlimit(resource.RLIMIT_DATA, (fuzz.MEMORY, fuzz.MEMORY))
 resource.setrlimit(resource.RLIMIT_CPU, (int(fuzz.LONGEST_S), int(fuzz.LONGEST_S)))
-print(*validate(sys.argv[1]))"""
+print(*eval(sys.argv[1]))"""
 BOMBS = dict(zip(fuzz.BOMBS, (
     "cannot be read .*expected 900000000 bytes", "packed in another way", "holds 1000003 files", "truncated after 48",
     "12000000 segments of remarks", "JPEG of 5010 scans", "^$", "stands in line .* already",
 ), strict=True))  # fmt: skip
 
 
+def limited(call):
+    """What a call yields, as text, in a process with the memory and the time of `make fuzz`."""
+    same = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", LIMITED, call]
+    return subprocess.run(command, env=same, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+
 @campaign
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_little_becomes_neither_much_nor_long(folder, bomb):
     bomb(folder / "scans")
-    command = [sys.executable, "-c", LIMITED, str(folder / "scans")]
-    told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    told = limited(f"validate({str(folder / 'scans')!r})")
     assert re.search(BOMBS[bomb], told), told
+
+
+@campaign
+def test_many_images_are_not_all_in_memory():
+    """The shipped session has 148; each is looked at several times."""
+    assert limited(f"prepare(open_session({str(DATA / 'sim_lms221')!r})).problems") == ""
 
 
 @pytest.mark.parametrize("message", DAMAGE)

@@ -1,7 +1,7 @@
 """What the cameras of a session see of the board: intrinsics, poses, turns, edges, the outline that nobody measured."""
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import PurePath
 
 import numpy as np
@@ -30,7 +30,8 @@ UPRIGHT = 0.05  # weight of the turn between two cameras where few placements te
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
-REMEMBERED_BYTES = 300_000_000  # of decoded images, in each process
+# of images that are looked at again: 40 of a megapixel; with more, prepare takes above 500 MB
+REMEMBERED_BYTES = 100_000_000
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 
 
@@ -111,10 +112,8 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
         the board does not have.
     """
+    read = _remembering(read)
     marks = _marks(picks, board)
-    sizes = [m.width * m.height for m in models.values() if m is not None]
-    largest = max(sizes, default=0) or (read(records[0]).size // 3 if records else 1)
-    read = lru_cache(maxsize=REMEMBERED_BYTES // (3 * largest) + 1)(read)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
         lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
@@ -205,6 +204,22 @@ def small_squares(views, pattern):
             "print larger squares"
         )
     return words
+
+
+def _remembering(read):
+    """The same function; the images that it read first are kept, as many as there is room for."""
+    kept = {}
+
+    def read_once(record):
+        """The image of a record."""
+        if record in kept:
+            return kept[record]
+        image = read(record)
+        if sum(other.nbytes for other in kept.values()) + image.nbytes <= REMEMBERED_BYTES:
+            kept[record] = image
+        return image
+
+    return read_once
 
 
 def _marks(picks, board):

@@ -229,8 +229,9 @@ def in_place_of(out):
 def _take_place(new, out):
     """Exchange two folders; files in the old one that are no report's come along.
 
-    At every moment, also that of a kill, there is a report: the old one or the new one. Where the system cannot
-    exchange folders (file systems over a network, macOS), each file of the new one takes the place of an old one.
+    At every moment, also that of a kill, there is a report: the old one or the new one. Where the
+    system cannot exchange folders (file systems over a network, macOS), each file of the new one
+    takes the place of an old one.
     """
 
     def ours(folder, names):
@@ -252,11 +253,12 @@ def _exchanged(one, other):
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False
-    return rename(AT_WORKING_FOLDER, os.fsencode(one), AT_WORKING_FOLDER, os.fsencode(other), EXCHANGE) == 0
+    here = AT_WORKING_FOLDER
+    return rename(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0
 
 
 def _move_files(new, out):
-    """Move every file of a folder into another one, the first page last; then remove a report's files that are old."""
+    """Move every file of a folder into another one, first page last; then remove a report's old files."""
     files = sorted(file.relative_to(new) for file in new.rglob("*") if not file.is_dir())
     for file in sorted(files, key=lambda file: file == Path("index.html")):
         (out / file.parent).mkdir(parents=True, exist_ok=True)

@@ -54,16 +54,16 @@ def cached(stage):
         """The kept result of the same call, or else what the stage makes now."""
         if not os.environ.get(VARIABLE):
             return stage(of, *args, **options)
-        folder, session = Path(os.environ[VARIABLE]), getattr(getattr(of, "prepared", of), "session", of)
-        if folder.exists():
-            _refuse_shared(folder)
+        folder = Path(os.environ[VARIABLE])
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_shared(folder)
+        session = getattr(getattr(of, "prepared", of), "session", of)
         key = hashlib.sha256(pickle.dumps((stage.__qualname__, of, args, sorted(options.items()))))
         for file in (Path(record.file) for record in session.image_records):
             key.update(file.read_bytes() if file.is_file() else b"missing")
         key.update(library())
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
                 if not file.is_file():
@@ -72,7 +72,8 @@ def cached(stage):
                         part.write(result)
                     os.replace(part.name, file)  # whole or not at all
         with opened(file, folder, most=LARGEST_RESULT) as stream:
-            _refuse_others(file, os.fstat(stream.fileno()))  # of what is open: the name may be another's file by now
+            # of what is open: the name may be another's file by now
+            _refuse_others(file, os.fstat(stream.fileno()))
             return pickle.load(stream)
 
     return look_first
@@ -89,9 +90,10 @@ def _refuse_shared(folder):
 
 
 def _refuse_others(place, status):
-    """Refuse a file or folder that is somebody else's, but for root's, or that somebody else may write to."""
+    """Refuse what is somebody else's, but for root's, or what somebody else may write to."""
     if status.st_uid not in (os.geteuid(), 0) or status.st_mode & 0o022:
-        may = f"others may write to '{place}' (owner {status.st_uid}, mode {status.st_mode & 0o7777:o})"
+        mode = f"{status.st_mode & 0o7777:o}"
+        may = f"others may write to '{place}' (owner {status.st_uid}, mode {mode})"
         raise ValueError(f"{VARIABLE}: {may}, {REMEDY}")
 
 
@@ -109,7 +111,11 @@ def all_processors():
     """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays alone."""
     global _processes
     alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
-    before, _processes = _processes, 1 if alone else len(os.sched_getaffinity(0))
+    before = _processes
+    if alone:
+        _processes = 1
+    else:
+        _processes = len(os.sched_getaffinity(0))
     try:
         yield
     finally:
@@ -124,7 +130,10 @@ def spread(work, items):
     Pickles are read from the pipes of our own children only.
     """
     global _processes
-    items, done, others, count = list(items), {}, [], _processes
+    items = list(items)
+    count = _processes
+    done = {}  # results by number of the item
+    others = []  # processes, and the files that their results come from
     if min(count, len(items)) < 2:
         return [pickle.loads(pickle.dumps(work(item))) for item in items]
     queue, end = os.pipe()  # of the numbers of items
@@ -162,4 +171,7 @@ def spread(work, items):
             file.close()
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-    return [done[i] if i in done else pickle.loads(pickle.dumps(work(item))) for i, item in enumerate(items)]
+    for number, item in enumerate(items):
+        if number not in done:
+            done[number] = pickle.loads(pickle.dumps(work(item)))
+    return [done[number] for number in range(len(items))]

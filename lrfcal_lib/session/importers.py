@@ -35,6 +35,8 @@ LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
 STEP_DEG, FIRST, LAST = 0.1, 550, 1250  # the LMS400 sees 70 deg: from the first to the last of these steps
 COUNT = 0.001  # metres, one count of the LMS400
 LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+# radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
+LINE_JUMP = 1e-4
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
 
 
@@ -62,15 +64,30 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     if intrinsics not in ("own", "published"):
         raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
     clouds = numbered(src, "plane_*.pcd")
-    published = {name: read_bouguet(Path(src) / f"Calib_Results_{name}.m") for name in ("left", "right")}
-    images = {name: numbered(src, f"{name}_*.png") for name in published}
-    first = {name: next(iter(files.values())) for name, files in images.items()}
-    sizes = {name: image_size(file, read_bytes(file)) for name, file in first.items()}
-    models = {name: result["model"] if intrinsics == "published" else None for name, result in published.items()}
-    cameras = [CameraInfo(name, "platform", *sizes[name], models[name]) for name in published]
-    edges, view = ("top", "right", "bottom", "left"), tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG]))
-    board = Board("chessboard 9 x 7", edges, None, Chessboard(8, 6, 0.0775), ("left", "top"))
-    lrf = LrfInfo("SICK LMS400", view, np.radians(STEP_DEG), 0.005, 0.0, COUNT, 3.0)
+    published = {}
+    images = {}
+    cameras = []
+    for name in ("left", "right"):
+        published[name] = read_bouguet(Path(src) / f"Calib_Results_{name}.m")
+        images[name] = numbered(src, f"{name}_*.png")
+        first = next(iter(images[name].values()))
+        width, height = image_size(first, read_bytes(first))
+        model = None
+        if intrinsics == "published":
+            model = published[name]["model"]
+        cameras.append(CameraInfo(name, "platform", width, height, model))
+    pattern = Chessboard(columns=8, rows=6, square=0.0775)
+    edges = ("top", "right", "bottom", "left")
+    features = ("left", "top")
+    board = Board("chessboard 9 x 7", edges, corners=None, pattern=pattern, features=features)
+    lrf = LrfInfo(
+        model="SICK LMS400",
+        field_of_view=tuple(np.radians([FIRST * STEP_DEG, LAST * STEP_DEG])),
+        bearing_step=np.radians(STEP_DEG),
+        sigma_range=0.005,
+        range_resolution=COUNT,
+        max_range=3.0,
+    )
     # the authors' result is printed with four digits, so made orthonormal again
     turn = Rotation.from_matrix([[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]])
     T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
@@ -81,8 +98,12 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
         "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
         "cameras": {name: result["reference"] for name, result in published.items()},
     }
-    about = {"licence": "none stated by the authors", "source": LASERSETERO, "reference": reference}
-    about["platform_sigma"] = LASERSETERO_PLATFORM_SIGMA
+    about = {
+        "licence": "none stated by the authors",
+        "source": LASERSETERO,
+        "reference": reference,
+        "platform_sigma": LASERSETERO_PLATFORM_SIGMA,
+    }
     with SessionWriter(dst, board, lrf, cameras, LASERSETERO_HEAD, **about) as writer:
         misses = []
         values = 0
@@ -101,11 +122,14 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
 
 def numbered(folder, pattern):
     """Files by the number in their names."""
-    files = sorted(Path(folder).glob(pattern))
-    found = {int(number[1]): file for file in files if (number := re.search(r"_(\d+)\.", file.name))}
-    if not found:
+    files = {}
+    for file in sorted(Path(folder).glob(pattern)):
+        number = re.search(r"_(\d+)\.", file.name)
+        if number:
+            files[int(number[1])] = file
+    if not files:
         raise SessionError(f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?")
-    return found
+    return files
 
 
 def recover_polar(points, name="points"):
@@ -134,23 +158,25 @@ def recover_polar(points, name="points"):
     x, ahead, offset = LASERSETERO_HEAD.translation
     p_platform = LASERSETERO_CLOUD.inv().apply(points)
     S = np.sqrt(np.maximum(np.sum(p_platform[:, 1:] ** 2, axis=1) - offset**2, 0.0))
-    across, along = p_platform[:, 0] - x, S - ahead
+    across = p_platform[:, 0] - x
+    along = S - ahead
     ranges = np.round(np.hypot(across, along) / COUNT) * COUNT
     steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG)  # 0.1 deg, so no .5 to round
     bearing = np.radians(steps * STEP_DEG)
     # Once more with the exact range and bearing: now the pitch carries the rounding of the published points only.
     S = ranges * np.sin(bearing) + ahead
     pitch = np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
-    line = np.cumsum(np.r_[True, (np.diff(steps) >= 0) | (np.abs(np.diff(pitch)) > 1e-4)]) - 1
+    restarts = np.diff(steps) >= 0
+    jumps = np.abs(np.diff(pitch)) > LINE_JUMP
+    line = np.cumsum(np.r_[True, restarts | jumps]) - 1
     pitch = np.bincount(line, pitch) / np.bincount(line)
     rebuilt = lrf_to_platform(polar_to_points(ranges, bearing), pitch[line], LASERSETERO_HEAD)
     miss = float(np.linalg.norm(rebuilt - p_platform, axis=1).max())
     if not miss <= LARGEST_MISS:
-        raise SessionError(
-            f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, more than {1000 * LARGEST_MISS:g} mm; "
-            "not points of this rig?"
-        )
-    low, high = steps.min(), steps.max()
+        limit = f"more than {1000 * LARGEST_MISS:g} mm; not points of this rig?"
+        raise SessionError(f"{name}: rebuilding the points misses by {1000 * miss:.4f} mm, {limit}")
+    low = steps.min()
+    high = steps.max()
     if low < FIRST or high > LAST:
         reach = f"{STEP_DEG * low:.1f} .. {STEP_DEG * high:.1f} deg"
         raise SessionError(f"{name}: bearings reach {reach}, the LMS400 sees 55 .. 125 deg")
@@ -180,7 +206,8 @@ def read_pcd(file):
         points = np.array(body.split(), dtype=float)
         promised = int(count[1])
     if points.size != 3 * promised or points.size == 0:
-        raise SessionError(f"{file}: {points.size / 3:g} points, the header states {promised}; truncated?")
+        found = f"{points.size / 3:g} points, the header states {promised}"
+        raise SessionError(f"{file}: {found}; truncated?")
     if not np.isfinite(points).all():
         raise SessionError(f"{file}: holds coordinates that are not finite; damaged?")
     return points.reshape(-1, 3)
@@ -194,23 +221,32 @@ def read_bouguet(file):
     """
     found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
     with naming(file):
-        values = {key: np.array((many or one).replace(";", " ").split(), float) for key, many, one in found}
+        values = {}
+        for key, many, one in found:
+            values[key] = np.array((many or one).replace(";", " ").split(), float)
         return _from_bouguet(values)
 
 
 def _from_bouguet(values):
-    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a missing or impossible one."""
-    lengths = {"fc": 2, "cc": 2, "kc": 5, "nx": 1, "ny": 1, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+    """What :func:`read_bouguet` returns, of arrays by name; ValueError for a wrong one."""
+    lengths = {"fc": 2, "cc": 2, "kc": 5, "fc_error": 2, "cc_error": 2, "kc_error": 5}
+    lengths |= {"nx": 1, "ny": 1}
     if lacking := [key for key, length in lengths.items() if len(values.get(key, ())) != length]:
         raise ValueError(f"no value of {', '.join(lacking)}; is this a Calib_Results.m?")
     if endless := [key for key, array in values.items() if not np.isfinite(array).all()]:
         raise ValueError(f"values of {short(endless)} are not finite; damaged?")
-    intrinsics, sigma = (np.concatenate([values[k + s] for k in ("fc", "cc", "kc")]) for s in ("", "_error"))
-    model = CameraModel(int(values["nx"][0]), int(values["ny"][0]), *intrinsics[:4].tolist(), intrinsics[4:])
+    intrinsics = np.concatenate([values[key] for key in ("fc", "cc", "kc")])
+    sigma = np.concatenate([values[f"{key}_error"] for key in ("fc", "cc", "kc")])
+    fx, fy, cx, cy, *distortion = intrinsics.tolist()
+    width = int(values["nx"][0])
+    height = int(values["ny"][0])
+    model = CameraModel(width, height, fx, fy, cx, cy, np.array(distortion))
     poses = {}
     for key in values:
-        if (number := re.fullmatch(r"omc_(\d+)", key)) and f"Tc_{number[1]}" in values:
-            rotation, shift = Rotation.from_rotvec(values[key]), values[f"Tc_{number[1]}"] / 1000
+        number = re.fullmatch(r"omc_(\d+)", key)
+        if number and f"Tc_{number[1]}" in values:
+            rotation = Rotation.from_rotvec(values[key])
+            shift = values[f"Tc_{number[1]}"] / 1000
             poses[number[1]] = transform_to_json(RigidTransform.from_components(shift, rotation))
     both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
     reference = {k: dict(zip(INTRINSIC_NAMES, v.tolist(), strict=True)) for k, v in both.items()}

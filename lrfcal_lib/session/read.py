@@ -36,8 +36,8 @@ DROPPED = "dropped"  # purpose of an image of a placement that was recorded agai
 ARRAYS = ("ranges", "bearings", "placement", "pitch", "time_s", "intensities")
 ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
-PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; of bzip2 and LZMA, zipfile unpacks as much as there is at once
-LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, but reads them first
+PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
+LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, once it has them
 LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
 
 
@@ -75,15 +75,17 @@ SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
 
 def read_scans(path):
     """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
-    file = next((path / name for name in SOURCES if os.path.lexists(path / name)), path / SOURCES[0])
-    if file.suffix == ".npz":
-        if not os.path.lexists(file) and os.path.lexists(path / "lrf") and parts_of(path):
-            remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
-            raise SessionError(f"{path}: the recording was interrupted; {remedy}")
-        return read_npz(file, path), None
-    scans, log = read_telegrams(file, path)
-    with naming(file):
-        return check_scans(scans), log
+    arrays, telegrams = (path / name for name in SOURCES)
+    if os.path.lexists(arrays):
+        return read_npz(arrays, path), None
+    if os.path.lexists(telegrams):
+        scans, log = read_telegrams(telegrams, path)
+        with naming(telegrams):
+            return check_scans(scans), log
+    if os.path.lexists(path / "lrf") and parts_of(path):
+        remedy = f"lrfcal_lib.session.write.finish('{path}') completes it"
+        raise SessionError(f"{path}: the recording was interrupted; {remedy}")
+    raise SessionError(f"{arrays}: no such file; a session needs the scan lines")
 
 
 def parts_of(path):
@@ -93,8 +95,6 @@ def parts_of(path):
 
 def read_npz(file, within):
     """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
-    if not os.path.lexists(file):
-        raise SessionError(f"{file}: no such file; a session needs the scan lines")
     with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
         _check_entries(file, stream)
         with ZipFile(stream) as archive:
@@ -104,7 +104,7 @@ def read_npz(file, within):
 
 
 def _check_entries(file, stream):
-    """Refuse an archive with a long table of contents, of which ZipFile makes objects before it can be asked."""
+    """Refuse an archive with a long table of contents, of which ZipFile makes objects at once."""
     parts = iter(partial(stream.read, 1_000_000), b"")
     entries = sum(part.count(ENTRY) for part in parts)
     if entries > MOST_ENTRIES:
@@ -177,16 +177,24 @@ def check_scans(scans):
 
 def missing_parts(placements, scans, records, cameras, unfinished=None):
     """What a session states and does not hold, as sentences; the rest can be used."""
-    seen = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
-    shot, unfinished = {(r.camera, r.placement) for r in records}, unfinished or ()
-    again = "its recording was not finished, ignored; 'record --resume' records it again"
-    extra = sorted(seen - {*placements, *unfinished})
-    return (
-        *(f"placement {p}: no scan line with a range" for p in placements if p not in seen),
-        *(f"placement {p}: {again}" for p in unfinished),
-        *(f"placement {p}: in the scan lines but not in session.json, ignored" for p in extra),
-        *(f"placement {p}: no image of camera '{c}'" for p in placements for c in cameras if (c, p) not in shot),
-    )
+    scanned = set(scans["placement"][np.isfinite(scans["ranges"]).any(axis=1)].tolist())
+    shot = {(record.camera, record.placement) for record in records}
+    unfinished = unfinished or ()
+    problems = []
+    for placement in placements:
+        if placement not in scanned:
+            problems.append(f"placement {placement}: no scan line with a range")
+    for placement in unfinished:
+        again = "its recording was not finished, ignored; 'record --resume' records it again"
+        problems.append(f"placement {placement}: {again}")
+    for placement in sorted(scanned - {*placements, *unfinished}):
+        unknown = "in the scan lines but not in session.json, ignored"
+        problems.append(f"placement {placement}: {unknown}")
+    for placement in placements:
+        for camera in cameras:
+            if (camera, placement) not in shot:
+                problems.append(f"placement {placement}: no image of camera '{camera}'")
+    return tuple(problems)
 
 
 def inside(path, name, where):
@@ -207,7 +215,9 @@ def read_images(path, facts, unfinished=None):
     file, cameras = path / "images.csv", facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
-    out, lines, skipped = [], {}, {str(p) for p in unfinished or ()}
+    out = []
+    lines = {}  # in which each file stands
+    skipped = {str(placement) for placement in unfinished or ()}
     rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
@@ -222,8 +232,10 @@ def read_images(path, facts, unfinished=None):
                 raise ValueError(f"placement {placement} is not in session.json")
             pitch, time = (float(row[k] or "nan") for k in ("pitch_deg", "t_s"))
             target = inside(path, row["file"], "images.csv: file")
-            if (first := lines.setdefault(target, number)) < number:
-                raise ValueError(f"'{row['file']}' stands in line {first} already; remove one of the two rows")
+            first = lines.setdefault(target, number)
+            if first < number:
+                already = f"stands in line {first} already; remove one of the two rows"
+                raise ValueError(f"'{row['file']}' {already}")
             out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
             check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
     return tuple(out)
@@ -231,9 +243,13 @@ def read_images(path, facts, unfinished=None):
 
 def read_edges(path, facts, records):
     """The picks of edges.csv, if there is one, for images and edges that the session knows."""
-    file, out = path / "edges.csv", []
-    known, edges = {(r.camera, r.file) for r in records}, facts["board"].edges
-    rows = stated.read_table(file, EDGE_COLUMNS, path)[0] if os.path.lexists(file) else ()
+    file = path / "edges.csv"
+    if not os.path.lexists(file):
+        return ()
+    out = []
+    known = {(record.camera, record.file) for record in records}
+    edges = facts["board"].edges
+    rows = stated.read_table(file, EDGE_COLUMNS, path)[0]
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -251,17 +267,23 @@ def read_edges(path, facts, records):
 
 
 def image_size(file, data):
-    """Width and height of a PNG or JPEG image from its header; SessionError if it is cut off, or neither.
+    """Width and height of a PNG or JPEG image from its header.
 
-    Also for a JPEG that takes long to decode, or much memory, by its number of scans or of segments with remarks.
+    SessionError if it is cut off, or neither; also for a JPEG that would take long to decode, or
+    much memory, by its number of scans or of segments with remarks.
     """
+    size = None
     if data.startswith(PNG):
-        size = struct.unpack(">II", data[16:24]) if data[12:16] == b"IHDR" and len(data) >= 24 else None
+        if data[12:16] == b"IHDR" and len(data) >= 24:
+            size = struct.unpack(">II", data[16:24])
         end = b"IEND"
     elif data.startswith(JPEG):
-        for mark, most, things in ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks")):
-            if (count := data.count(mark)) > most:
-                raise SessionError(f"{file}: a JPEG of {count} {things}, more than {most}; write the image again")
+        limits = ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks"))
+        for mark, most, things in limits:
+            count = data.count(mark)
+            if count > most:
+                found = f"a JPEG of {count} {things}, more than {most}"
+                raise SessionError(f"{file}: {found}; write the image again")
         size = _jpeg_size(data)
         end = b"\xff\xd9"
     else:
@@ -272,7 +294,7 @@ def image_size(file, data):
 
 
 def _jpeg_size(data):
-    """Width and height from the frame header of a JPEG, None where it does not come within some segments."""
+    """Width and height from the frame header of a JPEG, None where it does not come soon."""
     at = len(JPEG)
     for _ in range(MOST_SEGMENTS):
         if len(data) < at + 9 or data[at] != 0xFF:
@@ -296,12 +318,15 @@ def check_image_size(file, data, camera, size=None):
         raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")
 
 
+# radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
+SMALLEST_MOVE = 1e-4
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
 SCAN, REMARK = b"\xff\xda", b"\xff\xe1"  # markers, which do not occur within coded pixels
-MOST_SCANS = 100  # of a JPEG, each of which takes up to 30 ms at 30 megapixels; programs write about ten
-MOST_SEGMENTS = 10_000  # of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
+MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write about ten
+# of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
+MOST_SEGMENTS = 10_000
 
 # tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
 ORDERED = {
@@ -385,23 +410,38 @@ class Session:
         if placement not in self.placements:
             raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
         rows = self.scans["placement"] == placement
-        picked = {k: v[rows] for k, v in self.scans.items() if k in ("ranges", "pitch", "time_s", "intensities")}
-        if not np.isfinite(picked["ranges"]).any():
+        ranges = self.scans["ranges"][rows]
+        if not np.isfinite(ranges).any():
             raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
-        return Sweep(int(placement), bearings=self.scans["bearings"], **picked)
+        intensities = self.scans.get("intensities")
+        if intensities is not None:
+            intensities = intensities[rows]
+        return Sweep(
+            placement=int(placement),
+            ranges=ranges,
+            bearings=self.scans["bearings"],
+            pitch=self.scans["pitch"][rows],
+            time_s=self.scans["time_s"][rows],
+            intensities=intensities,
+        )
 
     def images(self, camera=None, placement=None, purpose=None):
         """The records of images that match all that is given, in the order of images.csv."""
-        wanted = {"camera": camera, "placement": placement, "purpose": purpose}
-        wanted = {k: v for k, v in wanted.items() if v is not None}
-        return tuple(r for r in self.image_records if all(getattr(r, k) == v for k, v in wanted.items()))
+        records = []
+        for record in self.image_records:
+            if camera not in (None, record.camera) or placement not in (None, record.placement):
+                continue
+            if purpose in (None, record.purpose):
+                records.append(record)
+        return tuple(records)
 
     def read_image(self, record):
         """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width, 3).
 
         SessionError if the file cannot be decoded or has another size than the camera.
         """
-        camera, data = self.cameras[record.camera], stated.read_bytes(record.file, self.path)
+        camera = self.cameras[record.camera]
+        data = stated.read_bytes(record.file, self.path)
         check_image_size(record.file, data, camera)
         with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -423,8 +463,11 @@ class Session:
     def sweep_direction(self, placement):
         """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one pitch."""
         pitch = self.sweep(placement).pitch
-        moved = np.nanmedian(pitch[-(len(pitch) // 4 + 1) :]) - np.nanmedian(pitch[: len(pitch) // 4 + 1])
-        return int(np.sign(moved)) if abs(moved) > 1e-4 else 0
+        quarter = len(pitch) // 4 + 1
+        moved = np.nanmedian(pitch[-quarter:]) - np.nanmedian(pitch[:quarter])
+        if not abs(moved) > SMALLEST_MOVE:
+            return 0
+        return int(np.sign(moved))
 
 
 def open_session(path):
@@ -489,23 +532,39 @@ def _too_dark(session, dark):
 
 
 def _disorder(session):
-    """What two writers, or hands, do to tables: time that runs back within a placement, rows that stand there twice."""
+    """What two writers, or hands, do to tables."""
     for name, (columns, group, once) in ORDERED.items():
-        file, last, seen = session.path / name, {}, {}
-        rows = stated.read_table(file, columns, session.path, torn=True)[0] if os.path.lexists(file) else ()
-        for line, row in enumerate(rows, start=2):
-            where, what = f"{file} line {line}", tuple(row[key] for key in once)
-            if what in seen:
-                yield f"{where}: {', '.join(what)} stands in line {seen[what]} already; remove one of them"
-            seen.setdefault(what, line)
-            key = tuple(row[key] for key in group)
-            if row.get("t_s") and row["placement"] and row.get("purpose") != DROPPED:
-                try:
-                    time = float(row["t_s"])
-                except ValueError:  # of a placement that was not finished: no other reader looks at it
-                    yield f"{where}: t_s is {row['t_s']!r}: a number of seconds is needed"
-                    continue
-                if time < last.get(key, -math.inf):
-                    back = f"t_s runs back from {last[key]:.9g} to {time:.9g}"
-                    yield f"{where}: {back}: two writers at once? Record the placement again"
-                last[key] = time
+        file = session.path / name
+        if os.path.lexists(file):
+            rows = stated.read_table(file, columns, session.path, torn=True)[0]
+            yield from _rows_twice(file, rows, once)
+            yield from _times_back(file, rows, group)
+
+
+def _rows_twice(file, rows, once):
+    """Sentences about rows whose values of the columns `once` stand in a table already."""
+    first = {}
+    for line, row in enumerate(rows, start=2):
+        values = tuple(row[key] for key in once)
+        if values in first:
+            already = f"stands in line {first[values]} already; remove one of them"
+            yield f"{file} line {line}: {', '.join(values)} {already}"
+        first.setdefault(values, line)
+
+
+def _times_back(file, rows, group):
+    """Sentences about times that run back between rows of one `group`, by these columns."""
+    last = {}
+    for line, row in enumerate(rows, start=2):
+        if not row.get("t_s") or not row["placement"] or row.get("purpose") == DROPPED:
+            continue
+        try:
+            time = float(row["t_s"])
+        except ValueError:  # of a placement that was not finished: no other reader looks at it
+            yield f"{file} line {line}: t_s is {row['t_s']!r}: a number of seconds is needed"
+            continue
+        values = tuple(row[key] for key in group)
+        if time < last.get(values, -math.inf):
+            back = f"t_s runs back from {last[values]:.9g} to {time:.9g}"
+            yield f"{file} line {line}: {back}: two writers at once? Record the placement again"
+        last[values] = time

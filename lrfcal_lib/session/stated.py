@@ -44,7 +44,7 @@ KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "
 
 
 def printable(text):
-    """Text as a terminal may show it: what steers the terminal, or cannot be encoded, stands there in letters."""
+    """Text as a terminal may show it: what steers it, or cannot be encoded, stands in letters."""
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
@@ -83,20 +83,28 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
     Raises
     ------
     SessionError
-        If the file, or a folder between it and the session's, is a link, or the file is none (a pipe, a device), too
-        large to be read, or to be written and known by another name as well (a hard link, maybe outside).
+        If the file, or a folder between it and the session's, is a link, or the file is none (a
+        pipe, a device), too large to be read, or to be written and known by another name as well
+        (a hard link, maybe outside).
     OSError
         If it cannot be opened.
     """
-    file = Path(os.path.realpath(file)) if within is None else checked(file, within)
+    file = Path(file)
+    writes = flags != os.O_RDONLY
+    if within is not None:
+        checked(file, within)
+        flags |= os.O_NOFOLLOW
     with suppress(FileNotFoundError):  # a device is not even opened
-        found = file.lstat()
+        found = os.stat(file, follow_symlinks=within is None)
         _refuse_other(file, found, "-", "a file")
-        if flags == os.O_RDONLY and found.st_size > most:
+        if not writes and found.st_size > most:
             raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
-    inner = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-    stream = os.fdopen(inner, "rb" if flags == os.O_RDONLY else "r+b" if flags & os.O_RDWR else "wb")
-    if flags != os.O_RDONLY and os.fstat(inner).st_nlink > 1:
+    inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    mode = "rb"
+    if writes:
+        mode = "r+b" if flags & os.O_RDWR else "wb"
+    stream = os.fdopen(inner, mode)
+    if writes and os.fstat(inner).st_nlink > 1:
         stream.close()
         remedy = "copy the session's folder and write to the copy"
         raise SessionError(f"{file}: has another name elsewhere (a hard link); {remedy}")
@@ -137,7 +145,8 @@ def _locked(file, path):
     except BlockingIOError:
         with stream:
             holder = stream.read(200).decode(errors="replace") or "another process"
-        raise SessionError(f"{path}: {holder} writes this session: end that first, or choose another one") from None
+        remedy = "end that first, or choose another one"
+        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
     return stream
 
 
@@ -184,9 +193,12 @@ def read_bytes(file, within=None, most=LARGEST_FILE):
     """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
     try:
         with opened(file, within, most=most) as stream:
-            return stream.read()
+            data = stream.read(most + 1)
     except OSError as error:
         raise SessionError(f"{file}: {error.strerror}; the session needs this file") from error
+    if len(data) > most:  # files of the system do not tell their size
+        raise SessionError(f"{file}: more than {most / 1e6:.0f} MB; {SPLIT}")
+    return data
 
 
 def read_json(file, within):

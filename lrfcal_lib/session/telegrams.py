@@ -95,7 +95,8 @@ def read_telegrams(file, within):
     in rising order at the same placement and the same pitch; a part that is missing stays NaN. What the device calls
     larger than its maximum is NaN here.
     """
-    data, path = np.frombuffer(read_bytes(file, within), np.uint8), file.with_name("index.csv")
+    data = np.frombuffer(read_bytes(file, within), np.uint8)
+    path = file.with_name("index.csv")
     rows, torn = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
         index = {key: np.array([float(row[key] or "nan") for row in rows]) for key in ("t_s", "pitch_deg")}
@@ -104,32 +105,43 @@ def read_telegrams(file, within):
             index[key] = np.array(numbers, int)
         _check_index(index, len(data), file)
         check_amount(len(data) // 2)
-    offset, length = index["offset"], index["length"]
+    offset = index["offset"]
+    length = index["length"]
     outcome = np.where(offset + length > len(data), TRUNCATED, WRONG).astype(np.uint8)
     whole = np.flatnonzero(outcome == WRONG)
-    good = (data[offset[whole]] == codec.STX) & (codec.word(data, offset[whole] + 2) + codec.OVERHEAD == length[whole])
-    good &= codec.check_crc(data, offset[whole], length[whole])
-    outcome[whole[good]] = OTHER
-    if good.sum() < len(good) / 2:
-        bad = f"{len(good) - good.sum()} of {len(good)} telegrams have a wrong CRC in {file.name}"
+    good = _sound(data, offset[whole], length[whole])
+    sound = whole[good]
+    outcome[sound] = OTHER
+    if len(sound) < len(whole) / 2:
+        bad = f"{len(whole) - len(sound)} of {len(whole)} telegrams have a wrong CRC in {file.name}"
         raise SessionError(f"{path}: {bad}; the two files are not of one recording, restore both")
     with naming(file):
-        some = whole[good]
-        mode, notes = _modes(data, index, some)
+        mode, notes = _modes(data, index, sound)
         groups = []
-        for one in np.unique(mode):
-            mine = some[mode == one]
-            groups += [(mine[g.rows], g) for g in codec.decode_scans(data, offset[mine], length[mine], int(one))]
+        for number in np.unique(mode):
+            rows = sound[mode == number]
+            for group in codec.decode_scans(data, offset[rows], length[rows], int(number)):
+                groups.append((rows[group.rows], group))
         scans = _lines(groups, index)
     values = np.zeros((len(outcome), len(codec.REASONS)), int)
-    for mine, group in groups:
-        outcome[mine], reasons = SCANNED, group.reasons
-        row, column = np.nonzero(reasons)  # nearly all values are valid
-        np.add.at(values, (mine[row], reasons[row, column]), 1)
-        values[mine, 0] = reasons.shape[1] - values[mine].sum(axis=1)
-    problems = [f"{path}: the last row is cut off, its telegram is left out"] * torn
-    problems += [f"{file}: {note}" for note in [*notes, *_damage(index, outcome, len(data))]]
+    for rows, group in groups:
+        outcome[rows] = SCANNED
+        row, column = np.nonzero(group.reasons)  # nearly all values are valid
+        np.add.at(values, (rows[row], group.reasons[row, column]), 1)
+        values[rows, 0] = group.reasons.shape[1] - values[rows].sum(axis=1)
+    problems = []
+    if torn:
+        problems.append(f"{path}: the last row is cut off, its telegram is left out")
+    for note in [*notes, *_damage(index, outcome, len(data))]:
+        problems.append(f"{file}: {note}")
     return scans, TelegramLog(file, offset, index["placement"], outcome, values, tuple(problems))
+
+
+def _sound(data, offset, length):
+    """Which telegrams begin as they should, have the length that they state, and a right CRC."""
+    begins = data[offset] == codec.STX
+    stated = codec.word(data, offset + 2) + codec.OVERHEAD
+    return begins & (stated == length) & codec.check_crc(data, offset, length)
 
 
 def _check_index(index, size, file):
@@ -157,12 +169,17 @@ def _place(index, row):
 def _modes(data, index, rows):
     """Measuring mode at each row: that of the last telegram that states it, before it the first. Also notes."""
     codes = data[index["offset"][rows] + 4]
-    telling, stated, notes = [], [], []
+    telling = []
+    stated = []
+    notes = []
     for row in np.flatnonzero(np.isin(codes, (codec.CONFIGURATION, codec.CONFIGURED, codec.STATUS))):
         first = index["offset"][rows[row]]
-        parse = codec.parse_status if codes[row] == codec.STATUS else codec.parse_configuration
+        end = first + index["length"][rows[row]]
+        parse = codec.parse_configuration
+        if codes[row] == codec.STATUS:
+            parse = codec.parse_status
         try:
-            stated.append(parse(data[first : first + index["length"][rows[row]]].tobytes()).measuring_mode)
+            stated.append(parse(data[first:end].tobytes()).measuring_mode)
             telling.append(row)
         except codec.TelegramError as error:
             notes.append(f"{_place(index, rows[row])}: {error}; ignored")
@@ -175,40 +192,54 @@ def _modes(data, index, rows):
 
 def _lines(groups, index):
     """Scan lines on one grid of bearings; refuses a mixture of variants."""
-    partial, number = (np.full(len(index["offset"]), -2) for _ in range(2))
+    n = len(index["offset"])
+    # which quarter of a degree the scan is turned by; -1 a whole scan, -2 no scan
+    partial = np.full(n, -2)
+    number = np.full(n, -2)  # of the scan, as the device counts; -1 where it does not
     for rows, group in groups:
-        partial[rows], number[rows] = group.partial, group.telegram_index
+        partial[rows] = group.partial
+        number[rows] = group.telegram_index
     rows = np.flatnonzero((partial > -2) & (index["placement"] >= 0))
     if not len(rows):
         raise ValueError("no telegram with a scan belongs to a placement: was the device streaming?")
-    step, count = np.diff(partial[rows]), number[rows]
-    later = (partial[rows][:-1] >= 0) & (step > 0)  # part of the line that the scan before began
-    later &= (np.diff(index["placement"][rows]) == 0) & (np.diff(index["pitch_deg"][rows]) == 0)
-    later &= (count[1:] < 0) | (count[:-1] < 0) | (np.diff(count) % 256 == step)
-    line = np.full(len(partial), -1)
-    line[rows] = np.cumsum(np.r_[True, ~later]) - 1
-    kinds = {(g.words.shape[1], int(part)) for mine, g in groups for part in np.unique(g.partial[line[mine] >= 0])}
+    line = np.full(n, -1)
+    line[rows] = np.cumsum(np.r_[True, ~_goes_on(partial[rows], number[rows], index, rows)]) - 1
+    kinds = set()
+    for mine, group in groups:
+        for part in np.unique(group.partial[line[mine] >= 0]):
+            kinds.add((group.words.shape[1], int(part)))
     if len(kinds) > 1 and any(part < 0 for _, part in kinds):
         counts = short(sorted({values for values, _ in kinds}))
         raise ValueError(f"scans of {counts} values are mixed: a session holds one variant, split the recording")
     quarters = np.unique(np.concatenate([codec.scan_quarters(*kind) for kind in sorted(kinds)]))
-    check_amount((line.max() + 1) * len(quarters))
-    ranges = np.full((line.max() + 1, len(quarters)), np.nan)
-    for some, group in groups:
-        used = line[some] >= 0
+    lines = line.max() + 1
+    check_amount(lines * len(quarters))
+    ranges = np.full((lines, len(quarters)), np.nan)
+    for mine, group in groups:
+        used = line[mine] >= 0
         for part in np.unique(group.partial[used]):
-            mine = used & (group.partial == part)
+            turned = used & (group.partial == part)
             columns = np.searchsorted(quarters, codec.scan_quarters(group.words.shape[1], part))
-            ranges[line[some[mine]][:, None], columns] = group.ranges[mine]
+            ranges[line[mine[turned]][:, None], columns] = group.ranges[turned]
     first = rows[np.searchsorted(line[rows], np.arange(len(ranges)))]
     time = np.bincount(line[rows], index["t_s"][rows]) / np.bincount(line[rows])
     scans = {"ranges": ranges, "bearings": np.radians(quarters / 4), "time_s": time}
     return {**scans, "placement": index["placement"][first], "pitch": np.radians(index["pitch_deg"][first])}
 
 
+def _goes_on(partial, number, index, rows):
+    """Whether each scan but the first goes on with the line of the one before, shape (n - 1,)."""
+    step = np.diff(partial)
+    rises = (partial[:-1] >= 0) & (step > 0)
+    stays = (np.diff(index["placement"][rows]) == 0) & (np.diff(index["pitch_deg"][rows]) == 0)
+    uncounted = (number[1:] < 0) | (number[:-1] < 0)
+    return rises & stays & (uncounted | (np.diff(number) % 256 == step))
+
+
 def _damage(index, outcome, size):
     """Sentences about telegrams that could not be used."""
-    wrong, last = index["offset"][outcome == WRONG].tolist(), int(index["offset"][-1])
+    wrong = index["offset"][outcome == WRONG].tolist()
+    last = int(index["offset"][-1])
     tail = size - last - int(index["length"][-1])
     if wrong:
         yield f"{len(wrong)} of {len(outcome)} telegrams have a wrong CRC, left out, at {short(wrong)}"

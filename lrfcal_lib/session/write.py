@@ -49,24 +49,46 @@ class SessionWriter:
     """
 
     def __init__(
-        self, path, board, lrf, cameras=(), T_head_lrf=None, *, name=None, licence="", source="", simulated=False,
-        platform_sigma=None, reference=None,
-    ):  # fmt: skip
+        self,
+        path,
+        board,
+        lrf,
+        cameras=(),
+        T_head_lrf=None,
+        *,
+        name=None,
+        licence="",
+        source="",
+        simulated=False,
+        platform_sigma=None,
+        reference=None,
+    ):
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
-        self.bearings, self.parts, self.shots = None, 0, dict.fromkeys(self.cameras, 0)
+        self.bearings = None  # of the sweeps so far
+        self.parts = 0  # files of sweeps so far
+        self.shots = dict.fromkeys(self.cameras, 0)  # images so far, by camera
         self.telegrams = self.path / "lrf" / "telegrams.bin"
         platform = {"T_head_lrf": stated.transform_to_json(T_head_lrf)}
         if platform_sigma is not None:
             platform["sigma_direction_deg"] = round(math.degrees(platform_sigma[0]), 9)
             platform["sigma_offset_m"] = platform_sigma[1]
+        rig = {
+            "lrf": stated.lrf_to_json(lrf),
+            "platform": platform,
+            "cameras": {name: stated.camera_to_json(info) for name, info in self.cameras.items()},
+        }
         self.data = {
-            "schema": stated.SCHEMA, "name": name or self.path.resolve().name, "licence": licence, "source": source,
-            "simulated": simulated, "board": stated.board_to_json(board),
-            "rig": {"lrf": stated.lrf_to_json(lrf), "platform": platform,
-                    "cameras": {c.name: stated.camera_to_json(c) for c in self.cameras.values()}},
-            "placements": [], "reference": reference or {},
-        }  # fmt: skip
+            "schema": stated.SCHEMA,
+            "name": name or self.path.resolve().name,
+            "licence": licence,
+            "source": source,
+            "simulated": simulated,
+            "board": stated.board_to_json(board),
+            "rig": rig,
+            "placements": [],
+            "reference": reference or {},
+        }
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
         if self.path.exists() and not self.path.is_dir():
@@ -136,15 +158,21 @@ class SessionWriter:
         """
         if self.telegrams.exists():
             raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
-        ranges, bearings = np.array(ranges, float, ndmin=2), np.asarray(bearings, float)
-        time_s = np.full(len(ranges), np.nan) if time_s is None else time_s
-        scans = {"ranges": ranges, "bearings": bearings, "pitch": pitch, "time_s": time_s, "intensities": intensities}
-        scans = {key: np.asarray(values, float) for key, values in scans.items() if values is not None}
+        ranges = np.array(ranges, float, ndmin=2)
+        bearings = np.asarray(bearings, float)
+        if time_s is None:
+            time_s = np.full(len(ranges), np.nan)
+        scans = {"ranges": ranges, "bearings": bearings}
+        scans["pitch"] = np.asarray(pitch, float)
+        scans["time_s"] = np.asarray(time_s, float)
+        if intensities is not None:
+            scans["intensities"] = np.asarray(intensities, float)
         with naming(f"{self.path}: placement {placement}"):
             scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
                 raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
-        self.bearings, self.parts = bearings, self.parts + 1
+        self.bearings = bearings
+        self.parts += 1
         self._write(f"lrf/part_{self.parts:06d}.npz", scans)
         self._note_placement(placement)
 
@@ -168,7 +196,8 @@ class SessionWriter:
         """
         with naming(f"{self.path}: placement {placement}"):
             lengths = [len(raw) for raw in telegrams]
-            pitch, time_s = (np.broadcast_to(np.asarray(a, float), len(telegrams)) for a in (pitch, time_s))
+            pitch = np.broadcast_to(np.asarray(pitch, float), len(telegrams))
+            time_s = np.broadcast_to(np.asarray(time_s, float), len(telegrams))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
                 raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
             if self.parts:
@@ -176,9 +205,13 @@ class SessionWriter:
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
         self._note_placement(placement)
         offset = append_file(self.telegrams, b"".join(telegrams), self.path)
-        offsets, numbers = offset + np.cumsum([0, *lengths[:-1]]), ["" if placement < 0 else placement] * len(telegrams)
-        columns = map(cell, time_s), offsets, lengths, numbers, map(cell, np.degrees(pitch))
-        self._append_rows("lrf/index.csv", zip(*columns, strict=True))
+        offsets = offset + np.cumsum([0, *lengths[:-1]])
+        number = number_cell(placement)
+        rows = []
+        pitch_deg = np.degrees(pitch)
+        for begin, length, at, angle in zip(offsets, lengths, time_s, pitch_deg, strict=True):
+            rows.append([cell(at), begin, length, number, cell(angle)])
+        self._append_rows("lrf/index.csv", rows)
 
     def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
         """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red pixels (h, w, 3).
@@ -189,19 +222,23 @@ class SessionWriter:
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
-        what, content = f"camera '{camera}'", image
+        what = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
             content = cv2.imencode(".png", image)[1].tobytes()
-        elif not isinstance(image, bytes):
-            what, content = image, stated.read_bytes(image)
+        elif isinstance(image, bytes):
+            content = image
+        else:
+            what = image
+            content = stated.read_bytes(image)
         read.check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
-        kind = "jpg" if content[:2] == b"\xff\xd8" else "png"
+        kind = "jpg" if content.startswith(read.JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
-        where = name, "" if placement < 0 else placement, cell(math.degrees(pitch))
-        self._append_rows("images.csv", [[cell(time_s), camera, *where, purpose]])
+        number = number_cell(placement)
+        row = [cell(time_s), camera, name, number, cell(math.degrees(pitch)), purpose]
+        self._append_rows("images.csv", [row])
 
 
 def finish(path):
@@ -221,20 +258,28 @@ def complete(path):
     mend_tables(path)
     if os.path.lexists(path / "lrf" / "telegrams.bin"):
         return
-    if not (parts := read.parts_of(path)):
+    parts = read.parts_of(path)
+    if not parts:
         raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
     sweeps = [read.read_npz(part, path) for part in parts]
-    shared = [k for k in sweeps[0] if k != "bearings" and all(k in s for s in sweeps)]
-    scans = {k: np.concatenate([s[k] for s in sweeps]) for k in shared}
-    write_file(path / "lrf" / "scans.npz", {**scans, "bearings": sweeps[0]["bearings"]}, path)
+    scans = {}
+    for key in sweeps[0]:
+        if key != "bearings" and all(key in sweep for sweep in sweeps):
+            scans[key] = np.concatenate([sweep[key] for sweep in sweeps])
+    scans["bearings"] = sweeps[0]["bearings"]
+    write_file(path / "lrf" / "scans.npz", scans, path)
     for part in parts:
         part.unlink()
 
 
 def mend_tables(path):
     """Remove rows that a crash cut off at the end of a session's tables."""
-    for table in (path / "images.csv", path / "lrf" / "index.csv", path / "platform.csv"):
-        if os.path.lexists(table) and not (data := stated.read_bytes(table, path)).endswith(b"\n"):
+    for name in ("images.csv", "lrf/index.csv", "platform.csv"):
+        table = path / name
+        if not os.path.lexists(table):
+            continue
+        data = stated.read_bytes(table, path)
+        if not data.endswith(b"\n"):
             write_file(table, data.rpartition(b"\n")[0] + b"\n", path)
 
 
@@ -246,6 +291,11 @@ def as_lines(rows):
 def cell(value):
     """A number as it stands in a table, empty for NaN."""
     return "" if math.isnan(value) else repr(round(float(value), 9))
+
+
+def number_cell(placement):
+    """The number of a placement as it stands in a table, empty for none."""
+    return "" if placement < 0 else str(placement)
 
 
 def write_file(file, content, within):
@@ -352,21 +402,29 @@ class SessionRecorder(SessionWriter):
 
     def _go_on(self):
         """Take over what an earlier recording wrote, without the placement that it did not finish."""
-        mine, data = json.loads(json.dumps(self.data)), stated.read_json(self.path / "session.json", self.path)
+        mine = json.loads(json.dumps(self.data))
+        data = stated.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
             known = stated.parse_session(data)
-            for key in (key for key in ("board", "rig") if data[key] != mine[key]):
-                where = _first_difference(data[key], mine[key], key)
-                raise ValueError(f"{where}, unlike the rig now: go on with the same rig file, or begin another one")
-        self.data = {**data, "placements": list(known["placements"]), "unfinished": list(known["unfinished"] or ())}
+            for key in ("board", "rig"):
+                if data[key] != mine[key]:
+                    where = _first_difference(data[key], mine[key], key)
+                    remedy = "go on with the same rig file, or begin another one"
+                    raise ValueError(f"{where}, unlike the rig now: {remedy}")
+        self.data = dict(data)
+        self.data["placements"] = list(known["placements"])
+        self.data["unfinished"] = list(known["unfinished"] or ())
         self._make_folders()
         mend_tables(self.path)
         for placement in self.data["unfinished"]:
             self._mark_dropped(placement)
         self._state(unfinished=[])
         for camera in self.cameras:
-            names = [file.stem for file in (self.path / "images" / camera).iterdir() if file.suffix != ".draft"]
-            self.shots[camera] = max((int(name) for name in names if name.isdecimal()), default=0)
+            numbers = [0]
+            for file in (self.path / "images" / camera).iterdir():
+                if file.suffix != ".draft" and file.stem.isdecimal():
+                    numbers.append(int(file.stem))
+            self.shots[camera] = max(numbers)
 
     def begin_placement(self, placement):
         """State that a placement is being recorded from now on; one that was broken off is dropped.
@@ -396,7 +454,11 @@ class SessionRecorder(SessionWriter):
 
     def add_platform(self, rows):
         """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN where unknown."""
-        self._append_rows("platform.csv", [[cell(t), *(cell(math.degrees(a)) for a in both)] for t, *both in rows])
+        cells = []
+        for time_s, commanded, measured in rows:
+            angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
+            cells.append([cell(time_s), *angles])
+        self._append_rows("platform.csv", cells)
 
     def finish(self):
         """Close the recording: nothing can be half done in it any more."""
@@ -412,20 +474,31 @@ class SessionRecorder(SessionWriter):
 
     def shots_of(self, purpose):
         """Numbers of images of a purpose, a dict by camera."""
-        rows = stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0] if self.cameras else []
-        return {c: sum(row["camera"] == c and row["purpose"] == purpose for row in rows) for c in self.cameras}
+        counts = dict.fromkeys(self.cameras, 0)
+        if not counts:
+            return counts
+        for row in stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
+            if row["camera"] in counts and row["purpose"] == purpose:
+                counts[row["camera"]] += 1
+        return counts
 
     def _note_placement(self, placement):
         if placement not in (-1, *self.data["unfinished"]):
             raise SessionError(f"{self.path}: placement {placement} was not begun")
 
     def _mark_dropped(self, placement):
-        images = "images.csv", read.IMAGE_COLUMNS, {"purpose": read.DROPPED}
-        for name, columns, mark in (("lrf/index.csv", INDEX_COLUMNS, {"placement": ""}), images):
-            if os.path.lexists(self.path / name):
-                rows = stated.read_table(self.path / name, columns, self.path)[0]
-                rows = [row | mark if row["placement"] == str(placement) else row for row in rows]
-                self._write(name, as_lines([columns, *(row.values() for row in rows)]))
+        self._mark_rows("lrf/index.csv", INDEX_COLUMNS, placement, {"placement": ""})
+        self._mark_rows("images.csv", read.IMAGE_COLUMNS, placement, {"purpose": read.DROPPED})
+
+    def _mark_rows(self, name, columns, placement, mark):
+        """Write other values into the rows of a placement in a table, if there is one."""
+        if not os.path.lexists(self.path / name):
+            return
+        rows = stated.read_table(self.path / name, columns, self.path)[0]
+        for row in rows:
+            if row["placement"] == str(placement):
+                row.update(mark)
+        self._write(name, as_lines([columns, *(row.values() for row in rows)]))
 
 
 def _first_difference(old, new, where):
