@@ -30,7 +30,9 @@ from lrfcal_lib.calibrate.reconstruct import Painter, View
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
+from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, encode_scan, split_stream
+from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import converged, of_placements, solve_joint
 from lrfcal_lib.solvers.joint_start import start_states, thin
@@ -39,10 +41,11 @@ ROOT = Path(__file__).resolve().parent.parent
 FULL = {
     "repeats": 7, "trials": 1000, "placements": (10, 30, 100, 300, 1000), "joint": 100, "points": 10_000_000,
     "growth": (10_000, 100_000, 1_000_000, 10_000_000, 100_000_000), "telegrams": 20_000, "session": "sim_lms221",
+    "pixels": 12_000_000,
 }  # fmt: skip
 TINY = {  # for the test, which only asks whether everything is written
     "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "points": 10_000, "growth": (1_000,),
-    "telegrams": 100, "session": None,
+    "telegrams": 100, "session": None, "pixels": 2_000_000,
 }  # fmt: skip
 CHUNK = 1_000_000  # points that growth hands over at a time
 SHORT = 0.02  # seconds
@@ -221,6 +224,21 @@ def decoding(size):
     yield "decode_mb_per_s", len(data) / 1e6 / ours, "decode_vs_plain", "one by one", 100 * theirs / ours, whole
 
 
+def images(size):
+    """A large image decoded and its chessboard found to a fraction of a pixel: nothing else does the same."""
+    file = next((ROOT / "data" / "sim_quick" / "images" / "left").iterdir())
+    small = cv2.imread(str(file))
+    times = np.sqrt(size["pixels"] / (small.shape[0] * small.shape[1]))
+    large = cv2.resize(small, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+    data = cv2.imencode(".jpg", large)[1]
+    finder = PatternFinder(open_session(ROOT / "data" / "sim_quick").board.pattern)
+
+    def find():
+        return finder(cv2.imdecode(data, cv2.IMREAD_COLOR))
+
+    yield "image_12mp_s", seconds(min(size["repeats"], 3), find)[0], None, "", np.nan, find
+
+
 def commands(size):
     """Whole commands on a shipped session, once each: nothing else does the same."""
     for key, verb in (("calibrate_s", "calibrate"), ("report_s", "report")):
@@ -279,7 +297,7 @@ def plot(table, path):
 def main(out, size=None):
     """Measure everything at a size and write bench.json, bench.csv and growth.png."""
     size, rows, figures = size or FULL, [], {}
-    for part in (cameras, joint, colouring, decoding, commands):
+    for part in (cameras, joint, colouring, decoding, images, commands):
         for key, value, ratio_key, against, times_faster, call in part(size):
             rows.append([key, value, against, times_faster, memory(call) if call else np.nan])
             figures |= {key: value, ratio_key: times_faster} if ratio_key else {key: value}

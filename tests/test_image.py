@@ -18,7 +18,13 @@ from lrfcal_lib.preprocess import edges_in_image, intrinsics, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
 from lrfcal_lib.preprocess.edges_in_image import picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
-from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders
+from lrfcal_lib.preprocess.pattern_in_image import (
+    PatternFinder,
+    PatternNotFound,
+    pattern_orders,
+    scale_error,
+    square_px,
+)
 from lrfcal_lib.session.read import EdgePick, ImageRecord
 
 SIZE = 640, 480
@@ -43,27 +49,27 @@ def rays():
     return ((undistort(uv, MODEL) - [MODEL.cx, MODEL.cy]) / [MODEL.fx, MODEL.fy]).astype(np.float32)
 
 
-def render(pose, board=SHEET, background=170.0, noise=1.5, seed=0):
+def render(pose, board=SHEET, background=170.0, noise=1.5, seed=0, rim=1.0):
     """Image of a board, every pixel averaged over rays, blurred a little, with noise."""
     inverse = np.linalg.inv(pose.as_matrix()[:3, [0, 1, 3]]).astype(np.float32)
     plane = rays() @ inverse[:, :2].T + inverse[:, 2]
     x, y = plane[..., 0] / plane[..., 2], plane[..., 1] / plane[..., 2]
     lines = board.lines().astype(np.float32)
     inside = np.all([a * x + b * y + c < 0 for a, b, c in lines], axis=0) & (plane[..., 2] > 0)
-    shade = np.where(inside, face(x, y, board), background)
+    shade = np.where(inside, face(x, y, board, rim), background)
     small = cv2.GaussianBlur(shade.reshape(MODEL.height, SAMPLES, MODEL.width, SAMPLES).mean(axis=(1, 3)), (0, 0), 0.7)
     noisy = np.clip(small + np.random.default_rng(seed).normal(0, noise, small.shape), 0, 255)
     return np.repeat(np.rint(noisy).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def face(x, y, board):
-    """Grey values of a board: dark, or a white sheet with a chessboard on a brown board."""
+def face(x, y, board, rim=1.0):
+    """Grey values of a board: dark, or a white sheet with a chessboard on a brown one, its rim cut to `rim` squares."""
     if board.pattern is None:
         return np.full_like(x, 35.0)
     p = board.pattern
     u, v = (x - p.origin[0]) / p.square, (y - p.origin[1]) / p.square
     i, j = np.floor(u).astype(np.int16), np.floor(v).astype(np.int16)
-    squares = (i >= -1) & (i < p.columns) & (j >= -1) & (j < p.rows)
+    squares = (u > -rim) & (u < p.columns - 1 + rim) & (v > -rim) & (v < p.rows - 1 + rim)
     white = (u > -1.3) & (u < p.columns + 0.3) & (v > -1.3) & (v < p.rows + 0.3)
     return np.where(squares, np.where((i + j) % 2 == 0, 20.0, 235.0), np.where(white, 235.0, 105.0))
 
@@ -159,6 +165,57 @@ def test_corners_are_found_at_subpixel_level(roll, negative, limit):
     picture = 255 - render(pose) if negative else render(pose)
     off = up_to_a_turn(find_pattern(picture), on_board(pose, PATTERN.points()[:, :2], project))
     assert np.sqrt(np.mean(off**2)) < limit
+
+
+@pytest.mark.parametrize(("side", "rim"), [(6.5, 0.65), (9.5, 1.0)])  # pixels, squares
+def test_small_squares_have_the_right_scale(side, rim):
+    """Also where the outermost squares are cut: no window may reach over the rim of the pattern."""
+    scales = []
+    for seed, pose in enumerate(view_poses(6, seed=3)):
+        far = RigidTransform.from_components([0.01 * seed, -0.07, MODEL.fx * PATTERN.square / side], pose.rotation)
+        exact = on_board(far, PATTERN.points()[:, :2], project)
+        off = up_to_a_turn(find_pattern(render(far, seed=seed, rim=rim)), exact)
+        spread = exact - exact.mean(axis=0)
+        scales.append(np.sum(off * spread) / np.sum(spread**2))
+    assert abs(np.median(scales)) < 0.0005  # a corner that the detector puts elsewhere is left out later
+
+
+def test_small_squares_widen_the_covariance_and_are_named():
+    for side, least in ((6.0, 0.001), (30.0, 0.0)):
+        pose = pose_of(at=(0.0, 0.0, MODEL.fx * PATTERN.square / side), tilt=(0.0, 0.0))
+        pixels = pixels_of([pose], 0.02)[0]
+        found, covariance, _ = board_pose(pixels, PATTERN, MODEL)
+        middle = found.apply(PATTERN.points().mean(axis=0))
+        added = intrinsics.scale_covariance(found, pixels, PATTERN)
+        np.testing.assert_allclose(np.sqrt(np.trace(added)), least * np.linalg.norm(middle), rtol=0.05, atol=2e-6)
+        assert np.all(np.diag(covariance) > np.diag(added))
+        words = survey.small_squares({"left": {4: BoardView(pixels=pixels), 7: BoardView()}}, PATTERN)
+        assert ("left" in words) == (side < 9)
+    assert words == {} == survey.small_squares({"left": {4: BoardView(pixels=pixels)}}, None)
+    assert scale_error(square_px(np.full((24, 2), np.nan), (6, 4))) == 0.01  # no two neighbours
+
+
+def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
+    pose, looked_at = pose_of(-1.2), []
+    small = render(pose, noise=0.0)
+    exact = on_board(pose, PATTERN.points()[:, :2], project)
+
+    def watched(ask):
+        """The same detector, which notes how large the pictures are."""
+        return lambda picture, *rest, **options: looked_at.append(picture.size) or ask(picture, *rest, **options)
+
+    for name in ("findChessboardCorners", "findChessboardCornersSB"):
+        monkeypatch.setattr(cv2, name, watched(getattr(cv2, name)))
+    found = find_pattern(cv2.resize(small, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC))
+    off = up_to_a_turn((found + 0.5) / 4 - 0.5, exact)
+    assert np.abs(off).max() < 0.1
+    assert looked_at and max(looked_at) < 2e6
+    # squares that only the whole image shows
+    far = pose_of(-1.2, at=(0.0, 0.0, 3.3))
+    large = np.full((2400, 3200, 3), 170, np.uint8)
+    large[1200:1680, 900:1540] = render(far)
+    exact = on_board(far, PATTERN.points()[:, :2], project) + [900, 1200]
+    assert np.abs(up_to_a_turn(find_pattern(large), exact)).max() < 0.2
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():

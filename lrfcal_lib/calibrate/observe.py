@@ -12,8 +12,9 @@ from lrfcal_lib.model.observations import CameraObservations, JointObservations,
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import VARIANTS
-from lrfcal_lib.preprocess.survey import all_views
+from lrfcal_lib.preprocess.survey import all_views, small_squares
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
 from lrfcal_lib.solvers.joint_noise import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
@@ -270,9 +271,18 @@ def rough_poses(prepared):
             off = f"its plane is {1000 * max(miss.values()):.0f} mm rms off the"
             words = f"camera {wrong[0]}: {off} scan"
             if len(wrong) == len(miss) > 1:
-                words = f"scan: {off} board in the images of all {len(miss)} cameras (another surface, mixed readings)"
+                words = f"scan: {off} board in the images of all {len(miss)} cameras ({_causes(prepared, placement)})"
             problems[placement] = f"{words}; left out"
     return rough, problems
+
+
+def _causes(prepared, placement):
+    """What may be wrong where the scan of a placement disagrees with all cameras: scan, or images."""
+    causes = "another surface, mixed readings"
+    views = {camera: {placement: seen[placement]} for camera, seen in prepared.views.items() if placement in seen}
+    if small_squares(views, prepared.board.pattern):
+        causes += f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
+    return causes
 
 
 def nearest_edges(board, sides):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.fit.least_squares import Block, minimise
 from lrfcal_lib.model.camera import CameraModel, project, project_jacobians
 from lrfcal_lib.model.geometry import apply_pose, gradient_by_pose, move_pose, pose_array, pose_transform, rotate_points
+from lrfcal_lib.preprocess.pattern_in_image import scale_error, square_px
 
 SIGMA_FLOOR_PX = 0.05  # corner detectors are never better than this on real prints
 OUTLIER_SIGMAS = 4.5
@@ -226,7 +227,8 @@ def board_pose(pixels, pattern, model, relief=None, start=None):
     `pixels` (k, 2) are in the order of ``pattern.points()``, NaN where a corner is not to be used; glaring ones are
     left out. The covariance is for the given intrinsics. The noise is taken from the residuals, and widened where
     neighbouring residuals agree (a wavy sheet), because such errors do not average out. `start` replaces OpenCV's start
-    pose. ValueError with fewer than four corners, or when they do not determine a pose.
+    pose. Where squares are small a share of the distance is added, see :func:`scale_covariance`. ValueError with fewer
+    than four corners, or when they do not determine a pose.
     """
     pixels, points = np.asarray(pixels, float), raised_points(pattern, relief)
     if pixels.shape != (len(points), 2) or np.isfinite(pixels).all(axis=1).sum() < 4:
@@ -241,7 +243,20 @@ def board_pose(pixels, pattern, model, relief=None, start=None):
         a, b = (np.delete(grid, where, axis=axis) for where in (-1, 0))
         rho = np.clip(np.nansum(a * b) / max(np.nansum((a**2 + b**2) / 2), 1e-300), 0.0, 0.8)
         factor *= (1 + rho) / (1 - rho)
-    return result.poses[0], result.pose_covariance[0] * factor, np.isfinite(residuals).all(axis=1)
+    used = np.isfinite(residuals).all(axis=1)
+    covariance = result.pose_covariance[0] * factor
+    return result.poses[0], covariance + scale_covariance(result.poses[0], pixels, pattern), used
+
+
+def scale_covariance(pose, pixels, pattern):
+    """Covariance (6, 6) of ``[w, v]`` of a pose for a scale of all corners that small squares bias.
+
+    Corners farther apart by a share bring the board nearer by it, along the way to its middle.
+    """
+    side = square_px(pixels, (pattern.columns, pattern.rows))
+    away = np.zeros(6)
+    away[3:] = scale_error(side) * pose.apply(pattern.points().mean(axis=0))
+    return np.outer(away, away)
 
 
 def raised_points(pattern, relief=None):

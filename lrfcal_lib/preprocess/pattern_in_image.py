@@ -2,10 +2,28 @@
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates, spline_filter
 
-WINDOW_SHARE, WIDEST_WINDOW = 0.4, 15  # half window around a corner: of the shortest side of a square; pixels
-SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second detector
-BEYOND, LEAST_BEYOND = 0.3, 0.25  # where to look outside the outermost corners, squares; contrast there, of that inside
+SEARCH_PIXELS = 1.5e6  # larger images are searched at a reduced size: the detectors' time grows with it
+REACH = 0.5  # half window around a corner, squares; the outermost squares of some boards are cut to 0.65
+WIDEST_WINDOW_PX = 15.0  # half window where squares are large, but for
+LEAST_REACH = 0.25  # of a square: large images are soft
+SAMPLES = 17  # across a window
+BLURS = 0.3, 0.1  # of the half window, one after the other: rough corners, then noise (0.25 to 0.20 px in lms400_zed)
+REFINE_ROUNDS = 20
+FARTHEST_MOVE = 0.25  # of a square, in each round
+SETTLED_PX = 1e-3  # no corner moves by more: done
+SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second start
+BEYOND = 0.3  # where to look outside the outermost corners, squares
+LEAST_BEYOND = 0.25  # contrast there, a share of that inside
+SMALL_SQUARE_PX = 9.0  # below it the blur of a corner reaches into the squares behind
+# Scale common to all images of rendered boards with cut outermost squares. Blurred by 0.5 to 1 px it
+# is right within 0.02 % from 5 px a square on; blurred by 1.5 px it is 0.09 % too large at 6 px (along
+# the shorter side), 0.02 % at 8 px, below 0.003 % at 10 px. Nobody states the blur of an image.
+SCALE_ERROR = 0.001
+SCALE_ERROR_AT_PX = 6.0
+SCALE_ERROR_POWER = 6
+LARGEST_SCALE_ERROR = 0.01
 
 
 class PatternNotFound(ValueError):
@@ -29,11 +47,10 @@ class PatternFinder:
 
     Notes
     -----
-    The classic detector tells where to look (it wants dark squares on a light ground: boards with white squares on a
-    dark ground are looked for in the negative). Two detectors then compete on that part of the image: the sector-based
-    one (Duda and Frese 2018; 0.14 px on real prints where `cornerSubPix` has 0.18 px, but 0.1 to 0.6 px on simulated
-    images where the other has 0.05 px) and `cornerSubPix` with a wide window. The smoother grid is taken; the
-    sector-based detector, which is slow, is not asked where the other's grid is as smooth as a print can be.
+    OpenCV's detectors only tell where the corners roughly are: the classic one (it wants dark squares
+    on a light ground, so it looks into the negative as well), then the sector-based one (Duda and
+    Frese 2018), whose own corners are off by up to 0.6 % in scale below 30 px a square. Both look at
+    a reduced picture where the image is large; :func:`refine_corners` looks at the image itself.
     """
 
     def __init__(self, pattern):
@@ -41,64 +58,102 @@ class PatternFinder:
         self.negatives = (False, True)
 
     def __call__(self, image):
-        """Recorded pixels of the corners, shape (columns * rows, 2), x right and y down as seen from the printed side.
+        """Recorded pixels of the corners, (columns * rows, 2), x right, y down on the printed side.
 
-        A chessboard looks the same when it is turned by 180 deg: :mod:`lrfcal_lib.preprocess.survey` resolves that.
-        PatternNotFound where no detector finds all corners; ValueError for what is no 8-bit image.
+        A chessboard looks the same when it is turned by 180 deg: :mod:`lrfcal_lib.preprocess.survey`
+        resolves that. PatternNotFound where no detector finds all corners; ValueError for what is no
+        8-bit image.
         """
-        picture, size = grey(image), self.size
-        for negative in self.negatives:
-            rough = classic(picture, size, negative)
-            if rough is not None:
-                self.negatives = (negative, not negative)
-                break
-        corners = sectors(picture, size) if rough is None else _smoothest(picture, size, rough)
-        if corners is None or not _ends_in_squares(picture, corners, size):
-            looks_for = f"no chessboard with {size[0]} x {size[1]} inner corners"
+        picture = grey(image)
+        corners = self._in_reduced(picture)
+        if corners is None:
+            columns, rows = self.size
+            looks_for = f"no chessboard with {columns} x {rows} inner corners"
             raise PatternNotFound(f"{looks_for} in the image: it must be whole, and not glare")
-        grid = corners.reshape(size[1], size[0], 2)
-        x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+        grid = corners.reshape(self.size[1], self.size[0], 2)
+        x = grid[0, -1] - grid[0, 0]
+        y = grid[-1, 0] - grid[0, 0]
         clockwise = x[0] * y[1] - x[1] * y[0] > 0
         return (grid if clockwise else grid[::-1]).reshape(-1, 2)
 
+    def _in_reduced(self, picture):
+        """Corners of a large picture by way of a reduced one, or without it where that shows none."""
+        times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
+        if times <= 1:
+            return self._search(picture)
+        height, width = (length // times for length in picture.shape)
+        whole = picture[: height * times, : width * times]
+        corners = self._search(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+        if corners is None:
+            return self._search(picture, thorough=False)
+        # pixel (0, 0) is the centre of a pixel, of the reduced one as well
+        return refine_corners(picture, (corners + 0.5) * times - 0.5, self.size)
+
+    def _search(self, picture, thorough=True):
+        """Refined corners (n, 2) of a picture, None where there are none; `thorough` costs most."""
+        rough = self._classic(picture)
+        if rough is not None:
+            corners = _smoothest(picture, self.size, rough)
+        else:
+            rough = sectors(picture, self.size, 0)
+            if rough is None and thorough:
+                rough = sectors(picture, self.size)
+            corners = None if rough is None else refine_corners(picture, rough, self.size)
+        if corners is None or not _ends_in_squares(picture, corners, self.size):
+            return None
+        return corners
+
+    def _classic(self, picture):
+        """Rough corners by the classic detector, the last successful of picture and negative first."""
+        for negative in self.negatives:
+            rough = classic(picture, self.size, negative)
+            if rough is not None:
+                self.negatives = (negative, not negative)
+                return rough
+        return None
+
 
 def classic(picture, size, negative):
-    """Rough corners (n, 2) by OpenCV's classic detector, also in the negative; None if there are none."""
+    """Rough corners (n, 2) by OpenCV's classic detector, also in the negative; None without any."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    # the quick check for a chessboard overlooks white squares on a dark board, and saves little time there
-    picture, flags = (255 - picture, flags) if negative else (picture, flags | cv2.CALIB_CB_FAST_CHECK)
+    # the quick check overlooks white squares on a dark board, and saves little time there
+    if negative:
+        picture = 255 - picture
+    else:
+        flags |= cv2.CALIB_CB_FAST_CHECK
     try:
         found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
     except cv2.error:  # some images a few pixels wide are too narrow for its thresholds
         return None
-    return corners.reshape(-1, 2) if found else None
+    return corners.reshape(-1, 2).astype(float) if found else None
 
 
 def sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-    """Corners (n, 2) by OpenCV's sector-based detector; None if there are none."""
+    """Rough corners (n, 2) by OpenCV's sector-based detector; None if there are none.
+
+    The flags make it look at a picture of twice the size, for small squares, at four times the time.
+    """
     found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
     return corners.reshape(-1, 2).astype(float) if found else None
 
 
 def _smoothest(picture, size, rough):
-    """Of the corners of several sub-pixel detectors those whose grid has the least noise."""
-    refined = _refined(picture, rough, size)
+    """Refined corners; from sectors near by where rough corners were too far off for their windows."""
+    refined = refine_corners(picture, rough, size)
     noise = grid_noise(refined, size)
     if noise < SMOOTH_ENOUGH_PX:
         return refined
-    low, high = rough.min(axis=0), rough.max(axis=0)
+    low = rough.min(axis=0)
+    high = rough.max(axis=0)
     margin = 0.22 * (high - low) + 4
-    low, high = np.maximum(low - margin, 0).astype(int), np.minimum(high + margin, picture.shape[::-1]).astype(int)
+    low = np.maximum(low - margin, 0).astype(int)
+    high = np.minimum(high + margin, picture.shape[::-1]).astype(int)
     part = np.ascontiguousarray(picture[low[1] : high[1], low[0] : high[0]])
-    found = sectors(part, size, cv2.CALIB_CB_ACCURACY)
-    found = sectors(picture, size) if found is None else found + low
-    if found is None:
+    start = sectors(part, size, 0)
+    if start is None:
         return refined
-    candidates = [refined, found]
-    if noise > 2 * grid_noise(found, size):
-        # a rough corner was too far off for its window: the sectors are the better start
-        candidates.append(_refined(picture, found, size))
-    return min(candidates, key=lambda corners: grid_noise(corners, size))
+    other = refine_corners(picture, start + low, size)
+    return refined if noise <= grid_noise(other, size) else other
 
 
 def grid_noise(corners, size):
@@ -115,12 +170,106 @@ def grid_noise(corners, size):
     return float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 
 
-def _refined(picture, rough, size):
-    grid = rough.reshape(size[1], size[0], 2)
-    step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-    window = int(np.clip(WINDOW_SHARE * step, 2, WIDEST_WINDOW))
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
-    return cv2.cornerSubPix(picture, rough.astype(np.float32).copy(), (window, window), (-1, -1), stop).astype(float)
+def refine_corners(picture, corners, size):
+    """Corners of a chessboard: the points about which the picture is symmetric.
+
+    A window turned by 180 deg about a corner looks the same, however blurred. The least squares of
+    what differs need no edges, which `cv2.cornerSubPix` does: small squares have none. The window is
+    that of the printed squares, not of the pixels, and falls to zero half a square away: it never
+    reaches the rim of the pattern, however the outermost squares are cut.
+
+    Parameters
+    ----------
+    picture : ndarray of uint8, shape (h, w)
+    corners : ndarray, shape (columns * rows, 2)
+        Start values row by row, pixels; good to a quarter of a square.
+    size : (int, int)
+        Columns and rows of inner corners.
+
+    Returns
+    -------
+    ndarray, shape (columns * rows, 2)
+        A corner that would move farther stays where it started.
+    """
+    start = np.asarray(corners, float)
+    side = np.linalg.norm(square_axes(start, size), axis=1)  # (n, 2), pixels
+    longest = side.max(axis=1)
+    reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # (n,), squares
+    around = int(3 * np.max(reach * longest)) + 3
+    low = np.maximum(start.min(axis=0).astype(int) - around, 0)
+    high = np.minimum(start.max(axis=0).astype(int) + around, picture.shape[::-1])
+    if np.any(high - low < 3):
+        return start
+    part = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    kept = start - low
+    for blur in BLURS:
+        smooth = cv2.GaussianBlur(part, (0, 0), blur * np.median(reach[:, None] * side))
+        refined = symmetric_points(smooth, kept, size, reach)
+        moved = np.linalg.norm(refined - kept, axis=1)
+        kept = np.where((moved < FARTHEST_MOVE * longest)[:, None], refined, kept)
+    return kept + low
+
+
+def symmetric_points(picture, points, size, reach):
+    """Points (n, 2) of a grid about which windows of `reach` squares (n,) are symmetric, from near ones."""
+    place = np.linspace(-1, 1, SAMPLES)
+    u, v = np.meshgrid(place[SAMPLES // 2 + 1 :], place)  # the other half is what it is compared with
+    offsets = np.stack([u.ravel(), v.ravel()])
+    weight = np.prod((1 - offsets**2) ** 2, axis=0)
+    spline = spline_filter(picture, output=np.float32)
+    slopes = [cv2.Sobel(picture, cv2.CV_32F, *by, ksize=1, scale=0.5) for by in ((1, 0), (0, 1))]
+    last = np.array(picture.shape[::-1]) - 1
+
+    def values(source, places, order):
+        """Of a picture or its splines at places (n, m, 2)."""
+        at = places[..., ::-1].reshape(-1, 2).T
+        return map_coordinates(source, at, order=order, prefilter=False, mode="nearest").reshape(places.shape[:2])
+
+    def slope(places):
+        return np.stack([values(by, places, 1) for by in slopes], axis=2)
+
+    for _ in range(REFINE_ROUNDS):
+        arms = (square_axes(points, size) @ offsets * reach[:, None, None]).swapaxes(1, 2)  # (n, m, 2)
+        there = points[:, None] + arms
+        opposite = points[:, None] - arms
+        inside = np.all((there >= 0) & (there <= last) & (opposite >= 0) & (opposite <= last), axis=2)
+        differs = values(spline, there, 3) - values(spline, opposite, 3)
+        jacobian = slope(there) - slope(opposite)
+        weighted = (inside * weight)[..., None] * jacobian
+        normal = weighted.swapaxes(1, 2) @ jacobian
+        right = weighted.swapaxes(1, 2) @ differs[..., None]
+        step = -(np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
+        length = np.linalg.norm(step, axis=1)
+        # a third of the window at most: farther away other corners begin
+        most = reach * np.linalg.norm(square_axes(points, size), axis=1).min(axis=1) / 3
+        points = points + step * np.minimum(1, most / np.maximum(length, most))[:, None]
+        if length.max() < SETTLED_PX:
+            break
+    return points
+
+
+def square_axes(corners, size):
+    """Sides of the squares around every corner, (n, 2, 2): columns along a row and along a column."""
+    grid = np.reshape(corners, (size[1], size[0], 2))
+    along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
+    return np.stack([along, across], axis=-1).reshape(-1, 2, 2)
+
+
+def square_px(corners, size):
+    """Mean side of a chessboard's squares in an image along the shorter of its two axes, pixels.
+
+    Corners (n, 2) that are NaN do not count; NaN where no two neighbours are left.
+    """
+    grid = np.reshape(corners, (size[1], size[0], 2))
+    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
+    means = [np.mean(side[np.isfinite(side)]) for side in sides if np.isfinite(side).any()]
+    return float(min(means, default=np.nan))
+
+
+def scale_error(side_px):
+    """Standard deviation of the scale of corners refined on squares of a side in pixels, a share."""
+    error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
+    return float(np.fmin(error, LARGEST_SCALE_ERROR))  # the largest for a side that is NaN
 
 
 def _ends_in_squares(picture, corners, size):

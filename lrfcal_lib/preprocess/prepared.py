@@ -8,7 +8,7 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
-from lrfcal_lib.preprocess.survey import Outline, views_of
+from lrfcal_lib.preprocess.survey import Outline, small_squares, views_of
 from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.session.read import Session
 from lrfcal_lib.session.stated import SessionError
@@ -131,6 +131,10 @@ def prepare_images(prepared):
     # an image that belongs to no placement is left out
     views = {c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
              for c, own in seen.views.items()}  # fmt: skip
-    problems = prepared.problems | ({"outline": f"faces of the board only: {seen.unseen}"} if seen.unseen else {})
+    problems = dict(prepared.problems)
+    if seen.unseen:
+        problems["outline"] = f"faces of the board only: {seen.unseen}"
+    for camera, words in small_squares(views, seen.board.pattern).items():
+        problems[f"squares {camera}"] = words
     found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
     return replace(prepared, models=seen.models, views=views, **found)

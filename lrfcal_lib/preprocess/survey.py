@@ -13,14 +13,23 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
-from lrfcal_lib.preprocess.pattern_in_image import PatternFinder, PatternNotFound, pattern_orders, spread_views
+from lrfcal_lib.preprocess.pattern_in_image import (
+    SMALL_SQUARE_PX,
+    PatternFinder,
+    PatternNotFound,
+    pattern_orders,
+    scale_error,
+    spread_views,
+    square_px,
+)
 from lrfcal_lib.session.cache import spread
+from lrfcal_lib.session.stated import short
 
 UPRIGHT = 0.05  # weight of the turn between two cameras where few placements tell: most look the same way, head up
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
-REMEMBERED_IMAGES = 128
+REMEMBERED_BYTES = 300_000_000  # of decoded images, in each process
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 
 
@@ -101,7 +110,10 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
         the board does not have.
     """
-    read, marks = lru_cache(maxsize=REMEMBERED_IMAGES)(read), _marks(picks, board)
+    marks = _marks(picks, board)
+    sizes = [m.width * m.height for m in models.values() if m is not None]
+    largest = max(sizes, default=0) or (read(records[0]).size // 3 if records else 1)
+    read = lru_cache(maxsize=REMEMBERED_BYTES // (3 * largest) + 1)(read)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
         lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
@@ -168,6 +180,30 @@ def all_views(prepared):
         same = replace(prepared.views[r.camera][r.placement], file=_view(r).file, pitch=r.pitch)
         views[r.camera].append(same if view is None else view)
     return views
+
+
+def small_squares(views, pattern):
+    """In words, by camera, in which images squares are so small that corners may be biased.
+
+    `views` (dict of BoardView by placement) are by camera, `pattern` is None for a board without.
+    """
+    words = {}
+    if pattern is None:
+        return words
+    size = (pattern.columns, pattern.rows)
+    for camera, seen in views.items():
+        sides = {p: square_px(v.pixels, size) for p, v in seen.items() if v.pixels is not None}
+        small = {p: side for p, side in sides.items() if side < SMALL_SQUARE_PX}
+        if not small:
+            continue
+        least = min(small.values())
+        words[camera] = (
+            f"camera '{camera}': squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of "
+            f"{len(sides)} images (placements {short(list(small))}), {least:.1f} px at least: distances "
+            f"may be off by {100 * scale_error(least):.2g} %, more if the image is blurred; go nearer, or "
+            "print larger squares"
+        )
+    return words
 
 
 def _marks(picks, board):
