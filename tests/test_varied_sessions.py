@@ -1,8 +1,35 @@
 """Sessions of rigs that nothing was tuned on: what is claimed of errors is what the truth shows."""
 
 import numpy as np
+import pytest
 import varied_sessions
+from scipy.stats import chi2
 from shared import campaign
+
+from lrfcal_lib.evaluate.monte_carlo import state_errors
+from lrfcal_lib.solvers.joint import solve_joint
+
+SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(100, marks=campaign)])
+def test_claims_hold_on_varied_draws(count):
+    """All shared unknowns that have a truth, together with their full covariance and one by one."""
+    square, size, inside = 0.0, 0, []
+    for seed in range(count):
+        obs, truth = varied_sessions.drawn(seed)
+        found = solve_joint(obs, sensor=SENSOR, sides=True, lapse=0.01, noise="estimate", required=False)
+        known = [i for i, name in enumerate(found.solution.names) if name not in varied_sessions.NOT_SHOWN]
+        errors = state_errors(found.state, truth, found.unknowns)[known]
+        covariance = found.solution.trusted[np.ix_(known, known)]
+        square += errors @ np.linalg.solve(covariance, errors)
+        size += len(errors)
+        inside.append(varied_sessions.inside(errors / np.sqrt(np.diag(covariance))))
+        print(seed, obs.mounts[0], round(float(errors @ np.linalg.solve(covariance, errors)) / len(errors), 2))
+    print(square / size, np.mean(inside))
+    low, high = chi2.ppf([0.001, 0.999], size) / size
+    assert low * 0.85 < square / size < high * 1.15
+    assert 0.82 < np.mean(inside) < 0.97
 
 
 @campaign

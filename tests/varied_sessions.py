@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numba
 import numpy as np
+from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import norm
 
@@ -151,9 +152,9 @@ def _cast(origin, direction, T, lines, pattern, tones, sheets):
     """Nearest surface along rays (n, 3): distance (inf for none), reflectivity, and the cosine of incidence.
 
     One origin may serve all rays. `T` (3, 4) is ``T_platform_board``, `lines` its sides, `pattern` its first corner,
-    square, columns, rows and ring; `tones` the board, the squares that differ from it, the light on it, and whether a
-    camera looks; `sheets` (k, 7) are rectangles behind the board that face the rig: y, least and greatest x and z,
-    reflectivity for the LRF and for cameras.
+    square, columns, rows and ring; `tones` the board, the squares that differ from it, the light on it, whether a
+    camera looks, and which squares differ (0 or 1); `sheets` (k, 7) are rectangles behind the board that face the rig:
+    y, least and greatest x and z, reflectivity for the LRF and for cameras.
     """
     n = len(direction)
     distance, value, cosine = np.full(n, np.inf), np.zeros(n), np.ones(n)
@@ -172,7 +173,7 @@ def _cast(origin, direction, T, lines, pattern, tones, sheets):
         if inside:
             u, w, ring = (x - pattern[0]) / pattern[2], (y - pattern[1]) / pattern[2], pattern[5]
             on = -ring < u < pattern[3] - 1 + ring and -ring < w < pattern[4] - 1 + ring
-            other = on and (int(np.floor(u)) + int(np.floor(w))) % 2 == 0
+            other = on and (int(np.floor(u)) + int(np.floor(w))) % 2 == int(tones[4])
             distance[i], cosine[i] = r, abs(along)
             value[i] = (tones[1] if other else tones[0]) * tones[2]
             continue
@@ -205,7 +206,8 @@ def _scene(v, rig, T_platform_board, rng):
     lamp = np.array([0.3, -0.8, 0.5])
     shade = 0.55 + 0.45 * abs(T_platform_board.rotation.as_matrix()[:, 2] @ lamp)
     known = pose_array(T_platform_board), rig.board.lines(), settings
-    tones = {"lrf": [face, squares, 1.0, 0], "camera": [face, squares, shade, 1]}
+    # of a Chessboard the square diagonally before the first corner is light
+    tones = {"lrf": [face, squares, 1.0, 0, v.white], "camera": [face, squares, shade, 1, v.white]}
     return {name: (*known, np.array(value, float), np.array(sheets, float)) for name, value in tones.items()}
 
 
@@ -348,6 +350,28 @@ def _image(writer, truth, camera, imagers, scene, pose, T_camera_board, rng, tru
     writer.add_image(camera.name, _photo(imagers[camera.name], scene, pose, rng), **own)
     file = f"images/{camera.name}/{writer.shots[camera.name]:04d}.jpg"
     truth["images"][file] = {"pitch_rad": true, "T_camera_board": transform_to_json(T_camera_board)}
+
+
+def drawn(seed):
+    """Observations of a varied rig, drawn from noise models without any picture, and the truth: a fast stand-in."""
+    own = np.random.default_rng([seed, 25])
+    settings = {
+        "mount": str(own.choice(["head", "platform"])),
+        "spot": SPOTS[str(own.choice(list(SPOTS)))],
+        "bias": own.uniform(-0.8, 0.8),
+        "softness": own.uniform(0.02, 0.2),
+        "spread": own.uniform(0.0, 1.0),
+        "sigma_stop": np.radians(own.choice([0.0, 0.005, 0.01, 0.02])),
+        "sigma_range": own.uniform(0.004, 0.012),
+        "sigma_px": own.uniform(0.05, 0.3),
+        "stretch": own.normal(0, 0.002),
+        "pitch_step": np.radians(0.5),
+        "see_images": int(own.integers(2, 4)),
+    }
+    if settings["mount"] == "platform":
+        settings["see_images"] = 1
+    obs, truth, _ = draw(own, int(own.integers(10, 20)), **settings)
+    return obs, truth
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,8 @@ def combined_outlines(joint):
 
     Plane, sides, errors of the sweep's pitch and a correction of the calibration are estimated together for each
     placement; the calibration that has not seen it counts as an observation with its own covariance. What image edges
-    are worth is taken from their residuals over all placements.
+    are worth is taken from their residuals over all placements; what residuals cannot show, from the scatter of the
+    lengths.
 
     Parameters
     ----------
@@ -77,7 +78,28 @@ def combined_outlines(joint):
                 r, J = whiten(sight_block(found[placement], case, scale))
                 total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
         scale = max(scale * np.sqrt(total[0] / total[1]) if total[1] > 0 else 1.0, LEAST_SCALE)
-    return measured
+    return as_scattered(measured)
+
+
+def as_scattered(measured):
+    """Boards (see :func:`combined_outlines`) with standard deviations grown to how lengths scatter over placements.
+
+    Errors that all images of a side share (paint, a rim, a pattern close by), or all beams about it, show in no
+    residual of its placement. But it is one board everywhere, whatever its size.
+    """
+    square, freedom = 0.0, 0
+    for name in {name for board, _ in measured.values() for name in board.lengths}:
+        known = [(board.lengths[name], board.sigma[name]) for board, _ in measured.values() if name in board.lengths]
+        length, sigma = np.array(known).T
+        mean = np.average(length, weights=sigma**-2)
+        square += np.sum(((length - mean) / sigma) ** 2)
+        freedom += len(known) - 1
+    grow = np.sqrt(max(square / freedom, 1.0)) if freedom > 0 else 1.0
+    out = {}
+    for placement, (board, scanned) in measured.items():
+        sigma = {name: float(grow * value) for name, value in board.sigma.items()}
+        out[placement] = replace(board, sigma=sigma), scanned
+    return out
 
 
 def case_of(joint, observations, placement):

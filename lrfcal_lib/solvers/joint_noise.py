@@ -12,7 +12,6 @@ from lrfcal_lib.model.camera import project_jacobians
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 LEAST_CORNERS = 6
 PARTS = 3  # of a board in x and y, and of an edge
-SHARP = 0.4  # scatter of scores over their information where edges are sharp, for the floor of `flip_sigma`
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
 PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
 SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
@@ -131,9 +130,12 @@ def _part(values, used):
 def beam_share(state, data, block, unknowns, spread):
     """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
 
-    Board and sides take up a part of the scores, in all but few of them the larger one: with `spread` (p, k, k), the
-    covariance of a placement's own unknowns, tells what is left. Above one where readings flip more sharply than the
-    floor of the softness: scores then scatter less than expected.
+    What board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a placement's own
+    unknowns. The steps count a little more information than there is where beams may say nothing (`lapse`, see
+    :func:`beam_terms`); the share brings that down to the true curvature of the cost.
+
+    Never above that: where readings flip more sharply than the floor of the softness, crossings lie so regularly
+    between the beams that scores hardly scatter, but edges are no better known than the spacing of the beams says.
     """
     ray = rays(state, data, data.beam)
     a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
@@ -143,21 +145,26 @@ def beam_share(state, data, block, unknowns, spread):
     along = np.sum((o + r[..., None] * d - origin - a) * t, axis=-1)
     own = block.jacobian[..., unknowns.shared :]
     root = np.linalg.norm(own[..., 3:6], axis=-1)  # root information
-    squares, expected = [], []
+    lapsed = data.lapse * np.exp(np.where(data.beam["used"], block.cost, 0.0) / data.beam_share)
+    curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))
+    parts = []
     for edge in range(len(data.lines)):
         mine = data.beam["used"] & (data.beam["edge"] == edge)
         for part in range(PARTS):
             weight = np.where(mine & (_part(along, mine) == part), root, 0.0)
-            information = np.sum(weight**2, axis=-1)
-            known = information > 0
-            score = np.sum(weight * block.residuals, axis=-1)[known]
-            by_own = (weight[:, None] @ own)[known, 0]
-            taken = data.beam_share * np.vecdot(by_own, (spread[known] @ by_own[..., None])[..., 0])
-            squares.append(score**2 / information[known])
-            expected.append(1 - taken / information[known])
-    total = np.sum(np.concatenate(expected))
-    ratio = np.sum(np.concatenate(squares)) / total if total > 1 else 1.0
-    return float(1 / max(ratio, SHARP))
+            counted = np.sum(weight**2, axis=-1)
+            true = np.sum(np.where(weight > 0, curvature, 0.0), axis=-1)
+            score = np.sum(weight * block.residuals, axis=-1)
+            by_own = (weight[:, None] @ own)[:, 0]
+            taken = data.beam_share * np.vecdot(by_own, (spread @ by_own[..., None])[..., 0])
+            parts.append(np.stack([counted, true, score, taken], axis=1)[counted > 0])
+    counted, true, score, taken = np.concatenate(parts).T
+    left = np.sum(1 - taken / counted)
+    if left < 1:
+        return data.beam_share
+    gain = np.sum(true) / np.sum(counted)
+    ratio = np.sum(score**2 / counted) / left / gain
+    return float(gain / max(ratio, 1.0))
 
 
 def view_levels(data, block, hessian, gradient, shared):
@@ -277,8 +284,8 @@ def side_level(sides, data, hessian, gradient):
 
     Student's t is a normal distribution whose precision varies from side to side; what is expected of it hangs on the
     whole expected square of a deviation. A side that the beams hardly show is as uncertain as the scale says, and must
-    not pull it down. `hessian` (p, k, k) and `gradient` (p, k) are of a placement's own unknowns, the sides last; shared
-    ones are held.
+    not pull it down. One side more is believed to deviate as is usual: where nothing shows the scale, that is it.
+    `hessian` (p, k, k) and `gradient` (p, k) are of a placement's own unknowns, the sides last; shared ones are held.
     """
     edges, sigma2 = sides.shape[1], data.side_sigma**2
     shown = np.zeros(sides.shape, bool)
@@ -295,7 +302,8 @@ def side_level(sides, data, hessian, gradient):
         step = -(spread @ right[..., None])[..., 0]
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
-        sigma2 = np.clip(np.mean((weight * square)[shown]), 1e-4, 4.0)
+        total = np.sum((weight * square)[shown]) + residuals.JointData.side_sigma**2
+        sigma2 = np.clip(total / (shown.sum() + 1), 1e-4, 4.0)
     return float(np.sqrt(sigma2))
 
 

@@ -1,0 +1,65 @@
+"""Noise levels of beams and sides of the joint estimate."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from joint_draws import draw, rng
+
+from lrfcal_lib.fit.residuals import LEAST_STEP, SIDE_FREEDOM
+from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_noise import side_level
+
+FINE = np.radians(0.5)
+NARROW = (0.012, 0.0044)  # m at the window, rad: an LMS200
+
+
+def levels(count, **settings):
+    """Noise levels of some draws, with deviations of the sides estimated."""
+    found = []
+    for seed in range(count):
+        obs, _, _ = draw(rng(seed), 12, pitch_step=FINE, **settings)
+        found.append(solve_joint(obs, noise="estimate", sides=True, lapse=0.01, required=False).noise)
+    return found
+
+
+def test_the_scatter_of_the_sides_is_found():
+    """Student's t with three degrees of freedom has a scale of 0.63 where normal deviations scatter by 0.8."""
+    noise = levels(4, softness=0.02, spread=0.8, bias=0.0, spot=NARROW)
+    assert np.mean([one["side_sigma"] for one in noise]) == pytest.approx(0.63, rel=0.25)
+
+
+def most_likely(y, known, sigma):
+    """Deviations that make measured ones `y` of information `known` most likely, and the weight of what is expected."""
+    x = np.zeros_like(y)
+    for _ in range(100):
+        prior = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM * sigma**2 + x**2)
+        x = known * y / (known + prior)
+    return x, prior
+
+
+@pytest.mark.parametrize("start", [0.1, 0.35, 1.5])
+@pytest.mark.parametrize("true", [0.2, 0.8])
+def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
+    """Two of three say nothing, as bright boards do at the rim of the spot; the third tells the scale."""
+    own = rng(2)
+    known = np.tile([400.0, 0.01, 0.01], (200, 1))
+    y = true * own.standard_t(3, known.shape) + own.standard_normal(known.shape) / np.sqrt(known)
+    used = {"used": np.ones(known.shape, bool), "edge": np.tile(np.arange(3), (200, 1))}
+    level = start
+    for _ in range(10):
+        x, prior = most_likely(y, known, level)
+        hessian = np.zeros((200, 9, 9))
+        hessian[:, range(9), range(9)] = np.concatenate([np.ones((200, 6)), known + prior], axis=1)
+        level = side_level(x, SimpleNamespace(side_sigma=level, beam=used), hessian, np.zeros((200, 9)))
+    assert level == pytest.approx(true, rel=0.15)
+
+
+def test_beams_of_the_model_itself_are_independent():
+    noise = levels(4, softness=0.3, spread=0.8, floor=LEAST_STEP)
+    assert 0.7 < np.mean([one["beam_share"] for one in noise]) <= 1
+
+
+def test_beams_about_sharp_edges_say_no_more_than_their_spacing():
+    noise = levels(2, softness=0.02, spread=0.3, spot=NARROW)
+    assert all(0.5 < one["beam_share"] <= 1 for one in noise)
