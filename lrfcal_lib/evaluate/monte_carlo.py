@@ -1,6 +1,4 @@
-"""Monte-Carlo trials of the joint estimate and of every method on single shots, beside bound
-and truth.
-"""
+"""Monte-Carlo trials of the joint estimate and of single shots, beside bound and truth."""
 
 import re
 from dataclasses import dataclass, replace

@@ -219,8 +219,9 @@ def method_comparison(observations, solutions, truth=None, joint=None):
 def best_method(comparison, among=("line", "zhang_pless")):
     """The method of a :func:`method_comparison` with the least product of left-out errors.
 
-    Of edges and planes. A method that fits its own feature and fails on the other one (lines bent by a wide laser spot,
-    say) loses. A ValueError where none of them was judged on left-out placements.
+    Of edges and planes. A method that fits its own feature and fails on the other one (lines bent
+    by a wide laser spot, say) loses. A ValueError where none of them was judged on left-out
+    placements.
 
     Notes
     -----
@@ -242,8 +243,7 @@ def best_method(comparison, among=("line", "zhang_pless")):
 
 
 def handed_over(calibration):
-    """The method of a Calibration whose result goes into ``calibration.json`` and colours the
-    cloud.
+    """The method of a Calibration that goes into ``calibration.json`` and colours the cloud.
 
     'joint' where that estimate converged and left nothing open; otherwise what :func:`best_method`
     says. None where no camera was calibrated, or none could be judged.
@@ -268,8 +268,7 @@ def _parameter_table(keys, found):
 
 
 def camera_calibration_table(solutions):
-    """Parameters of every calibration (Solutions by camera and method) with their standard
-    deviations.
+    """Parameters of every calibration (Solutions by camera and method) with their sigmas.
 
     Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
@@ -278,8 +277,7 @@ def camera_calibration_table(solutions):
 
 
 def platform_calibration_table(platform, truth=None):
-    """The tilt axis by every method (PlatformCalibration) with its sigmas, and the paper's own
-    parameters.
+    """The tilt axis by every method (PlatformCalibration) with sigmas, and in the paper's chart.
 
     Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
     axis_offset_error_mm of the method. The four numbers of the axis are its angles out of and

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
-from lrfcal_lib.session.stated import board_from_json, naming, read_json, transform_from_json
+from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,20 @@ def read_truth(session):
     with naming(f"{file} (simulate the session again)"):
         cameras = {}
         for name, entry in data["cameras"].items():
-            on_head = "T_camera_lrf" in entry
-            pose = entry["T_camera_lrf"] if on_head else entry["T_camera_platform"]
-            cameras[name] = transform_from_json(pose)
+            cameras[name] = _pose(entry.get("T_camera_lrf") or entry["T_camera_platform"])
         boards = {}
         for number, entry in data["boards"].items():
-            boards[int(number)] = transform_from_json(entry["T_platform_board"])
+            boards[int(number)] = _pose(entry["T_platform_board"])
         pitch = {}
         for number, entry in data["sweeps"].items():
             pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
-        head = transform_from_json(data["T_head_lrf"])
+        head = _pose(data["T_head_lrf"])
         return Truth(head, cameras, board_from_json(data["board"]), boards, pitch)
+
+
+def _pose(stated):
+    """A transform that must be there, unlike those that a session may leave out."""
+    return from_json(TransformStated, stated).made()
 
 
 def camera_errors(solution, truth, camera):

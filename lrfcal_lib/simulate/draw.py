@@ -61,6 +61,10 @@ class Bench(Devices):
     pitch_step: float = np.radians(0.5)  # between scan lines, radians
     range_offset: float = 0.0  # metres
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
+    # standard deviation of the recorded pitch at the stop of an image, radians
+    sigma_stop: float = 0.0
+    # standard deviation of the log odds of the edge from side to side: uneven backgrounds
+    spread: float = 0.0
     # least softness, in beam steps; real edges have none, the model of the joint estimate has
     floor: float = 0.0
 
@@ -199,7 +203,8 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     edge = distances.argmax(axis=-1)
     soft = np.hypot(bench.softness * radius, bench.floor * bench.step * r)
     jitter = noise * soft * rng.standard_normal(r.shape)
-    hit = (u + jitter < bench.bias * radius) & sensible
+    bias = _bias_of_sides(bench, rng)[edge]
+    hit = (u + jitter < bias * radius) & sensible
     # near to an edge across the scan lines, and along them
     changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
     across, along = (
@@ -229,13 +234,29 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     return face, beams
 
 
+def _bias_of_sides(bench, rng):
+    """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
+    bias = np.full(len(bench.board.edges), float(bench.bias))
+    if bench.spread:
+        x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
+        # of a disc within an edge x radii inside its centre
+        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
+        odds = np.log(share / (1 - share))
+        own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
+        bias = np.interp(-own, -odds, x)
+    return bias
+
+
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
     true = []
+    pitch = at * (1 + bench.stretch)  # of the head
+    if bench.sigma_stop:  # one error for all cameras
+        pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
     for camera in bench.cameras.values():
         T_source_platform = RigidTransform.identity(len(at))
         if bench.mount == "head":
-            turn = np.outer(-at * (1 + bench.stretch), [1.0, 0.0, 0.0])
+            turn = np.outer(-pitch, [1.0, 0.0, 0.0])
             T_head_platform = RigidTransform.from_rotation(Rotation.from_rotvec(turn))
             T_source_platform = bench.T_head_lrf.inv() * T_head_platform
         true.append((camera * T_source_platform * pose).as_matrix())
@@ -364,7 +385,7 @@ def _facing(spin, lean):
 def _beside(board, origin, rays):
     """Distances between rays (board frame) and the lines of edges (..., E), positive outside.
 
-    Ranges to its plane.
+    And the ranges to the plane of the board.
     """
     ranges = -origin[..., 2] / rays[..., 2]
     at = origin + ranges[..., None] * rays
