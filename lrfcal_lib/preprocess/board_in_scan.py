@@ -1,4 +1,6 @@
-"""The board in the range image of a sweep: pieces without a jump, planes, a median filter, lines."""
+"""The board in the range image of a sweep: pieces without a jump, planes, a median filter,
+lines.
+"""
 
 from dataclasses import dataclass
 
@@ -11,18 +13,31 @@ from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.robust import NORMAL, biweight, robust_sigma
-from lrfcal_lib.model.geometry import fit_plane, lrf_to_platform, polar_covariance, polar_to_points, tilt
+from lrfcal_lib.model.geometry import (
+    fit_plane,
+    lrf_to_platform,
+    polar_covariance,
+    polar_to_points,
+    tilt,
+)
 from lrfcal_lib.session.read import Sweep
 
-STEEPEST = np.tan(np.radians(80))  # a face seen at a flatter angle than 10 deg is taken for a depth jump
-DEPTH_NOISE = 0.03  # metres; what noise and dark print change between neighbouring beams of one face
+# a face seen at a flatter angle than 10 deg is taken for a depth jump
+STEEPEST = np.tan(np.radians(80))
+# metres; what noise and dark print change between neighbouring beams of one face
+DEPTH_NOISE = 0.03
 PLANE_NOISE = 0.02  # metres; noise and warp of a board about its plane
 LONGEST_HOLE = 0.15  # metres; a gap without returns that does not end a surface (print, gloss)
-LARGEST_NOISE = 0.04  # metres; the farthest from its plane that a return of a noisy device still counts
+# metres; the farthest from its plane that a return of a noisy device still counts
+LARGEST_NOISE = 0.04
 FEWEST_POINTS = 12
-LEAST_FILL = 0.5  # share of its convex hull that a board fills; what clutter leaves on a plane is patchy
-FEWEST_LINES = 4  # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
-CLEAR, MOST_MARGIN = 2.0, 1 / 3  # spot radii from the last beam on the board that see its face alone; share of a row
+# share of its convex hull that a board fills; what clutter leaves on a plane is patchy
+LEAST_FILL = 0.5
+# that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
+FEWEST_LINES = 4
+# spot radii from the last beam on the board that see its face alone; share of a row
+CLEAR = 2.0
+MOST_MARGIN = 1 / 3
 RIGID_SIZES = (0.02, 4.0, 4.0)  # m2, m2, m: what may be a board when nothing is known about it
 
 
@@ -31,15 +46,17 @@ class BoardNotFound(ValueError):
 
 
 def depth_jump(ranges, step):
-    """Change of range between neighbours (an angle `step` apart) that no face of a board makes, metres."""
+    """Change of range between neighbours (an angle `step` apart) that no face of a board makes,
+    metres.
+    """
     return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
 
 
 def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
     """Cut scan lines at depth discontinuities; step (i) of the paper's preprocessing.
 
-    A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams. Returns the number
-    by beam, ascending along the lines, -1 where there is no return.
+    A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams.
+    Returns the number by beam, ascending along the lines, -1 where there is no return.
     """
     seen = np.isfinite(ranges)
     line, beam = np.nonzero(seen)
@@ -52,7 +69,9 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
 
 
 def surfaces(ranges, bearings, pitch):
-    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1 without a return, (L, B)."""
+    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1
+    without a return, (L, B).
+    """
     step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
     near = np.where(np.isfinite(ranges), ranges, 1.0)
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
@@ -65,19 +84,29 @@ def surfaces(ranges, bearings, pitch):
 
 
 def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
-    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance in the platform frame.
+    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance in the
+    platform frame.
 
-    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its radius all around.
+    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its
+    radius all around.
 
-    With all scan lines at one pitch they do not determine the plane; the one at right angles to the scan plane is taken
-    then. BoardNotFound says what was seen instead.
+    With all scan lines at one pitch they do not determine the plane; the one at right angles to the
+    scan plane is taken then. BoardNotFound says what was seen instead.
     """
     if not np.isfinite(sweep.ranges).any():
-        raise BoardNotFound(f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines")
-    points = lrf_to_platform(polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], T_head_lrf)
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines"
+        )
+    points = lrf_to_platform(
+        polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], T_head_lrf
+    )
     single = len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= 1e-4
-    upright = tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0])) if single else None
-    labels, seen, best = surfaces(sweep.ranges, sweep.bearings, sweep.pitch), [], (np.inf,)
+    upright = (
+        tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0])) if single else None
+    )
+    labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
+    seen = []
+    best = (np.inf,)
     numbers, counts = np.unique(labels[labels >= 0], return_counts=True)
     nearest = ndimage.minimum(sweep.ranges, labels, numbers)
     enough = np.flatnonzero(counts >= FEWEST_POINTS)
@@ -96,12 +125,18 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
                 best = (reach, mask, *plane)
     if len(best) == 1:
         found = "; ".join(seen[:4]) or "no flat surface"
-        raise BoardNotFound(f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}")
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}"
+        )
     _, mask, normal, distance = best
     # with the returns in and beside it that only the noise of its own points takes off its plane
     miss = np.abs(points @ normal - distance)
     reach = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
-    return mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)), normal, distance
+    return (
+        mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)),
+        normal,
+        distance,
+    )
 
 
 def _planes(sweep, points, surface, upright, rng, most=25):
@@ -120,7 +155,9 @@ def _planes(sweep, points, surface, upright, rng, most=25):
 
 
 def best_plane(points, upright, rng, trials=200, sample=1500):
-    """Random sample consensus over neighbouring points, then total least squares over all that agree; None if none."""
+    """Random sample consensus over neighbouring points, then total least squares over all that
+    agree; None if none.
+    """
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
     near = cdist(seeds, few)
@@ -147,8 +184,12 @@ def best_plane(points, upright, rng, trials=200, sample=1500):
 
 
 def _trimmed(points, mask, normal, limits, upright):
-    """A flat surface, if need be without thin strips of floor or wall; its size, and whether it may be the board."""
-    (least, most, longest), size = limits, plane_size(points[mask], normal, upright)
+    """A flat surface, if need be without thin strips of floor or wall.
+
+    Its size, and whether it may be the board.
+    """
+    (least, most, longest) = limits
+    size = plane_size(points[mask], normal, upright)
     if upright is not None:
         return mask, size, 0.3 * np.sqrt(least) < size[1] < longest
     area, length = size
@@ -164,9 +205,12 @@ def _trimmed(points, mask, normal, limits, upright):
 
 
 def _size_limits(board, grown):
-    """Least and largest area (m2) and greatest length (m) of what may be seen of a board with its outline grown (m)."""
+    """Least and largest area (m2) and greatest length (m) of what may be seen of a board with
+    its outline grown (m).
+    """
     if board is not None and board.corners is not None:
-        hull, length = ConvexHull(board.corners), pdist(board.corners).max()
+        hull = ConvexHull(board.corners)
+        length = pdist(board.corners).max()
         return 0.25 * hull.volume, 1.35 * hull.volume + grown * hull.area, 1.2 * length + 2 * grown
     if board is not None and board.pattern is not None:
         sides = board.pattern.square * np.array([board.pattern.columns + 1, board.pattern.rows + 1])
@@ -175,7 +219,9 @@ def _size_limits(board, grown):
 
 
 def _fault(sweep, T_head_lrf, points, mask, normal):
-    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself, patchy. '' if it may be."""
+    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself,
+    patchy. '' if it may be.
+    """
     lines = int(mask.any(axis=1).sum())
     if lines < min(FEWEST_LINES, len(sweep.pitch)):
         return f" on {lines} of {len(sweep.pitch)} scan lines"
@@ -189,7 +235,8 @@ def _fault(sweep, T_head_lrf, points, mask, normal):
         return ""
     corners = cells[hull.vertices]
     rim = np.gcd(*np.abs(np.roll(corners, -1, axis=0) - corners).T).sum()
-    fill = len(cells) / (hull.volume + rim / 2 + 1)  # of the cells within the hull, by Pick's theorem
+    # of the cells within the hull, by Pick's theorem
+    fill = len(cells) / (hull.volume + rim / 2 + 1)
     return f" filled to {100 * fill:.0f} %" if fill < LEAST_FILL else ""
 
 
@@ -231,17 +278,19 @@ class BoardScan:
     filtered : ndarray, shape (L, B)
         Median-filtered ranges on the board, metres; NaN elsewhere.
     fitted : ndarray, shape (L, B)
-        Ranges of the straight line fitted to each scan line, for every beam from the first to the last on the board
-        (holes included), metres; NaN elsewhere.
+        Ranges of the straight line fitted to each scan line, for every beam from the first to the
+        last on the board (holes included), metres; NaN elsewhere.
     lines : ndarray, shape (L, 2)
-        The fitted lines ``u . p = 1`` in the scan plane, 1/metre; NaN for a line with too few beams.
+        The fitted lines ``u . p = 1`` in the scan plane, 1/metre; NaN for a line with too few
+        beams.
     lines_covariance : ndarray, shape (L, 2, 2)
     normal : ndarray, shape (3,)
         Of the board's plane in the nominal platform frame.
     distance : float
         ``normal . p_platform = distance``, metres.
     sigma_range : float
-        Standard deviation of a range about the fitted lines, metres (noise, print and warp together).
+        Standard deviation of a range about the fitted lines, metres (noise, print and warp
+        together).
     n_jump_points : int
         Returns within or next to the board that were rejected: mixed pixels and outliers.
     spot : float
@@ -288,16 +337,21 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
         If no flat surface has the board's size.
     """
     T_head_lrf = RigidTransform.identity() if T_head_lrf is None else T_head_lrf
-    mask, *plane = planar_surface(sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng, lrf)
+    mask, *plane = planar_surface(
+        sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng, lrf
+    )
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals[np.abs(residuals) > PLANE_NOISE * 2] = np.nan
     if not np.isfinite(residuals).any():
-        raise BoardNotFound(f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board")
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board"
+        )
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
-    covariance, jumps = np.linalg.inv(information) * sigma**2, int(jump_points(sweep.ranges, fitted, sigma).sum())
+    covariance = np.linalg.inv(information) * sigma**2
+    jumps = int(jump_points(sweep.ranges, fitted, sigma).sum())
     images = mask, filtered, fitted, lines, covariance
     reach = float(np.nanmedian(fitted))
     spot = 0.0 if lrf is None or lrf.spot_exit is None else float(lrf.spot_radius(reach)) / reach
@@ -307,8 +361,8 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
 def median_filter(ranges, mask, width=MEDIAN_WIDTH):
     """Running median along the scan lines; step (ii) of the paper's preprocessing.
 
-    `mask` (L, B) tells which returns take part, `width` is an odd number of beams; near an end or a hole only the beams
-    that exist count. NaN outside the mask and where there is no return.
+    `mask` (L, B) tells which returns take part, `width` is an odd number of beams; near an end or a
+    hole only the beams that exist count. NaN outside the mask and where there is no return.
     """
     if width < 1 or width % 2 == 0:
         raise ValueError(f"the width of a median filter is odd and positive, got {width}")
@@ -333,10 +387,11 @@ def fit_lines(ranges, bearings, rounds=4):
     Returns
     -------
     lines : ndarray, shape (L, 2)
-        ``u`` with ``u . (x, y) = 1``; NaN with fewer than four beams. In polar form ``1 / r = u . (cos b, sin b)`` is
-        linear in u, with weights r^4 because of 1 / r.
+        ``u`` with ``u . (x, y) = 1``; NaN with fewer than four beams. In polar form ``1 / r = u .
+        (cos b, sin b)`` is linear in u, with weights r^4 because of 1 / r.
     information : ndarray, shape (L, 2, 2)
-        Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four beams.
+        Inverse covariance for ranges with a standard deviation of 1 m; NaN with fewer than four
+        beams.
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     products = rays[:, :, None] * rays[:, None, :]
@@ -347,7 +402,8 @@ def fit_lines(ranges, bearings, rounds=4):
     for _ in range(rounds):
         information = np.einsum("lb,bij->lij", weights, products)
         right = (weights / r) @ rays
-        information[~enough], right[~enough] = np.eye(2), np.nan
+        information[~enough] = np.eye(2)
+        right[~enough] = np.nan
         lines = np.linalg.solve(information, right[..., None])[..., 0]
         misses = np.where(seen, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         with np.errstate(invalid="ignore"):
@@ -361,26 +417,34 @@ def row_median(values):
     """Median of each row without its NaN; NaN for an empty row."""
     ordered = np.sort(values, axis=1)
     count = np.isfinite(ordered).sum(axis=1)
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, values.shape[1] - 1)
     rows = np.arange(len(values))
     return (ordered[rows, low] + ordered[rows, high]) / 2
 
 
 def _line_ranges(lines, bearings):
-    """Ranges of the fitted lines: every line in every direction (lines (L, 2), bearings (B,)), shape (L, B)."""
+    """Ranges of the fitted lines: every line in every direction (lines (L, 2), bearings (B,)),
+    shape (L, B).
+    """
     along = lines @ np.stack([np.cos(bearings), np.sin(bearings)])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(along > 0, 1 / along, np.nan)
 
 
 def row_ends(mask):
-    """First and last True of each row; rows without one are left out. Returns (rows, first, last)."""
+    """First and last True of each row.
+
+    Rows without one are left out. Returns (rows, first, last).
+    """
     rows = np.flatnonzero(mask.any(axis=1))
     return rows, mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
 
 
 def _span(mask, trim=0):
-    """True from the first to the last True of each row, without `trim` beams (a number, or one a row) at both ends."""
+    """True from the first to the last True of each row, without `trim` beams (a number, or one
+    a row) at both ends.
+    """
     rows, first, last = row_ends(mask)
     beam = np.arange(mask.shape[1])
     out = np.zeros(mask.shape, bool)
@@ -389,12 +453,14 @@ def _span(mask, trim=0):
 
 
 def jump_points(ranges, fitted, sigma_range):
-    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and outliers.
+    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and
+    outliers.
 
-    Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres at least), and
-    pieces of at most two beams (cut at jumps of that size) directly beside it.
+    Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres
+    at least), and pieces of at most two beams (cut at jumps of that size) directly beside it.
     """
-    on, threshold = np.isfinite(fitted), max(4 * sigma_range, PLANE_NOISE)
+    on = np.isfinite(fitted)
+    threshold = max(4 * sigma_range, PLANE_NOISE)
     with np.errstate(invalid="ignore"):
         inside = on & (np.abs(ranges - fitted) > threshold)
     pieces = segments(ranges, jump=threshold)
@@ -404,10 +470,11 @@ def jump_points(ranges, fitted, sigma_range):
 
 
 def count_jump_points(scan):
-    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of the paper.
+    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of
+    the paper.
 
-    The filter runs over the board's returns and the jump points among and beside them, without the background: what
-    step (i) of the paper leaves.
+    The filter runs over the board's returns and the jump points among and beside them, without the
+    background: what step (i) of the paper leaves.
     """
     jumps = jump_points(scan.sweep.ranges, scan.fitted, scan.sigma_range)
     filtered = median_filter(scan.sweep.ranges, scan.mask | jumps)
@@ -423,35 +490,44 @@ def face_points(scan, count=1000, margin=0.06):
     count : int
         At most.
     margin : float
-        What is left out at either end of a scan line and of a column, as a fraction of it; never less than two beams,
-        nor than a spot that reaches over the edge: it reads the mean of its part on the board, and a slanted board
-        would seem less so.
+        What is left out at either end of a scan line and of a column, as a fraction of it; never
+        less than two beams, nor than a spot that reaches over the edge: it reads the mean of its
+        part on the board, and a slanted board would seem less so.
 
     Returns
     -------
     points : ndarray, shape (m, 3)
-        LRF frame at the pitch of the point, metres, at the recorded range. Without outliers: mixed pixels inside the
-        board, four standard deviations off the fitted scan line.
+        LRF frame at the pitch of the point, metres, at the recorded range. Without outliers: mixed
+        pixels inside the board, four standard deviations off the fitted scan line.
     pitch : ndarray, shape (m,)
         Radians.
     covariance : ndarray, shape (m, 3, 3)
     """
     with np.errstate(invalid="ignore"):
         good = scan.mask & (np.abs(scan.sweep.ranges - scan.fitted) < 4 * scan.sigma_range)
-    steps = (np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf for v in (scan.sweep.bearings, scan.sweep.pitch))
+    steps = (
+        np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf
+        for v in (scan.sweep.bearings, scan.sweep.pitch)
+    )
     along, down = (CLEAR * scan.spot / max(step, 1e-6) for step in steps)
-    line, beam = np.nonzero(good & _interior(scan.mask, margin, along) & _interior(scan.mask.T, margin, down).T)
+    line, beam = np.nonzero(
+        good & _interior(scan.mask, margin, along) & _interior(scan.mask.T, margin, down).T
+    )
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
-        line, beam = line[keep], beam[keep]
-    ranges, bearings = scan.sweep.ranges[line, beam], scan.sweep.bearings[beam]
-    spread = 0.1 * np.median(np.diff(scan.sweep.bearings))  # keeps the covariance regular; bearings are all but exact
+        line = line[keep]
+        beam = beam[keep]
+    ranges = scan.sweep.ranges[line, beam]
+    bearings = scan.sweep.bearings[beam]
+    # keeps the covariance regular; bearings are all but exact
+    spread = 0.1 * np.median(np.diff(scan.sweep.bearings))
     covariance = polar_covariance(ranges, bearings, scan.sigma_range, spread)
     return polar_to_points(ranges, bearings), scan.sweep.pitch[line], covariance
 
 
 def _interior(mask, margin, spot):
-    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves half of the row.
+    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves
+    half of the row.
 
     A row too short for that (a sweep of one line, seen by columns) stays.
     """
