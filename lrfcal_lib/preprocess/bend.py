@@ -237,7 +237,8 @@ def bend_of(face, placement=0, level=0.0):
     known = np.isfinite(face.around) if level else np.ones(len(face.flat), bool)
     part = (cell @ [1, PARTS])[known]
     if len(np.unique(part)) < FEWEST_PARTS:
-        reason = f"the scan shows {len(np.unique(part))} of {PARTS**2} parts of the board, {FEWEST_PARTS} are needed"
+        shown = f"the scan shows {len(np.unique(part))} of {PARTS**2} parts of the board"
+        reason = f"{shown}, {FEWEST_PARTS} are needed"
         return Bend(placement, np.nan, np.nan, np.nan, False, f"placement {placement}: {reason}")
     columns = face.columns(face.flat[known])
     height = face.height[known] - (level * np.nan_to_num(face.around) * face.by_range)[known]

@@ -46,9 +46,7 @@ class BoardNotFound(ValueError):
 
 
 def depth_jump(ranges, step):
-    """Change of range between neighbours (an angle `step` apart) that no face of a board makes,
-    metres.
-    """
+    """Change of range (metres) between beams a `step` apart that no face of a board makes."""
     return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
 
 
@@ -60,35 +58,44 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
     """
     seen = np.isfinite(ranges)
     line, beam = np.nonzero(seen)
-    r, jump, bridge = (np.broadcast_to(v, ranges.shape)[seen] for v in (ranges, jump, bridge))
+    jump = np.broadcast_to(jump, ranges.shape)[seen]
+    bridge = np.broadcast_to(bridge, ranges.shape)[seen]
     gap = np.diff(beam)
-    broken = (np.diff(line) != 0) | (gap - 1 > bridge[1:]) | (np.abs(np.diff(r)) > gap * jump[1:])
+    change = np.abs(np.diff(ranges[seen]))
+    broken = np.diff(line) != 0
+    broken |= gap - 1 > bridge[1:]
+    broken |= change > gap * jump[1:]
     labels = np.full(ranges.shape, -1)
-    labels[seen] = np.cumsum(np.r_[True, broken])[: len(r)] - 1
+    labels[seen] = np.cumsum(np.r_[True, broken])[: len(line)] - 1
     return labels
 
 
 def surfaces(ranges, bearings, pitch):
-    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1
-    without a return, (L, B).
+    """Connected surfaces of a range image: numbers (L, B) of pieces joined across the lines.
+
+    -1 without a return.
     """
     step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
     near = np.where(np.isfinite(ranges), ranges, 1.0)
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
-    close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], np.diff(pitch)[:, None])
+    turned = np.diff(pitch)[:, None]
+    close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], turned)
     n = pieces.max(initial=-1) + 1
-    graph = coo_array((np.ones(close.sum()), (pieces[:-1][close], pieces[1:][close])), shape=(n, n))
-    joined = connected_components(graph, directed=False)[1] if n else np.zeros(0, int)
-    return np.where(pieces >= 0, np.append(joined, -1)[pieces], -1)
+    if n == 0:
+        return pieces
+    above = pieces[:-1][close]
+    below = pieces[1:][close]
+    graph = coo_array((np.ones(len(above)), (above, below)), shape=(n, n))
+    joined = connected_components(graph, directed=False)[1]
+    return np.where(pieces >= 0, joined[pieces], -1)
 
 
 def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
-    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance in the
-    platform frame.
+    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance.
 
-    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its
-    radius all around.
+    In the platform frame. A spot (of an LrfInfo) that reads the board while it only touches it
+    makes it larger by its radius all around.
 
     With all scan lines at one pitch they do not determine the plane; the one at right angles to the
     scan plane is taken then. BoardNotFound says what was seen instead.
@@ -97,13 +104,13 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
         raise BoardNotFound(
             f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines"
         )
-    points = lrf_to_platform(
-        polar_to_points(sweep.ranges, sweep.bearings), sweep.pitch[:, None], T_head_lrf
-    )
+    p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
+    points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
     single = len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= 1e-4
-    upright = (
-        tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0])) if single else None
-    )
+    upright = None
+    if single:
+        across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
+        upright = tilt(across_scan, float(sweep.pitch[0]))
     labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
     seen = []
     best = (np.inf,)
@@ -117,10 +124,11 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
             if sweep.ranges[mask].min() > best[0]:
                 continue
             reach = float(np.median(sweep.ranges[mask]))
-            limits = _size_limits(board, 0.0 if lrf is None else float(lrf.spot_radius(reach)))
-            mask, size, fits = _trimmed(points, mask, plane[0], limits, upright)
+            grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
+            limits = _size_limits(board, grown)
+            mask, (area, length), fits = _trimmed(points, mask, plane[0], limits, upright)
             fault = "" if single else _fault(sweep, T_head_lrf, points, mask, plane[0])
-            seen.append(f"{size[0]:.2f} m2, {size[1]:.2f} m long at {reach:.2f} m{fault}")
+            seen.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}")
             if fits and not fault and reach < best[0]:
                 best = (reach, mask, *plane)
     if len(best) == 1:
@@ -132,21 +140,22 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
     # with the returns in and beside it that only the noise of its own points takes off its plane
     miss = np.abs(points @ normal - distance)
     reach = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
-    return (
-        mask | (ndimage.binary_dilation(mask, np.ones((3, 3))) & (miss < reach)),
-        normal,
-        distance,
-    )
+    about = ndimage.binary_dilation(mask, np.ones((3, 3)))
+    return mask | (about & (miss < reach)), normal, distance
 
 
 def _planes(sweep, points, surface, upright, rng, most=25):
     """Flat connected parts of a surface: the largest plane first, then what is left."""
     left = surface.copy()
+    known = np.nan_to_num(points, nan=1e9)
     for _ in range(most):
-        plane = best_plane(points[left], upright, rng) if left.sum() >= FEWEST_POINTS else None
+        if left.sum() < FEWEST_POINTS:
+            return
+        plane = best_plane(points[left], upright, rng)
         if plane is None:
             return
-        on = left & (np.abs(np.nan_to_num(points, nan=1e9) @ plane[0] - plane[1]) < PLANE_NOISE)
+        normal, distance = plane
+        on = left & (np.abs(known @ normal - distance) < PLANE_NOISE)
         labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
         count = np.bincount(labels[labels >= 0])
         for label in np.flatnonzero(count >= max(FEWEST_POINTS, 0.2 * count.max())):
@@ -155,25 +164,29 @@ def _planes(sweep, points, surface, upright, rng, most=25):
 
 
 def best_plane(points, upright, rng, trials=200, sample=1500):
-    """Random sample consensus over neighbouring points, then total least squares over all that
-    agree; None if none.
-    """
+    """Random sample consensus over neighbours, then least squares over all that agree, or None."""
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
     near = cdist(seeds, few)
-    near = np.where((near < 0.3) & (near > 1e-6), rng.random(near.shape), -1.0)
-    others = few[np.argpartition(-near, 1, axis=1)[:, :2]]
-    normals = np.cross(others[:, 0] - seeds, others[:, 1] - seeds if upright is None else upright)
+    neighbours = (near < 0.3) & (near > 1e-6)  # metres
+    lots = np.where(neighbours, rng.random(near.shape), -1.0)
+    others = few[np.argpartition(-lots, 1, axis=1)[:, :2]]
+    second = upright
+    if upright is None:
+        second = others[:, 1] - seeds
+    normals = np.cross(others[:, 0] - seeds, second)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     good = length[:, 0] > 1e-9
     normals = normals[good] / length[good]
     offsets = np.sum(normals * seeds[good], axis=1)
     if len(normals) == 0:
         return None
-    best = np.sum(np.abs(normals @ few.T - offsets[:, None]) < PLANE_NOISE, axis=1).argmax()
+    misses = np.abs(normals @ few.T - offsets[:, None])
+    best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
     plane = normals[best], offsets[best]
     for _ in range(3):
-        on = points[np.abs(points @ plane[0] - plane[1]) < PLANE_NOISE]
+        normal, distance = plane
+        on = points[np.abs(points @ normal - distance) < PLANE_NOISE]
         if upright is not None:
             on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
         try:
@@ -188,13 +201,14 @@ def _trimmed(points, mask, normal, limits, upright):
 
     Its size, and whether it may be the board.
     """
-    (least, most, longest) = limits
+    least, most, longest = limits
     size = plane_size(points[mask], normal, upright)
-    if upright is not None:
-        return mask, size, 0.3 * np.sqrt(least) < size[1] < longest
     area, length = size
+    if upright is not None:
+        return mask, size, 0.3 * np.sqrt(least) < length < longest
     if not (least < area < most and length < longest):
-        core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
+        whole = ndimage.binary_closing(mask, iterations=2)
+        core = ndimage.binary_opening(whole, np.ones((5, 5)))
         labels, count = ndimage.label(core)
         if count == 0:
             return mask, size, False
@@ -205,44 +219,49 @@ def _trimmed(points, mask, normal, limits, upright):
 
 
 def _size_limits(board, grown):
-    """Least and largest area (m2) and greatest length (m) of what may be seen of a board with
-    its outline grown (m).
-    """
+    """Least and largest area (m2), greatest length (m) of a board with its outline grown (m)."""
     if board is not None and board.corners is not None:
         hull = ConvexHull(board.corners)
+        area = hull.volume
+        rim = hull.area  # of a plane figure: its circumference
         length = pdist(board.corners).max()
-        return 0.25 * hull.volume, 1.35 * hull.volume + grown * hull.area, 1.2 * length + 2 * grown
+        return 0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown
     if board is not None and board.pattern is not None:
-        sides = board.pattern.square * np.array([board.pattern.columns + 1, board.pattern.rows + 1])
-        return 0.3 * np.prod(sides), 4 * np.prod(sides), 2.5 * np.linalg.norm(sides)
+        pattern = board.pattern
+        sides = pattern.square * np.array([pattern.columns + 1, pattern.rows + 1])
+        area = np.prod(sides)
+        return 0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides)
     return RIGID_SIZES
 
 
 def _fault(sweep, T_head_lrf, points, mask, normal):
-    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself,
-    patchy. '' if it may be.
-    """
+    """Why a surface is no face of a board: few scan lines, seen along itself, patchy; or ''."""
     lines = int(mask.any(axis=1).sum())
     if lines < min(FEWEST_LINES, len(sweep.pitch)):
         return f" on {lines} of {len(sweep.pitch)} scan lines"
     cells = np.argwhere(mask)
     rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
-    if np.median(np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)) * STEEPEST < 1:
+    cosine = np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)
+    if np.median(cosine) * STEEPEST < 1:
         return " seen along itself"
     try:
         hull = ConvexHull(cells)
     except QhullError:
         return ""
     corners = cells[hull.vertices]
-    rim = np.gcd(*np.abs(np.roll(corners, -1, axis=0) - corners).T).sum()
-    # of the cells within the hull, by Pick's theorem
-    fill = len(cells) / (hull.volume + rim / 2 + 1)
-    return f" filled to {100 * fill:.0f} %" if fill < LEAST_FILL else ""
+    sides = np.abs(np.roll(corners, -1, axis=0) - corners)
+    rim = np.gcd(*sides.T).sum()
+    within = hull.volume + rim / 2 + 1  # cells of the hull, by Pick's theorem
+    fill = len(cells) / within
+    if fill < LEAST_FILL:
+        return f" filled to {100 * fill:.0f} %"
+    return ""
 
 
 def plane_axes(normal):
     """Two unit vectors in a plane, shape (2, 3): the first as level as the second is steep."""
-    across = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0])
+    other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
+    across = np.cross(normal, other)
     across /= np.linalg.norm(across)
     return np.stack([np.cross(across, normal), across])
 
@@ -336,10 +355,11 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
     BoardNotFound
         If no flat surface has the board's size.
     """
-    T_head_lrf = RigidTransform.identity() if T_head_lrf is None else T_head_lrf
-    mask, *plane = planar_surface(
-        sweep, T_head_lrf, board, np.random.default_rng(0) if rng is None else rng, lrf
-    )
+    if T_head_lrf is None:
+        T_head_lrf = RigidTransform.identity()
+    if rng is None:
+        rng = np.random.default_rng(0)
+    mask, normal, distance = planar_surface(sweep, T_head_lrf, board, rng, lrf)
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
@@ -351,11 +371,25 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
         )
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
     covariance = np.linalg.inv(information) * sigma**2
-    jumps = int(jump_points(sweep.ranges, fitted, sigma).sum())
-    images = mask, filtered, fitted, lines, covariance
-    reach = float(np.nanmedian(fitted))
-    spot = 0.0 if lrf is None or lrf.spot_exit is None else float(lrf.spot_radius(reach)) / reach
-    return BoardScan(sweep.placement, sweep, T_head_lrf, *images, *plane, sigma, jumps, spot)
+    spot = 0.0
+    if lrf is not None and lrf.spot_exit is not None:
+        reach = float(np.nanmedian(fitted))
+        spot = float(lrf.spot_radius(reach)) / reach
+    return BoardScan(
+        placement=sweep.placement,
+        sweep=sweep,
+        T_head_lrf=T_head_lrf,
+        mask=mask,
+        filtered=filtered,
+        fitted=fitted,
+        lines=lines,
+        lines_covariance=covariance,
+        normal=normal,
+        distance=distance,
+        sigma_range=sigma,
+        n_jump_points=int(jump_points(sweep.ranges, fitted, sigma).sum()),
+        spot=spot,
+    )
 
 
 def median_filter(ranges, mask, width=MEDIAN_WIDTH):
@@ -369,8 +403,10 @@ def median_filter(ranges, mask, width=MEDIAN_WIDTH):
     taken = np.where(np.isfinite(ranges) & mask, ranges, np.nan)
     out = np.full(taken.shape, np.nan)
     line, beam = np.nonzero(np.isfinite(taken))
-    padded = np.pad(taken, ((0, 0), (width // 2, width // 2)), constant_values=np.nan)
-    out[line, beam] = row_median(padded[line[:, None], beam[:, None] + np.arange(width)])
+    half = width // 2
+    padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)
+    window = beam[:, None] + np.arange(width)
+    out[line, beam] = row_median(padded[line[:, None], window])
     return out
 
 
@@ -438,23 +474,27 @@ def row_ends(mask):
     Rows without one are left out. Returns (rows, first, last).
     """
     rows = np.flatnonzero(mask.any(axis=1))
-    return rows, mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
+    first = mask[rows].argmax(axis=1)
+    from_end = mask[rows, ::-1].argmax(axis=1)
+    return rows, first, mask.shape[1] - 1 - from_end
 
 
 def _span(mask, trim=0):
-    """True from the first to the last True of each row, without `trim` beams (a number, or one
-    a row) at both ends.
+    """True from the first to the last True of each row, without `trim` beams at both ends.
+
+    A number, or one a row.
     """
     rows, first, last = row_ends(mask)
     beam = np.arange(mask.shape[1])
     out = np.zeros(mask.shape, bool)
-    out[rows] = (beam >= (first + trim)[:, None]) & (beam <= (last - trim)[:, None])
+    after = beam >= (first + trim)[:, None]
+    before = beam <= (last - trim)[:, None]
+    out[rows] = after & before
     return out
 
 
 def jump_points(ranges, fitted, sigma_range):
-    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and
-    outliers.
+    """Mixed pixels and outliers (L, B): neither of the board nor of a surface behind it.
 
     Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres
     at least), and pieces of at most two beams (cut at jumps of that size) directly beside it.
@@ -470,8 +510,7 @@ def jump_points(ranges, fitted, sigma_range):
 
 
 def count_jump_points(scan):
-    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of
-    the paper.
+    """Number of jump points of a BoardScan as recorded and after a median filter (figure 5).
 
     The filter runs over the board's returns and the jump points among and beside them, without the
     background: what step (i) of the paper leaves.
@@ -504,15 +543,13 @@ def face_points(scan, count=1000, margin=0.06):
     covariance : ndarray, shape (m, 3, 3)
     """
     with np.errstate(invalid="ignore"):
-        good = scan.mask & (np.abs(scan.sweep.ranges - scan.fitted) < 4 * scan.sigma_range)
-    steps = (
-        np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf
-        for v in (scan.sweep.bearings, scan.sweep.pitch)
-    )
-    along, down = (CLEAR * scan.spot / max(step, 1e-6) for step in steps)
-    line, beam = np.nonzero(
-        good & _interior(scan.mask, margin, along) & _interior(scan.mask.T, margin, down).T
-    )
+        miss = np.abs(scan.sweep.ranges - scan.fitted)
+        good = scan.mask & (miss < 4 * scan.sigma_range)
+    along = CLEAR * scan.spot / max(median_step(scan.sweep.bearings), 1e-6)
+    down = CLEAR * scan.spot / max(median_step(scan.sweep.pitch), 1e-6)
+    good &= _interior(scan.mask, margin, along)
+    good &= _interior(scan.mask.T, margin, down).T
+    line, beam = np.nonzero(good)
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
         line = line[keep]
@@ -525,13 +562,21 @@ def face_points(scan, count=1000, margin=0.06):
     return polar_to_points(ranges, bearings), scan.sweep.pitch[line], covariance
 
 
-def _interior(mask, margin, spot):
-    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves
-    half of the row.
+def median_step(angles):
+    """Median step between neighbouring angles; infinite for a single one."""
+    if len(angles) < 2:
+        return np.inf
+    return np.median(np.abs(np.diff(angles)))
 
-    A row too short for that (a sweep of one line, seen by columns) stays.
+
+def _interior(mask, margin, spot):
+    """Without the outer part of each row: a fraction `margin`, and `spot` cells.
+
+    The latter where that leaves half of the row. A row too short for that (a sweep of one line,
+    seen by columns) stays.
     """
     _, first, last = row_ends(mask)
     size = last - first
     least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
-    return _span(mask, np.where(size < 6, 0, np.maximum(least, margin * size).astype(int)))
+    trim = np.maximum(least, margin * size).astype(int)
+    return _span(mask, np.where(size < 6, 0, trim))

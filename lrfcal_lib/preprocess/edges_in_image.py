@@ -69,9 +69,7 @@ class EdgeNotSeen(ValueError):
 
 
 class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends (a sheet on a wall, a background as bright as
-    the board).
-    """
+    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
 
 
 def loops():
@@ -87,55 +85,57 @@ def sample(image, model, uv):
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
     image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
-    out = np.empty((uv.size // 2, image.shape[2]), np.float32)
-    loops().bilinear(
-        image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, fold(model), out
-    )
+    pixels = np.ascontiguousarray(uv, float).reshape(-1, 2)
+    out = np.empty((len(pixels), image.shape[2]), np.float32)
+    loops().bilinear(image, pixels, model.parameters, fold(model), out)
     return out.reshape(uv.shape[:-1] + (-1,))
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
-    """Height of the step at every place of a strip (across, along, channels), grey levels; 0 where
-    it leaves the image.
+    """Height of the step at every place of a strip (across, along, channels), grey levels.
 
-    Derivative of a Gaussian of `sigma` samples across the edge, of `along` averaged profiles, norm
-    over the colours.
+    0 where it leaves the image. Derivative of a Gaussian of `sigma` samples across the edge, of
+    `along` averaged profiles, norm over the colours.
     """
     gone = np.isnan(strip[..., 0])
-    places = np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)
+    wide = int(4 * sigma + 0.5)
+    places = np.arange(-wide, wide + 1)
     bell = np.exp(-0.5 * (places / sigma) ** 2)
     slope = places / sigma * bell / bell.sum() * np.sqrt(2 * np.pi)
+    mean = np.full(along, 1 / along)
     filled = np.where(gone[..., None], np.float32(0), strip)
-    found = cv2.sepFilter2D(
-        filled, cv2.CV_32F, np.full(along, 1 / along), slope, borderType=cv2.BORDER_REFLECT
-    )
-    height = np.linalg.norm(found.reshape(strip.shape), axis=-1)
+    steps = cv2.sepFilter2D(filled, cv2.CV_32F, mean, slope, borderType=cv2.BORDER_REFLECT)
+    height = np.linalg.norm(steps.reshape(strip.shape), axis=-1)
     reach = int(np.ceil(2 * sigma))
-    near_gone = cv2.dilate(gone.astype(np.uint8), np.ones((2 * reach + 1, along), np.uint8)) > 0
+    kernel = np.ones((2 * reach + 1, along), np.uint8)
+    near_gone = cv2.dilate(gone.astype(np.uint8), kernel) > 0
     return np.where(near_gone, 0, height)
 
 
 def peaks(height, least=LEAST_CONTRAST):
-    """Local maxima of the step height by profile: column, place across (to a fraction of a
-    sample), contrast.
+    """Local maxima of the step height by profile: column, place across, contrast.
+
+    The place is that of a parabola through three samples.
     """
     low = height[:-2]
     mid = height[1:-1]
     high = height[2:]
-    column, row = np.nonzero(((mid >= low) & (mid > high) & (mid > least)).T)
+    highest = (mid >= low) & (mid > high) & (mid > least)
+    column, row = np.nonzero(highest.T)
     a = low[row, column]
     b = mid[row, column]
     c = high[row, column]
-    return column, row + 1 + 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-12), b
+    bend = np.minimum(a - 2 * b + c, -1e-12)
+    return column, row + 1 + 0.5 * (a - c) / bend, b
 
 
 def fit_line(column, place, offset, slope, tolerance, rounds=12):
-    """Robust line ``place = offset + slope column`` through the peaks within `tolerance` samples of
-    a start line.
+    """Robust line ``place = offset + slope column`` through the peaks near a start line.
 
-    Tukey's biweight. Returns the offset and slope (2,), their covariance, which peaks were kept,
-    and their rms. Neighbouring profiles share pixels and the same dents, so errors are correlated
-    along the edge; the covariance is multiplied by the integrated autocorrelation of the residuals.
+    Near are those within `tolerance` samples; Tukey's biweight. Returns the offset and slope (2,),
+    their covariance, which peaks were kept, and their rms. Neighbouring profiles share pixels and
+    the same dents, so errors are correlated along the edge; the covariance is multiplied by the
+    integrated autocorrelation of the residuals.
     """
     design = np.column_stack([np.ones(len(column)), column])
     for _ in range(rounds):
@@ -143,8 +143,10 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
         near = np.abs(residual) < tolerance
         if near.sum() < 3:
             return np.array([offset, slope]), np.full((2, 2), np.inf), near, np.inf
-        weight = np.where(near, biweight(residual, robust_sigma(residual[near], least=0.02)), 0)
-        new = np.linalg.solve(design.T @ (design * weight[:, None]), design.T @ (weight * place))
+        sigma = robust_sigma(residual[near], least=0.02)
+        weight = np.where(near, biweight(residual, sigma), 0)
+        normal = design.T @ (design * weight[:, None])
+        new = np.linalg.solve(normal, design.T @ (weight * place))
         done = np.allclose(new, [offset, slope], rtol=0, atol=1e-7)
         offset, slope = new
         if done:
@@ -160,23 +162,31 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
 
 
 def correlation_factor(column, residual, window=3.0):
-    """Integrated autocorrelation of residuals along the edge (Sokal's window), ``1 + 2 sum
-    rho``, at least 1.
+    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``, at least 1.
+
+    With Sokal's window.
     """
-    column, length = column - column.min(), int(np.ptp(column)) + 1
-    series, seen = np.zeros((2, length))
-    series[column] = residual
-    seen[column] = 1.0
-    size = 2 ** int(np.ceil(np.log2(2 * length)))
-    power, pairs = (
-        np.fft.irfft(np.abs(np.fft.rfft(v, size)) ** 2, size)[:length] for v in (series, seen)
-    )
-    rho = power / np.maximum(pairs, 1) / max(power[0] / max(pairs[0], 1), 1e-300)
+    place = column - column.min()
+    length = place.max() + 1
+    series = np.zeros(length)
+    present = np.zeros(length)
+    series[place] = residual
+    present[place] = 1.0
+    mean_product = _autocorrelation(series) / np.maximum(_autocorrelation(present), 1)
+    rho = mean_product / max(mean_product[0], 1e-300)
     # a line was taken out: the residuals of white noise already sum to about -1, so no further
     # correction is needed
     total = 1 + 2 * np.cumsum(np.r_[0.0, rho[1 : length // 3]])
     beyond = np.flatnonzero(np.arange(len(total)) >= window * total)
-    return float(max(total[beyond[0] if len(beyond) else -1], 1.0))
+    last = beyond[0] if len(beyond) else -1
+    return float(max(total[last], 1.0))
+
+
+def _autocorrelation(series):
+    """Sums of products of a series (n,) with itself, by the distance apart."""
+    size = 2 ** int(np.ceil(np.log2(2 * len(series))))
+    power = np.abs(np.fft.rfft(series, size)) ** 2
+    return np.fft.irfft(power, size)[: len(series)]
 
 
 def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np.inf, most=np.inf):
@@ -199,18 +209,16 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     columns = np.arange(0, int(length) + 1, apart)
     pad = 3 * SMOOTH_PX + 1
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    strip = sample(
-        image, model, start + columns[None, :, None] * along + across[:, None, None] * normal
-    )
-    visible = int(np.isfinite(strip[np.abs(across) <= 2.0, :, 0]).all(axis=0).sum())
+    on_edge = start + columns[None, :, None] * along
+    strip = sample(image, model, on_edge + across[:, None, None] * normal)
+    near = strip[np.abs(across) <= 2.0, :, 0]
+    visible = int(np.isfinite(near).all(axis=0).sum())
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
-        raise EdgeNotSeen(
-            f"cut by the image border: {100 * visible / len(columns):.0f}% of it inside the image"
-        )
-    (offset, slope), covariance, seen, rms = _line_in_strip(
-        strip, visible, across, half_width, prior_px
-    )
-    seen = apart * seen
+        share = 100 * visible / len(columns)
+        raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
+    fitted, covariance, profiles, rms = _line_in_strip(strip, visible, across, half_width, prior_px)
+    offset, slope = fitted
+    seen = apart * profiles
     slope = slope / apart
     covariance = covariance / np.outer([1, apart], [1, apart])
     middle = seen.mean()
@@ -218,9 +226,8 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     covariance = to_middle @ covariance @ to_middle.T * ACROSS_STEP_PX**2
     covariance += np.diag([1.0, 12 / max(np.ptp(seen), 1) ** 2]) * SYSTEMATIC_PX**2
     column = np.array([seen.min(), seen.max(), middle])[:, None]
-    points = (
-        start + column * along + (across[0] + ACROSS_STEP_PX * (offset + slope * column)) * normal
-    )
+    off = across[0] + ACROSS_STEP_PX * (offset + slope * column)
+    points = start + column * along + off * normal
     line = outward_line(points[0], points[1], normal)
     # a slope ds moves the far end outwards; the angle turns the normal from u to v
     turn = -np.sign(along @ [-line[1], line[0]])
@@ -229,22 +236,23 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
 
 
 def _line_in_strip(strip, visible, across, half_width, prior_px):
-    """Line of most votes in a strip's samples: offset and slope, covariance, the profiles that
-    show it, rms.
-    """
+    """Line of most votes in a strip: offset and slope, covariance, profiles that show it, rms."""
     height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
+    count = height.shape[1]
     column, place, contrast = peaks(height)
-    slopes = np.linspace(-1, 1, 41) * min(half_width / ACROSS_STEP_PX, 24) / height.shape[1] * 2
-    votes = loops().vote(column, place, contrast / (contrast + FULL_CONTRAST), height.shape, slopes)
+    widest = min(half_width / ACROSS_STEP_PX, 24)
+    slopes = np.linspace(-1, 1, 41) * widest / count * 2
+    weight = contrast / (contrast + FULL_CONTRAST)
+    votes = loops().vote(column, place, weight, height.shape, slopes)
     # the prediction is as uncertain at either end as it is in the middle
-    tilted = slopes[:, None] * ACROSS_STEP_PX * height.shape[1] / 2
-    allowed = (np.abs(across) <= half_width) * np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
-    best = np.unravel_index(np.argmax(votes * allowed), votes.shape)
-    slope = slopes[best[0]]
-    offset = best[1] - slope * (height.shape[1] - 1) / 2
-    line, covariance, kept, rms = fit_line(
-        column, place, offset, slope, tolerance=1.5 / ACROSS_STEP_PX
-    )
+    tilted = slopes[:, None] * ACROSS_STEP_PX * count / 2
+    likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
+    allowed = (np.abs(across) <= half_width) * likely
+    turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
+    slope = slopes[turned]
+    offset = at - slope * (count - 1) / 2
+    tolerance = 1.5 / ACROSS_STEP_PX
+    line, covariance, kept, rms = fit_line(column, place, offset, slope, tolerance)
     support = len(np.unique(column[kept])) / visible
     if support < LEAST_SUPPORT or kept.sum() < LEAST_PROFILES:
         raise EdgeNotSeen(f"no clear edge: {100 * support:.0f}% of the profiles agree on a line")
@@ -288,8 +296,7 @@ def wide_distances(pattern):
 
 
 def edge_votes(image, board, model, pose):
-    """Share of the profiles that agree on an edge, by side of the pattern and
-    :func:`wide_distances` of it, (4, n).
+    """Share (4, n) of the profiles that agree on an edge, by side and :func:`wide_distances`.
 
     NaN where less than 30 % of the profiles lie inside the image.
     """
@@ -338,8 +345,8 @@ def common_lines(votes, board):
         places.append(outer_peak(gaussian_filter1d(mean, 1.0)))
         if places[-1] < 0:
             raise OutlineNotSeen(
-                f"the images do not agree on the {name} edge of board '{board.name}': give the corners of the board or "
-                "pick edges by hand"
+                f"the images do not agree on the {name} edge of board '{board.name}': give the "
+                "corners of the board or pick edges by hand"
             )
     return side_lines(board.pattern, distances[places])
 

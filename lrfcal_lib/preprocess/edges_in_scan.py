@@ -11,6 +11,7 @@ from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
 from lrfcal_lib.preprocess.board_in_scan import (
     DEPTH_NOISE,
     depth_jump,
+    median_step,
     plane_axes,
     row_ends,
     row_median,
@@ -40,28 +41,26 @@ SURE = 5.0  # standard deviations of a range: what is nearer to the board's plan
 
 
 def beyond(scan, line, beam, step, beams=3):
-    """Range behind ends of the board (a cell and the step to the next one): median reading, inf
-    where there is none.
-    """
-    cells = (
-        np.stack([line, beam], axis=1)[:, None] + step[:, None] * np.arange(1, beams + 1)[:, None]
-    )
-    rows, columns = np.moveaxis(np.clip(cells, 0, np.array(scan.mask.shape) - 1), -1, 0)
-    return np.sort(np.nan_to_num(scan.sweep.ranges[rows, columns], nan=np.inf), axis=1)[
-        :, beams // 2
-    ]
+    """Range behind ends of the board (a cell and the step to the next one): a median, or inf."""
+    ends = np.stack([line, beam], axis=1)
+    away = np.arange(1, beams + 1)[:, None]
+    cells = ends[:, None] + step[:, None] * away
+    cells = np.clip(cells, 0, np.array(scan.mask.shape) - 1)
+    ranges = scan.sweep.ranges[cells[..., 0], cells[..., 1]]
+    ordered = np.sort(np.nan_to_num(ranges, nan=np.inf), axis=1)
+    return ordered[:, beams // 2]
 
 
 def background_odds(here, behind):
-    """What the background adds to the log odds of the board's share of a spot at which readings
-    flip.
+    """What the background adds to the log odds of the board's share at which readings flip.
 
     ``2 ln(here / behind)``, the inverse square law; 0 with nothing behind, or so close that both
     give one echo.
     """
     behind = np.asarray(behind, float)
     apart = np.isfinite(behind) & (behind - here >= MIXING)
-    return 2 * np.log(np.where(apart, here / np.where(apart, behind, 1.0), 1.0))
+    ratio = here / np.where(apart, behind, 1.0)
+    return 2 * np.log(np.where(apart, ratio, 1.0))
 
 
 def straight_runs(points, order, tolerance, shortest):
@@ -83,46 +82,44 @@ def straight_runs(points, order, tolerance, shortest):
             break
         # the largest part without a gap of more than a tenth of the run (five steps at least)
         found = found[np.argsort(order[found], kind="stable")]
-        part = np.cumsum(np.r_[0, np.diff(order[found]) > max(5, 0.1 * len(found))])
-        found = np.sort(found[part == np.bincount(part).argmax()])
+        gaps = np.diff(order[found]) > max(5, 0.1 * len(found))
+        part = np.cumsum(np.r_[0, gaps])
+        largest = np.bincount(part).argmax()
+        found = np.sort(found[part == largest])
         if len(found) < FEWEST_POINTS:
             break
         left = np.setdiff1d(left, found)
         _, direction, along, _ = line_of(points[found])
-        if np.ptp(along) >= shortest and all(
-            abs(direction @ d) < np.cos(LEAST_TURN) for d in directions
-        ):
+        turned = all(abs(direction @ other) < np.cos(LEAST_TURN) for other in directions)
+        if turned and np.ptp(along) >= shortest:
             runs.append(found)
             directions.append(direction)
     return runs
 
 
 def line_of(points, among=slice(None)):
-    """Total least squares line of some points (n, 2): centre, direction, places of all along
-    and across it, metres.
+    """Least squares line of some points (n, 2): centre, direction, places along and across it.
+
+    Total least squares; the places are of all points, metres.
     """
     centre = points[among].mean(axis=0)
     offset = points - centre
-    direction = np.linalg.eigh(offset[among].T @ offset[among])[1][:, 1]
-    return (
-        centre,
-        direction,
-        offset @ direction,
-        offset[:, 1] * direction[0] - offset[:, 0] * direction[1],
-    )
+    spread = offset[among].T @ offset[among]
+    direction = np.linalg.eigh(spread)[1][:, 1]
+    across = offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
+    return centre, direction, offset @ direction, across
 
 
 def _consensus(points, tolerance, apart, rng, trials=300):
-    """Which points lie near the line that most points agree with, after two least-squares
-    refinements.
-    """
+    """Which points lie near the line that most agree with, after two least-squares refinements."""
     a = points[rng.integers(len(points), size=trials)]
     b = points[rng.integers(len(points), size=trials)]
     length = np.linalg.norm(b - a, axis=1)
     far = length > apart
     if not far.any():
         return np.zeros(len(points), bool)
-    a, along = a[far], (b - a)[far] / length[far, None]
+    along = (b - a)[far] / length[far, None]
+    a = a[far]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     distance = normal @ points.T - np.sum(normal * a, axis=1)[:, None]
     # The sum of truncated squares ranks lines through the middle of a trace above those along its
@@ -167,12 +164,16 @@ class ScanSide:
     ends: np.ndarray
 
     def is_same(self, other):
-        """Whether two sides are one: the same direction, and no farther apart than two
-        centimetres.
-        """
-        along, its = ((s.ends[1] - s.ends[0]) / s.length for s in (self, other))
-        apart = np.cross(other.ends.mean(axis=0) - self.ends.mean(axis=0), along)
-        return abs(along @ its) > np.cos(LEAST_TURN) and np.linalg.norm(apart) < SAME_SIDE
+        """Whether two sides are one: the same direction, and less than two centimetres apart."""
+        between = other.ends.mean(axis=0) - self.ends.mean(axis=0)
+        apart = np.linalg.norm(np.cross(between, self.direction))
+        cosine = abs(self.direction @ other.direction)
+        return cosine > np.cos(LEAST_TURN) and apart < SAME_SIDE
+
+    @property
+    def direction(self):
+        """From one end to the other, shape (3,), of unit length."""
+        return (self.ends[1] - self.ends[0]) / self.length
 
 
 @dataclass(frozen=True)
@@ -251,44 +252,58 @@ def crossings(scan, across=False, known=()):
         All of them, with those left out.
     """
     line, beam, step, end = _ends(scan, across)
-    angles, cell = (scan.sweep.pitch, line) if across else (scan.sweep.bearings, beam)
+    pitch = scan.sweep.pitch[line]
+    if across:
+        angles = scan.sweep.pitch
+        cell = line
+    else:
+        angles = scan.sweep.bearings
+        cell = beam
     inner = angles[cell]
     outer = angles[cell + step.sum(axis=1)]
     gap = outer - inner
     middle = (inner + outer) / 2
-    pitch = scan.sweep.pitch[line]
-    if across and len(angles) > 1:  # the pitch is read in steps, it may seem to stand still
-        gap = np.copysign(np.maximum(np.abs(gap), np.median(np.abs(np.diff(angles)))), gap)
-    shift, warp_sigma = (0.0, 0.0) if across else _warp(scan, line, beam, end)
+    if across:
+        order = beam
+        when = middle
+        shift = 0.0
+        warp_sigma = 0.0
+        if len(angles) > 1:  # the pitch is read in steps, it may seem to stand still
+            gap = np.copysign(np.maximum(np.abs(gap), median_step(angles)), gap)
+    else:
+        order = line
+        when = pitch
+        shift, warp_sigma = _warp(scan, line, beam, end)
     points, by_angle, _ = _points_at(scan, line, beam, middle, shift, across)
     here = scan.fitted[line, beam]
     behind = beyond(scan, line, beam, step)
-    order, when = (beam, middle) if across else (line, pitch)
     side, every = _group(scan, points, when, order, end, behind - here < MIXING, known)
     sigma = np.abs(gap) * UNIFORM
     sigma = sigma * _inflation(_to_platform(scan, by_angle, when), sigma, side, every)
-    # scans at one pitch have no sides, and keep all points
-    sides = tuple(s for s in every if (np.pi / 2 - s.angle if across else s.angle) >= LEAST_ANGLE)
-    side = np.where(np.isin(side, [s.side for s in sides]), side, -1) if every else side
+    sides = every
+    if every:  # scans at one pitch have no sides, and keep all points
+        lean = [np.pi / 2 - s.angle if across else s.angle for s in every]
+        sides = tuple(s for s, angle in zip(every, lean, strict=True) if angle >= LEAST_ANGLE)
+        side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
     about = line, beam, step, end, side, sides, by_angle * (gap / 2)[:, None]
     odds = background_odds(here, behind)
     found = {}
     for variant, angle, there in (("last_beam", inner, pitch), ("half_step", middle, when)):
         points, by_angle, range_sigma = _points_at(scan, line, beam, angle, shift, across)
-        noise = (
-            points
-            / np.linalg.norm(points, axis=1, keepdims=True)
-            * np.hypot(range_sigma, warp_sigma)[:, None]
-        )
-        noise, spacing = (np.einsum("ni,nj->nij", v, v) for v in (noise, by_angle * sigma[:, None]))
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        noise = _outer(rays * np.hypot(range_sigma, warp_sigma)[:, None])
+        spacing = _outer(by_angle * sigma[:, None])
         found[variant] = ScanEdges(variant, points, spacing + noise, there, *about, noise, odds)
     return found, every
 
 
+def _outer(vectors):
+    """Products (n, 3, 3) of vectors (n, 3) with themselves."""
+    return np.einsum("ni,nj->nij", vectors, vectors)
+
+
 def _ends(scan, across):
-    """Ends of scan lines (of columns) on the board that may be edges: line, beam, step off the
-    board, -1 / +1.
-    """
+    """Ends of lines (columns) that may be edges: line, beam, step off the board, -1 or +1."""
     mask = scan.mask.T if across else scan.mask
     pitch = scan.sweep.pitch
     rows, first, last = row_ends(mask)
@@ -296,22 +311,28 @@ def _ends(scan, across):
     cell = np.r_[first, last]
     way = np.repeat([-1, 1], len(rows))
     line, beam = (cell, row) if across else (row, cell)
-    keep = (cell >= BORDER) & (cell < mask.shape[1] - BORDER) & np.isfinite(scan.lines[line, 0])
+    keep = (cell >= BORDER) & (cell < mask.shape[1] - BORDER)
+    keep &= np.isfinite(scan.lines[line, 0])
     line = line[keep]
     beam = beam[keep]
     way = way[keep]
-    step = np.stack([way, 0 * way] if across else [0 * way, way], axis=1)
-    after = line + step[:, 0]
+    step = np.zeros((len(way), 2), int)
+    if across:
+        step[:, 0] = way
+        turned = pitch[line + way] - pitch[line]
+    else:
+        step[:, 1] = way
+        turned = np.median(np.diff(scan.sweep.bearings))
     here = scan.fitted[line, beam]
-    turned = pitch[after] - pitch[line] if across else np.median(np.diff(scan.sweep.bearings))
-    seen = ~(scan.sweep.ranges[after, beam + step[:, 1]] < here - depth_jump(here, turned))
-    downwards = across and len(pitch) > 1 and np.polyfit(np.arange(len(pitch)), pitch, 1)[0] <= 0
-    return line[seen], beam[seen], step[seen], -way[seen] if downwards else way[seen]
+    after = scan.sweep.ranges[line + step[:, 0], beam + step[:, 1]]
+    seen = ~(after < here - depth_jump(here, turned))
+    if across and len(pitch) > 1 and np.polyfit(np.arange(len(pitch)), pitch, 1)[0] <= 0:
+        way = -way  # a sweep downwards
+    return line[seen], beam[seen], step[seen], way[seen]
 
 
 def _points_at(scan, line, beam, angle, shift, across):
-    """Points of the board where lines (at bearings) or columns (at pitch angles) end, metres, LRF
-    frame.
+    """Points (LRF frame) of the board where lines end at bearings, or columns at pitch angles.
 
     Returns them with their derivative by that angle and the standard deviation of the fitted range.
     They lie on the fitted lines, moved by `shift` along the ray, and along a column by the change
@@ -323,11 +344,14 @@ def _points_at(scan, line, beam, angle, shift, across):
     u = scan.lines[line]
     ray = rays[:, :2]
     r = 1 / np.sum(u * ray, axis=1)
-    range_sigma = r**2 * np.sqrt(np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[line], ray))
+    variance = np.einsum("ni,nij,nj->n", ray, scan.lines_covariance[line], ray)
+    range_sigma = r**2 * np.sqrt(variance)
     if not across:
         slope = -(r**2) * np.sum(u * turned[:, :2], axis=1)
-        return (r + shift)[:, None] * rays, slope[:, None] * rays + r[:, None] * turned, range_sigma
-    there, here = (_plane_range(scan, rays, pitch)[0] for pitch in (angle, scan.sweep.pitch[line]))
+        by_bearing = slope[:, None] * rays + r[:, None] * turned
+        return (r + shift)[:, None] * rays, by_bearing, range_sigma
+    there, _ = _plane_range(scan, rays, angle)
+    here, _ = _plane_range(scan, rays, scan.sweep.pitch[line])
     points = (scan.fitted[line, beam] + (there - here))[:, None] * rays
     rotation = scan.T_head_lrf.rotation.as_matrix()
     # d p / d pitch, in the LRF frame
@@ -352,43 +376,51 @@ def _to_platform(scan, vectors, pitch):
 
 
 def _warp(scan, line, beam, end):
-    """How far the board lies from the fitted lines at their ends, and the standard deviation of
-    that, metres.
+    """How far the board lies from the fitted lines at their ends, and the sigma of that, metres.
 
     A board bends, and cardboard reads farther than paper. The outermost eighth of a line (15 beams
     at most) says how far each end is off; how much these medians vary beyond their noise over all
     lines says how far to believe them. On a flat board that is nothing, and the ends stay on the
     fitted lines.
     """
+    inwards = np.arange(WARPED_BEAMS)
     count = np.clip(scan.mask[line].sum(axis=1) // 8, 1, WARPED_BEAMS)
-    at = beam[:, None] - end[:, None] * np.arange(WARPED_BEAMS)
-    use = (np.arange(WARPED_BEAMS) < count[:, None]) & (at >= 0) & (at < scan.mask.shape[1])
-    at = line[:, None], np.where(use, at, 0)
-    use &= scan.mask[at]
-    middle = row_median(np.where(use, (scan.sweep.ranges - scan.fitted)[at], np.nan))
+    at = beam[:, None] - end[:, None] * inwards
+    use = inwards < count[:, None]
+    use &= (at >= 0) & (at < scan.mask.shape[1])
+    cells = line[:, None], np.where(use, at, 0)
+    use &= scan.mask[cells]
+    misses = (scan.sweep.ranges - scan.fitted)[cells]
+    middle = row_median(np.where(use, misses, np.nan))
+    # of a median: pi / 2 times that of a mean
     noise = np.pi / 2 * scan.sigma_range**2 / np.maximum(use.sum(axis=1), 1)
     shift = np.zeros(len(line))
     sigma = np.zeros(len(line))
     for mine in (end == -1, end == 1):
         if mine.any():
-            # 0.455: median of chi2(1)
-            excess = max(np.median(middle[mine] ** 2) / 0.455 - np.median(noise[mine]), 0.0)
-            shift[mine] = middle[mine] * excess / (excess + noise[mine])
-            sigma[mine] = np.sqrt(excess * noise[mine] / (excess + noise[mine]))
+            variance = np.median(middle[mine] ** 2) / 0.455  # the median of chi2(1)
+            excess = max(variance - np.median(noise[mine]), 0.0)
+            whole = excess + noise[mine]
+            shift[mine] = middle[mine] * excess / whole
+            sigma[mine] = np.sqrt(excess * noise[mine] / whole)
     return shift, sigma
 
 
 def _inflation(by_angle, sigma, side, sides):
-    """How much more the points of a side scatter than their spacing (along `by_angle`)
-    explains, at least 1, (n,).
+    """How much more the points of a side scatter than their spacing explains, at least 1, (n,).
+
+    The spacing is along `by_angle`.
     """
     out = np.ones(len(side))
     for s in sides:
         mine = side == s.side
-        direction = (s.ends[1] - s.ends[0]) / np.linalg.norm(s.ends[1] - s.ends[0])
-        across = by_angle[mine] - (by_angle[mine] @ direction)[:, None] * direction
+        way = s.ends[1] - s.ends[0]
+        direction = way / np.linalg.norm(way)
+        along = by_angle[mine] @ direction
+        across = by_angle[mine] - along[:, None] * direction
         expected = np.sqrt(np.mean(sigma[mine] ** 2 * np.sum(across**2, axis=1)))
-        out[mine] = max(1.0, s.rms / expected) if expected > 0 else 1.0
+        if expected > 0:
+            out[mine] = max(1.0, s.rms / expected)
     return out
 
 
@@ -403,15 +435,10 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
         return (end + 1) // 2, ()  # scans at one pitch show one point a side
     axes = plane_axes(scan.normal)
     flat = lrf_to_platform(p_lrf, pitch, scan.T_head_lrf) @ axes.T
-    row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
-    steps = [
-        _points_at(scan, row, beam, scan.sweep.bearings[beam], 0.0, False)[1]
-        for beam in (first, last)
-    ]
-    spacing = np.median(np.linalg.norm(np.concatenate(steps), axis=1)) * np.median(
-        np.diff(scan.sweep.bearings)
-    )
-    shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0)) if len(flat) else 0.0
+    tolerance = max(_spacing(scan), EDGE_SCATTER)
+    shortest = 0.0
+    if len(flat):
+        shortest = SHORTEST_SIDE * np.linalg.norm(np.ptp(flat, axis=0))
     usable = ~mixed | (2 * mixed.sum() >= len(flat))
     side = np.full(len(flat), -1)
     sides = []
@@ -419,23 +446,44 @@ def _group(scan, p_lrf, pitch, order, end, mixed, known):
         mine = np.flatnonzero((end == e) & usable)
         left_out = np.unique(order[(end == e) & ~usable])  # makes no gap
         place = order[mine] - np.searchsorted(left_out, order[mine])
-        for run in straight_runs(flat[mine], place, max(float(spacing), EDGE_SCATTER), shortest):
+        for run in straight_runs(flat[mine], place, tolerance, shortest):
             rows = mine[run]
-            centre, direction, along, across = line_of(flat[rows])
-            ends = (
-                centre + np.outer([along.min(), along.max()], direction)
-            ) @ axes + scan.distance * scan.normal
-            level = np.cross(
-                _to_platform(scan, np.array([0.0, 0.0, 1.0]), np.mean(pitch[rows])), scan.normal
-            )
-            cosine = min(abs(level @ (direction @ axes)) / np.linalg.norm(level), 1.0)
-            rms = float(np.sqrt(np.mean(across**2) * len(rows) / max(len(rows) - 2, 1)))
-            new = ScanSide(
-                -1, e, len(rows), float(np.ptp(along)), rms, float(np.arccos(cosine)), ends
-            )
-            side[rows] = next((s.side for s in known if s.is_same(new)), len(known) + len(sides))
-            sides.append(replace(new, side=int(side[rows[0]])))
+            new = _side_through(scan, flat[rows], axes, np.mean(pitch[rows]), e)
+            same = [s.side for s in known if s.is_same(new)]
+            number = same[0] if same else len(known) + len(sides)
+            side[rows] = number
+            sides.append(replace(new, side=number))
     return side, tuple(sides)
+
+
+def _spacing(scan):
+    """Median distance of neighbouring beams at the ends of the board's scan lines, metres."""
+    row, first, last = row_ends(scan.mask & np.isfinite(scan.lines[:, :1]))
+    steps = []
+    for beam in (first, last):
+        bearing = scan.sweep.bearings[beam]
+        steps.append(_points_at(scan, row, beam, bearing, 0.0, False)[1])
+    by_bearing = np.median(np.linalg.norm(np.concatenate(steps), axis=1))
+    return float(by_bearing * np.median(np.diff(scan.sweep.bearings)))
+
+
+def _side_through(scan, flat, axes, pitch, end):
+    """The ScanSide, without its number, through points (n, 2) of the board's plane."""
+    centre, direction, along, across = line_of(flat)
+    ends = centre + np.outer([along.min(), along.max()], direction)
+    scan_normal = _to_platform(scan, np.array([0.0, 0.0, 1.0]), pitch)
+    level = np.cross(scan_normal, scan.normal)  # of the scan line on the board
+    cosine = abs(level @ (direction @ axes)) / np.linalg.norm(level)
+    variance = np.mean(across**2) * len(flat) / max(len(flat) - 2, 1)
+    return ScanSide(
+        side=-1,
+        end=end,
+        n_points=len(flat),
+        length=float(np.ptp(along)),
+        rms=float(np.sqrt(variance)),
+        angle=float(np.arccos(min(cosine, 1.0))),
+        ends=ends @ axes + scan.distance * scan.normal,
+    )
 
 
 def edge_cells(scan, along, swept, lrf):
@@ -467,11 +515,12 @@ def edge_cells(scan, along, swept, lrf):
     """
     found = [edges for edges in (along, swept) if edges is not None]
     sweep = scan.sweep
-    line, beam, step, side = (
-        np.concatenate([getattr(edges, name)[edges.side >= 0] for edges in found])
-        for name in ("line", "beam", "step", "side")
-    )
-    board, cosine = _plane_range(scan, polar_to_points(1.0, sweep.bearings), sweep.pitch[:, None])
+    line = np.concatenate([edges.line[edges.side >= 0] for edges in found])
+    beam = np.concatenate([edges.beam[edges.side >= 0] for edges in found])
+    step = np.concatenate([edges.step[edges.side >= 0] for edges in found])
+    side = np.concatenate([edges.side[edges.side >= 0] for edges in found])
+    rays = polar_to_points(1.0, sweep.bearings)
+    board, cosine = _plane_range(scan, rays, sweep.pitch[:, None])
     board[~(board > 0)] = np.nan
     radius = lrf.spot_radius(board)
     here = board[line, beam]
@@ -479,35 +528,38 @@ def edge_cells(scan, along, swept, lrf):
     seen = np.isfinite(behind)
     mixed = behind - here < MIXING
     close = len(seen) == 0 or np.mean(seen) < 0.5 or np.mean(mixed) >= 0.5
-    odds = np.zeros(len(here)) if close else background_odds(here, behind)
-    usable = np.flatnonzero(seen & ~mixed) if not close else np.arange(len(here))
+    if close:
+        odds = np.zeros(len(here))
+        usable = np.arange(len(here))
+    else:
+        odds = background_odds(here, behind)
+        usable = np.flatnonzero(seen & ~mixed)
     row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
     # before a far background also beams that noise takes off the plane read the board
     near = max(SURE * scan.sigma_range, DEPTH_NOISE)
-    gaps = [
-        np.median(np.abs(np.diff(v))) if len(v) > 1 else np.inf
-        for v in (sweep.pitch, sweep.bearings)
-    ]
+    gaps = median_step(sweep.pitch), median_step(sweep.bearings)
     with np.errstate(invalid="ignore"):
         miss = sweep.ranges - board
         excess = miss[line, beam]
-        hit = scan.mask[line, beam] | ((np.abs(excess) < near) & (not close))
+        hit = scan.mask[line, beam]
+        if not close:
+            hit = hit | (np.abs(excess) < near)
         # without what hides the board, and without holes: nothing, or something near, read inside
         # the boundary
-        keep = hit | (~(excess < -near) & ((excess > MIXING) | (k > 0)))
+        hides = excess < -near
+        keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
         if not close:
             # without cells whose spot may reach a surface (not the odd reading) less than a pulse
             # length away
-            beside = ndimage.binary_opening(
-                (np.abs(miss) > near) & (miss < MIXING), np.ones((2, 2))
-            )
+            mixing = (np.abs(miss) > near) & (miss < MIXING)
+            beside = ndimage.binary_opening(mixing, np.ones((2, 2)))
             size = np.nanmedian((radius / board)[scan.mask])
-            spot = [2 * min(int(np.ceil(size / max(gap, 1e-6))), 30) + 1 for gap in gaps]
+            reach = np.ceil(size / np.maximum(gaps, 1e-6))
+            spot = 2 * np.minimum(reach, 30).astype(int) + 1
             keep &= ~ndimage.binary_dilation(beside, np.ones(spot))[line, beam]
     sides = [s for edges in found for s in edges.sides]
-    keep &= _on_one_side(
-        scan, (line, beam), board, (CORNER * radius / np.abs(cosine))[line, beam], sides, side[row]
-    )
+    reach = (CORNER * radius / np.abs(cosine))[line, beam]
+    keep &= _on_one_side(scan, (line, beam), board, reach, sides, side[row])
     across = step[row, 0] != 0
     cells = {
         "line": line,
@@ -526,21 +578,20 @@ def edge_cells(scan, along, swept, lrf):
 
 
 def _neighbours(usable, line, beam, step, shape):
-    """Cells about boundaries, each once, with the nearest boundary: its number, the step k from
-    it, line and beam.
-    """
+    """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
     k, row = np.meshgrid(np.arange(1 - REACH, REACH + 1), usable, indexing="ij")
     k = k.ravel()
     row = row.ravel()
     order = np.argsort(np.abs(k - 0.5), kind="stable")
     k = k[order]
     row = row[order]
-    cell = np.stack([line, beam], axis=1)[row] + k[:, None] * step[row]
+    boundary = np.stack([line, beam], axis=1)
+    cell = boundary[row] + k[:, None] * step[row]
     margin = np.where(step[row] != 0, BORDER, 0)
     inside = np.all((cell >= margin) & (cell < shape - margin), axis=1)
     k = k[inside]
     row = row[inside]
-    (line, beam) = cell[inside].T
+    line, beam = cell[inside].T
     _, first = np.unique(line * shape[1] + beam, return_index=True)
     return row[first], k[first], line[first], beam[first]
 
@@ -551,16 +602,16 @@ def _on_one_side(scan, cells, board, reach, sides, side):
     All of them where sides are not known.
     """
     axes = plane_axes(scan.normal)
-    (line, beam) = cells
+    line, beam = cells
     p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
     flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
     keep = ~np.isin(side, [s.side for s in sides])
     alone = np.ones(len(side), bool)
     for s in sides:
         first, last = s.ends @ axes.T
-        direction = (last - first) / np.linalg.norm(last - first)
-        along = (flat - first) @ direction
-        apart = np.abs((flat - first) @ [-direction[1], direction[0]])
+        x, y = (last - first) / np.linalg.norm(last - first)
+        along = (flat - first) @ [x, y]
+        apart = np.abs((flat - first) @ [-y, x])
         mine = side == s.side
         keep |= mine & (along > 0) & (along < s.length)
         alone &= mine | ~(apart < reach)
