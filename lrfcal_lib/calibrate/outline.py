@@ -9,7 +9,7 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import fit_line, lrf_to_platform
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_scan import edge_cells
+from lrfcal_lib.preprocess.edge_cells import edge_cells
 
 LEAST_STRETCH = 0.4  # share of an edge that must be seen before its line decides a corner
 FEWEST_CELLS = 8

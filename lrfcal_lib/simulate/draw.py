@@ -326,13 +326,7 @@ def _candidates(setup, rng, rig):
     board = setup.board
     model = setup.model
     bearings = setup.bearings()
-    spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
-    turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
-    away = rng.uniform(*setup.distances, count)
-    right = rng.uniform(-0.35, 0.35, count) * away
-    up = rng.uniform(-0.12, 0.12, count)
-    centre = np.column_stack([right, away, up])
-    shift = centre - turn @ np.append(board.corners.mean(axis=0), 0.0)
+    turn, shift = _boards_ahead(setup, rng, count)
     rays = polar_to_points(np.ones(len(bearings)), bearings) @ turn
     u, ranges = _beside(board, -(shift[:, None] @ turn), rays)
     radius = setup.radius(ranges)
@@ -372,6 +366,17 @@ def _candidates(setup, rng, rig):
         "boards": boards,
         "board_covariance": covariance,
     }
+
+
+def _boards_ahead(setup, rng, count):
+    """Rotations (n, 3, 3) and origins (n, 3) of boards in the LRF frame that face it."""
+    spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
+    turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
+    away = rng.uniform(*setup.distances, count)
+    right = rng.uniform(-0.35, 0.35, count) * away
+    up = rng.uniform(-0.12, 0.12, count)
+    centre = np.column_stack([right, away, up])
+    return turn, centre - turn @ np.append(setup.board.corners.mean(axis=0), 0.0)
 
 
 def _facing(spin, lean):
