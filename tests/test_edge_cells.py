@@ -8,7 +8,7 @@ from test_scan import HEAD, edge_points, scene, sweep_edges
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.preprocess import board_in_scan
-from lrfcal_lib.preprocess.edges_in_scan import edge_cells
+from lrfcal_lib.preprocess.edge_cells import edge_cells
 from lrfcal_lib.session.stated import LrfInfo
 
 LRF = LrfInfo("test", (0.0, np.pi), np.radians(0.25), 0.005, spot_exit=0.01, spot_divergence=0.004)

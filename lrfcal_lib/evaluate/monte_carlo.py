@@ -1,6 +1,4 @@
-"""Monte-Carlo trials of the joint estimate and of every method on single shots, beside bound
-and truth.
-"""
+"""Monte-Carlo trials of the joint estimate and of single shots, beside bound and truth."""
 
 import re
 from dataclasses import dataclass, replace
@@ -321,18 +319,7 @@ def observations(shots, setup, last_beam=False):
     crossings = {}
     for name, values in found.items():
         crossings[f"crossing_{name}"] = values.reshape((t, 2 * p) + values.shape[2:])
-    # face points for the plane method
-    hit = np.isfinite(ranges)
-    count = hit.sum(axis=-1)
-    on_board = np.argsort(~hit, axis=-1, kind="stable")
-    share = np.linspace(0, 1, FACE)
-    pick = (share * (count[..., None] - 1)).round().astype(int)
-    beam = np.take_along_axis(on_board, pick, axis=-1)
-    ray = polar_to_points(1.0, bearings[beam])
-    repeats = np.maximum(FACE / count, 1.0)  # short lines give some twice
-    points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
-    variance = setup.sigma_range**2 * repeats
-    covariance = _outer(ray) * variance[..., None, None, None] + 1e-10 * np.eye(3)
+    points, covariance = _face_points(ranges, bearings, setup.sigma_range)
     return CameraObservations(
         setup.model,
         **crossings,
@@ -344,6 +331,21 @@ def observations(shots, setup, last_beam=False):
         board_poses=shots["boards"],
         board_covariance=shots["board_covariance"],
     )
+
+
+def _face_points(ranges, bearings, sigma_range):
+    """Evenly chosen points on the boards, (t, p, FACE, 3), and their covariances."""
+    hit = np.isfinite(ranges)
+    count = hit.sum(axis=-1)
+    on_board = np.argsort(~hit, axis=-1, kind="stable")
+    share = np.linspace(0, 1, FACE)
+    pick = (share * (count[..., None] - 1)).round().astype(int)
+    beam = np.take_along_axis(on_board, pick, axis=-1)
+    ray = polar_to_points(1.0, bearings[beam])
+    repeats = np.maximum(FACE / count, 1.0)  # short lines give some twice
+    points = np.take_along_axis(ranges, beam, axis=-1)[..., None] * ray
+    variance = sigma_range**2 * repeats
+    return points, _outer(ray) * variance[..., None, None, None] + 1e-10 * np.eye(3)
 
 
 def _outer(v):

@@ -1,6 +1,4 @@
-"""What a joint estimate knows badly, and which of the placements that a rig could record next
-would help most.
-"""
+"""What a joint estimate knows badly, and which placement would help most if recorded next."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -294,8 +292,7 @@ def scales_of(solution, names):
 
 
 def observability(solution):
-    """Directions of the scaled information of a JointSolution, the least known first: list of
-    Direction.
+    """Directions of the scaled information of a JointSolution, a list, the least known first.
 
     The softness of the edges is eliminated.
     """

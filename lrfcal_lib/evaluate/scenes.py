@@ -1,4 +1,6 @@
-"""How good a coloured scene is: predicted sigma of its points, flatness of a wall, errors against a simulated room."""
+"""How good a coloured scene is: predicted sigma of its points, flatness of a wall, errors
+against a simulated room.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -13,31 +15,42 @@ from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.session.stated import read_json
 
 AT_ONCE = 1 << 16  # points
-BESIDE = 0.05  # metres along the beam by which a reading is of another surface than the beam's centre meets
+# metres along the beam by which a reading is of another surface than the beam's centre meets
+BESIDE = 0.05
 PATCH = 40  # points that average the noise out of a patch of a wall
 
 
 def with_sigma(cloud, solution):
     """A Cloud with the standard deviations (metres) of its points that a JointSolution predicts.
 
-    Of the distance of a point from its surface: calibration, errors of the sweep's pitch and range noise along the
-    normal (along the beam where there is none), or the scatter of readings about the surface where that is more: a spot
-    averages over what is finer than itself. A turn of the whole cloud about the tilt axis does not count.
+    Of the distance of a point from its surface: calibration, errors of the sweep's pitch and range
+    noise along the normal (along the beam where there is none), or the scatter of readings about
+    the surface where that is more: a spot averages over what is finer than itself. A turn of the
+    whole cloud about the tilt axis does not count.
     """
-    chain, noise, sigma = chain_of(solution), range_noise(solution), np.zeros(len(cloud.points))
+    chain = chain_of(solution)
+    noise = range_noise(solution)
+    sigma = np.zeros(len(cloud.points))
     for part in np.array_split(np.arange(len(sigma)), 1 + len(sigma) // AT_ONCE):
         _, J, by_pitch = carried(chain, cloud.bearing[part], cloud.pitch[part], cloud.range[part])
-        normals, beams = cloud.normals[part] @ chain.head[:, :3], -J[..., COLUMNS.index("range_offset")]
+        normals = cloud.normals[part] @ chain.head[:, :3]
+        beams = -J[..., COLUMNS.index("range_offset")]
         normals = np.where(np.isfinite(normals), normals, beams)
         sweep = np.hypot(chain.sweep_sigma[0], chain.sweep_sigma[1] * cloud.pitch[part])
-        sweep, own = (v * np.sum(normals * by, axis=1) for v, by in ((sweep, by_pitch), (noise, beams)))
+        sweep, own = (
+            v * np.sum(normals * by, axis=1) for v, by in ((sweep, by_pitch), (noise, beams))
+        )
         own = np.maximum(np.abs(own), cloud.sigma[part])
-        sigma[part] = np.sqrt(spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None]) ** 2 + sweep**2 + own**2)
+        sigma[part] = np.sqrt(
+            spread(chain, np.einsum("ni,nij->nj", normals, J)[:, None]) ** 2 + sweep**2 + own**2
+        )
     return replace(cloud, sigma=sigma)
 
 
 def largest_plane(cloud, tolerance=0.04):
-    """Which points of a Cloud lie on its largest plane: within a tolerance (metres), facing as it does to 15 deg."""
+    """Which points of a Cloud lie on its largest plane: within a tolerance (metres), facing as
+    it does to 15 deg.
+    """
     import open3d as o3d
 
     o3d.utility.random.seed(0)
@@ -48,9 +61,11 @@ def largest_plane(cloud, tolerance=0.04):
 
 
 def flatness(points):
-    """How far a wall (n, 3) is from a plane, metres: the signed distance of each point, and the flatness.
+    """How far a wall (n, 3) is from a plane, metres: the signed distance of each point, and the
+    flatness.
 
-    The flatness is the root mean square of the mean distances of patches of `PATCH` points, without their noise.
+    The flatness is the root mean square of the mean distances of patches of `PATCH` points, without
+    their noise.
     """
     normal, offset, _ = fit_plane(points)
     miss = points @ normal - offset
@@ -74,7 +89,8 @@ class Feature:
     normal : ndarray, shape (3,), or None
         Of a plane.
     noise, tilt : ndarray, shape (3, 3)
-        Covariances of centre and normal from the range noise (or the points' scatter about the plane).
+        Covariances of centre and normal from the range noise (or the points' scatter about the
+        plane).
     jacobian : ndarray, shape (3, 13)
         Of the centre by what the calibration may have wrong; `chain` knows how much.
     """
@@ -90,14 +106,22 @@ class Feature:
 def fit_feature(cloud, chosen, solution, plane=True):
     """Fit a plane, or else take the middle, of chosen points (index or mask) of a Cloud: a Feature.
 
-    `solution` is the JointSolution that the cloud was made with. DegenerateGeometry if the points span no plane.
+    `solution` is the JointSolution that the cloud was made with. DegenerateGeometry if the points
+    span no plane.
     """
-    part, chain, noise = cloud.rows(chosen), chain_of(solution), range_noise(solution)
+    part = cloud.rows(chosen)
+    chain = chain_of(solution)
+    noise = range_noise(solution)
     if not len(part.points):
         raise DegenerateGeometry("no point of the cloud was chosen")
-    J, R, centre = carried(chain, part.bearing, part.pitch, part.range)[1], chain.head[:, :3], part.points.mean(axis=0)
+    J = carried(chain, part.bearing, part.pitch, part.range)[1]
+    R = chain.head[:, :3]
+    centre = part.points.mean(axis=0)
     beams = -J[..., COLUMNS.index("range_offset")] @ R.T
-    scatter, count, normal, tilted = noise**2 * beams.T @ beams, len(beams), None, np.zeros((3, 3))
+    scatter = noise**2 * beams.T @ beams
+    count = len(beams)
+    normal = None
+    tilted = np.zeros((3, 3))
     if plane:
         normal, _, rough = fit_plane(part.points)
         variance = max(noise**2 * np.mean((beams @ normal) ** 2), rough**2)
@@ -110,10 +134,11 @@ def fit_feature(cloud, chosen, solution, plane=True):
 def length_between(first, second):
     """Length between two Features and its standard deviation, metres.
 
-    Between two points along the line that joins them, otherwise along the normal of the plane, or the mean of both.
-    What the calibration has wrong counts as far as it moves the two apart.
+    Between two points along the line that joins them, otherwise along the normal of the plane, or
+    the mean of both. What the calibration has wrong counts as far as it moves the two apart.
     """
-    way, planes = second.centre - first.centre, [f for f in (first, second) if f.normal is not None]
+    way = second.centre - first.centre
+    planes = [f for f in (first, second) if f.normal is not None]
     normals = [f.normal * np.copysign(1.0, f.normal @ planes[0].normal) for f in planes] or [way]
     along = np.mean(normals, axis=0)
     along = along / np.linalg.norm(along)
@@ -134,7 +159,8 @@ class SceneErrors:
     normal : ndarray, shape (n,)
         The same along the normal of the true surface.
     color : ndarray, shape (n,)
-        Mean over red, green, blue of the absolute difference to the true light at one exposure; NaN where unseen.
+        Mean over red, green, blue of the absolute difference to the true light at one exposure; NaN
+        where unseen.
     blocked : ndarray of bool, shape (n,)
         Coloured from an image in which something hides the point.
     """
@@ -146,20 +172,25 @@ class SceneErrors:
 
 
 def scene_errors(cloud, calibration, method):
-    """Errors of a Cloud of one scene, made by a method, against the simulator: SceneErrors; None for a recording.
+    """Errors of a Cloud of one scene, made by a method, against the simulator: SceneErrors; None
+    for a recording.
 
     A turn about the tilt axis and a shift along it, which no data can show, do not count.
     """
-    session, truth = calibration.prepared.session, read_truth(calibration.prepared.session)
+    session = calibration.prepared.session
+    truth = read_truth(calibration.prepared.session)
     if truth is None:
         return None
     from lrfcal_lib.simulate.record import world_of
     from lrfcal_lib.simulate.rig import load_setup
 
-    world = world_of(load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None)
+    world = world_of(
+        load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None
+    )
     T_head_lrf, corrections = calibration.frame(method)
     gauge = truth.T_head_lrf * T_head_lrf.inv()
-    turn, shift = gauge.rotation.as_rotvec()[0], np.array([gauge.translation[0], 0.0, 0.0])
+    turn = gauge.rotation.as_rotvec()[0]
+    shift = np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
     sweep = session.sweep(placement)
     turn += np.mean(truth.pitch[placement] - corrections.pitch(placement, sweep.pitch))
@@ -176,19 +207,26 @@ def scene_errors(cloud, calibration, method):
     ratio = cloud.colors[cloud.seen] / np.maximum(light[cloud.seen], 1e-9)
     light = np.clip(light * np.median(ratio), 0, 255)
     color = np.where(cloud.seen, np.abs(cloud.colors - light).mean(axis=1), np.nan)
-    own = np.abs(depth) < BESIDE  # else the rim of the spot read a surface beside the beam: the point is where it is
-    blocked, true = np.zeros(len(points), bool), origins + np.where(own, hits.distance, length)[:, None] * directions
+    # else the rim of the spot read a surface beside the beam: the point is where it is
+    own = np.abs(depth) < BESIDE
+    blocked = np.zeros(len(points), bool)
+    true = origins + np.where(own, hits.distance, length)[:, None] * directions
     for view in views_of(calibration, method, placement):
         mine = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
         way = true[mine] - eye
         far = np.linalg.norm(way, axis=1)
-        blocked[mine] = world.cast(np.broadcast_to(eye, way.shape), way / far[:, None]).distance < far - 0.02
+        blocked[mine] = (
+            world.cast(np.broadcast_to(eye, way.shape), way / far[:, None]).distance < far - 0.02
+        )
     return SceneErrors(depth, normal, color, blocked)
 
 
 def as_stated(calibration):
-    """The first scene with the platform as it is stated, ranges and pitch as recorded, and no colours; a Cloud."""
+    """The first scene with the platform as it is stated, ranges and pitch as recorded, and no
+    colours; a Cloud.
+    """
     session = calibration.prepared.session
-    sweep, T_head_lrf = session.sweep(session.scene_placements[0]), calibration.platform.transform("stated")
+    sweep = session.sweep(session.scene_placements[0])
+    T_head_lrf = calibration.platform.transform("stated")
     return join(reconstruct(sweep, [], T_head_lrf, AS_RECORDED, lrf=session.lrf))

@@ -211,8 +211,7 @@ def _parameter_table(keys, found):
 
 
 def camera_calibration_table(solutions):
-    """Parameters of every calibration (Solutions by camera and method) with their standard
-    deviations.
+    """Parameters of every calibration (Solutions by camera and method) with their sigmas.
 
     Columns camera, method, parameter, unit, value, sigma (`Solution.trusted`).
     """
@@ -221,8 +220,7 @@ def camera_calibration_table(solutions):
 
 
 def platform_calibration_table(platform, truth=None):
-    """The tilt axis by every method (PlatformCalibration) with its sigmas, and the paper's own
-    parameters.
+    """The tilt axis by every method (PlatformCalibration) with sigmas, and in the paper's chart.
 
     Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
     axis_offset_error_mm of the method. The four numbers of the axis are its angles out of and

@@ -39,16 +39,20 @@ def read_truth(session):
     with naming(f"{file} (simulate the session again)"):
         cameras = {}
         for name, entry in data["cameras"].items():
-            pose = entry.get("T_camera_lrf") or entry["T_camera_platform"]
-            cameras[name] = from_json(TransformStated, pose).made()
+            cameras[name] = _pose(entry.get("T_camera_lrf") or entry["T_camera_platform"])
         boards = {}
         for number, entry in data["boards"].items():
-            boards[int(number)] = from_json(TransformStated, entry["T_platform_board"]).made()
+            boards[int(number)] = _pose(entry["T_platform_board"])
         pitch = {}
         for number, entry in data["sweeps"].items():
             pitch[int(number)] = np.asarray(entry["pitch_rad"], float)
-        head = from_json(TransformStated, data["T_head_lrf"]).made()
+        head = _pose(data["T_head_lrf"])
         return Truth(head, cameras, board_from_json(data["board"]), boards, pitch)
+
+
+def _pose(stated):
+    """A transform that must be there, unlike those that a session may leave out."""
+    return from_json(TransformStated, stated).made()
 
 
 def camera_errors(solution, truth, camera):

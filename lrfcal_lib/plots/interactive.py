@@ -1,6 +1,4 @@
-"""A scene to turn in a browser: points, frames, the tilt axis, boards and camera frusta in one
-offline page.
-"""
+"""A scene to turn in a browser, one offline page: points, frames, boards and camera frusta."""
 
 import numpy as np
 
@@ -60,8 +58,7 @@ def scene_page(path, points, colors, seen, lines, eye=(-0.3, -1.5, 0.55)):
 
 
 def rig_lines(T_head_lrf, cameras, boards=None, size=0.15):
-    """Lines of :func:`scene_page` that show a rig in the platform frame: frames, tilt axis, camera
-    frusta, boards.
+    """Lines of :func:`scene_page` that show a rig and boards in the platform frame.
 
     `cameras` are (``T_camera_platform``, CameraModel) by name, `boards` corners (n, 3) by name;
     `size` in metres.

@@ -40,9 +40,7 @@ def polygon(ax, corners, color=COLORS["truth"]):
 
 
 def rays(ax, origin, points):
-    """Beams in space, from one origin (or one a point) to the points they hit, shapes (3,) or
-    (n, 3), metres.
-    """
+    """Beams in space, from an origin (3,) or (n, 3) to the points (n, 3) that they hit, metres."""
     beams = np.stack([np.broadcast_to(origin, np.shape(points)), points], axis=1)
     color = COLORS["lrf"]
     ax.add_collection3d(Line3DCollection(beams, colors=color, linewidths=0.4, alpha=0.35))
@@ -50,9 +48,7 @@ def rays(ax, origin, points):
 
 
 def lines(ax, drawn):
-    """Lines in space by their name in the legend: a colour and points (n, 3), NaN rows where a
-    line breaks.
-    """
+    """Lines in space by name: a colour and points (n, 3), with NaN rows where a line breaks."""
     for name, (color, points) in drawn.items():
         ax.plot(*np.transpose(points), color=color, linewidth=1.6, label=name)
 
@@ -95,9 +91,7 @@ def cylinder(ax, point, direction, radius, half_length):
 
 
 def slab(ax, point, normal, thickness, half_width):
-    """The set a plane allows, figure 3 (c): the space between it and its parallel on the
-    sensor's side, metres.
-    """
+    """The set a plane allows, figure 3 (c): from it to its parallel near the sensor, metres."""
     across = np.linalg.svd(np.asarray(normal, float)[None])[2][1:]
     square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ across + point
     polygon(ax, square)
@@ -105,8 +99,7 @@ def slab(ax, point, normal, thickness, half_width):
 
 
 def render(points, colors, T_view, size, focal=None, splat=1):
-    """A coloured cloud as a pinhole camera sees it: nearest point wins in every pixel, white where
-    none is.
+    """A coloured cloud as a pinhole camera sees it: the nearest point of each pixel, or white.
 
     Parameters
     ----------
@@ -149,8 +142,7 @@ def pixels(seen, size, focal=None):
 
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)):
-    """The view from one point to another (metres) for :func:`render`, as RigidTransform from the
-    points' frame.
+    """The view from one point to another (metres) for :func:`render`, a transform of points.
 
     `up` is shown upwards. A ValueError if eye and target coincide, or `up` is the line of sight.
     """
@@ -167,9 +159,7 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)):
 
 
 def measured_edges(ax, measured, known, T_view, size, focal=None):
-    """Edges of a MeasuredBoard over a picture of :func:`render`, with their lengths and the
-    `known` ones, metres.
-    """
+    """Edges of a MeasuredBoard over a picture of :func:`render`, with lengths and `known` ones."""
     names = list(known)
     middle = pixels(T_view.apply(measured.T_platform_plane[None, :3, 3]), size, focal)[0]
     for name, length in measured.lengths.items():

@@ -1,5 +1,5 @@
-"""The board in the range image of a sweep: pieces without a jump, planes, a median
-filter, lines.
+"""The board in the range image of a sweep: pieces without a jump, planes, a median filter,
+lines.
 """
 
 from dataclasses import dataclass
@@ -35,55 +35,18 @@ FEWEST_POINTS = 12
 LEAST_FILL = 0.5
 # that a surface of a sweep must span: points of one scan line lie in a plane whatever they hit
 FEWEST_LINES = 4
-CLEAR = 2.0  # spot radii from the last beam on the board that see its face alone
-MOST_MARGIN = 1 / 3  # share of a row that is left out for that, at most
-STILL = 1e-4  # radians; scan lines that differ by less are at one pitch
+# spot radii from the last beam on the board that see its face alone; share of a row
+CLEAR = 2.0
+MOST_MARGIN = 1 / 3
+RIGID_SIZES = (0.02, 4.0, 4.0)  # m2, m2, m: what may be a board when nothing is known about it
 
 
 class BoardNotFound(ValueError):
     """No board in a sweep; the message says what was seen instead."""
 
 
-@dataclass(frozen=True)
-class Plane:
-    """``normal . p = distance``: unit normal, shape (3,), and metres."""
-
-    normal: np.ndarray
-    distance: float
-
-    def misses(self, points):
-        """Distances (...) of points (..., 3) from the plane, metres; NaN where a point is."""
-        return np.abs(points @ self.normal - self.distance)
-
-
-@dataclass(frozen=True)
-class Size:
-    """Area (m2; 0 for a single line) and greatest length (m) of a surface."""
-
-    area: float
-    length: float
-
-
-@dataclass(frozen=True)
-class SizeLimits:
-    """Least and largest area (m2) and greatest length (m) of what may be a board."""
-
-    least: float
-    most: float
-    longest: float
-
-    def hold(self, size):
-        """Whether a Size lies within them."""
-        return self.least < size.area < self.most and size.length < self.longest
-
-
-ANY_BOARD = SizeLimits(0.02, 4.0, 4.0)  # where nothing is known about the board
-
-
 def depth_jump(ranges, step):
-    """Change of range between neighbours (an angle `step` apart) that no face of a board makes,
-    metres.
-    """
+    """Change of range (metres) between beams a `step` apart that no face of a board makes."""
     return DEPTH_NOISE + STEEPEST * np.asarray(ranges) * np.abs(step)
 
 
@@ -93,44 +56,46 @@ def segments(ranges, *, jump=DEPTH_NOISE, bridge=0):
     A change of range above `jump` a beam ends a piece, and a gap of more than `bridge` beams.
     Returns the number by beam, ascending along the lines, -1 where there is no return.
     """
-    measured = np.isfinite(ranges)
-    line, beam = np.nonzero(measured)
-    r = ranges[measured]
-    jump = np.broadcast_to(jump, ranges.shape)[measured][1:]
-    bridge = np.broadcast_to(bridge, ranges.shape)[measured][1:]
+    seen = np.isfinite(ranges)
+    line, beam = np.nonzero(seen)
+    jump = np.broadcast_to(jump, ranges.shape)[seen]
+    bridge = np.broadcast_to(bridge, ranges.shape)[seen]
     gap = np.diff(beam)
-    broken = (np.diff(line) != 0) | (gap - 1 > bridge) | (np.abs(np.diff(r)) > gap * jump)
+    change = np.abs(np.diff(ranges[seen]))
+    broken = np.diff(line) != 0
+    broken |= gap - 1 > bridge[1:]
+    broken |= change > gap * jump[1:]
     labels = np.full(ranges.shape, -1)
-    labels[measured] = np.cumsum(np.r_[True, broken])[: len(r)] - 1
+    labels[seen] = np.cumsum(np.r_[True, broken])[: len(line)] - 1
     return labels
 
 
 def surfaces(ranges, bearings, pitch):
-    """Connected surfaces of a range image: numbers of pieces joined across the lines, -1 without a
-    return, (L, B).
+    """Connected surfaces of a range image: numbers (L, B) of pieces joined across the lines.
+
+    -1 without a return.
     """
-    step = 0.0
-    if len(bearings) > 1:
-        step = np.median(np.diff(bearings))
+    step = np.median(np.diff(bearings)) if len(bearings) > 1 else 0.0
     near = np.where(np.isfinite(ranges), ranges, 1.0)
     bridge = (LONGEST_HOLE / np.maximum(near * step, 1e-9)).astype(int)
     pieces = segments(ranges, jump=depth_jump(near, step), bridge=bridge)
-    close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], np.diff(pitch)[:, None])
-    count = pieces.max(initial=-1) + 1
-    if count == 0:
+    turned = np.diff(pitch)[:, None]
+    close = np.abs(np.diff(ranges, axis=0)) < depth_jump(near[1:], turned)
+    n = pieces.max(initial=-1) + 1
+    if n == 0:
         return pieces
-    neighbours = pieces[:-1][close], pieces[1:][close]
-    graph = coo_array((np.ones(close.sum()), neighbours), shape=(count, count))
-    _, surface = connected_components(graph, directed=False)
-    return np.where(pieces >= 0, surface[pieces], -1)
+    above = pieces[:-1][close]
+    below = pieces[1:][close]
+    graph = coo_array((np.ones(len(above)), (above, below)), shape=(n, n))
+    joined = connected_components(graph, directed=False)[1]
+    return np.where(pieces >= 0, joined[pieces], -1)
 
 
 def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
-    """The nearest flat connected surface of a board's size: mask (L, B) and Plane in the platform
-    frame.
+    """The nearest flat connected surface of a board's size: mask (L, B), normal and distance.
 
-    A spot (of an LrfInfo) that reads the board while it only touches it makes it larger by its
-    radius all around.
+    In the platform frame. A spot (of an LrfInfo) that reads the board while it only touches it
+    makes it larger by its radius all around.
 
     With all scan lines at one pitch they do not determine the plane; the one at right angles to the
     scan plane is taken then. BoardNotFound says what was seen instead.
@@ -141,165 +106,153 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
         )
     p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
     points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
+    single = len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= 1e-4
     upright = None
-    if len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= STILL:
-        upright = tilt(T_head_lrf.rotation.apply([0.0, 0.0, 1.0]), float(sweep.pitch[0]))
-    best = None
-    best_reach = np.inf
-    others = []
-    for surface in _nearest_first(sweep):
-        if sweep.ranges[surface].min() > best_reach:
-            break
-        for mask, plane in _planes(sweep, points, surface, upright, rng):
-            if sweep.ranges[mask].min() > best_reach:
-                continue
-            reach = float(np.median(sweep.ranges[mask]))
-            limits = _size_limits(board, _spot_radius(lrf, reach))
-            mask, size, fits = _trimmed(points, mask, plane.normal, limits, upright)
-            fault = ""
-            if upright is None:
-                fault = _fault(sweep, T_head_lrf, points, mask, plane.normal)
-            others.append(f"{size.area:.2f} m2, {size.length:.2f} m long at {reach:.2f} m{fault}")
-            if fits and not fault and reach < best_reach:
-                best = mask, plane
-                best_reach = reach
-    if best is None:
-        words = "; ".join(others[:4]) or "no flat surface"
-        raise BoardNotFound(
-            f"placement {sweep.placement}: no flat surface of the board's size; seen: {words}"
-        )
-    mask, plane = best
-    # with the returns in and beside it that only the noise of its own points takes off its plane
-    miss = plane.misses(points)
-    noise = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
-    beside = ndimage.binary_dilation(mask, np.ones((3, 3)))
-    return mask | (beside & (miss < noise)), plane
-
-
-def _nearest_first(sweep):
-    """Masks (L, B) of the connected surfaces of a sweep that are large enough, the nearest one
-    first.
-    """
+    if single:
+        across_scan = T_head_lrf.rotation.apply([0.0, 0.0, 1.0])
+        upright = tilt(across_scan, float(sweep.pitch[0]))
     labels = surfaces(sweep.ranges, sweep.bearings, sweep.pitch)
+    seen = []
+    best = (np.inf,)
     numbers, counts = np.unique(labels[labels >= 0], return_counts=True)
     nearest = ndimage.minimum(sweep.ranges, labels, numbers)
     enough = np.flatnonzero(counts >= FEWEST_POINTS)
     for k in enough[np.argsort(nearest[enough])]:
-        yield labels == numbers[k]
-
-
-def _spot_radius(lrf, reach):
-    """Radius of the spot at a distance, metres; 0 where nothing states it."""
-    if lrf is None or lrf.spot_exit is None:
-        return 0.0
-    return float(lrf.spot_radius(reach))
+        if nearest[k] > best[0]:
+            break
+        for mask, plane in _planes(sweep, points, labels == numbers[k], upright, rng):
+            if sweep.ranges[mask].min() > best[0]:
+                continue
+            reach = float(np.median(sweep.ranges[mask]))
+            grown = 0.0 if lrf is None else float(lrf.spot_radius(reach))
+            limits = _size_limits(board, grown)
+            mask, (area, length), fits = _trimmed(points, mask, plane[0], limits, upright)
+            fault = "" if single else _fault(sweep, T_head_lrf, points, mask, plane[0])
+            seen.append(f"{area:.2f} m2, {length:.2f} m long at {reach:.2f} m{fault}")
+            if fits and not fault and reach < best[0]:
+                best = (reach, mask, *plane)
+    if len(best) == 1:
+        found = "; ".join(seen[:4]) or "no flat surface"
+        raise BoardNotFound(
+            f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}"
+        )
+    _, mask, normal, distance = best
+    # with the returns in and beside it that only the noise of its own points takes off its plane
+    miss = np.abs(points @ normal - distance)
+    reach = np.clip(3 * robust_sigma(miss[mask]), PLANE_NOISE, LARGEST_NOISE)
+    about = ndimage.binary_dilation(mask, np.ones((3, 3)))
+    return mask | (about & (miss < reach)), normal, distance
 
 
 def _planes(sweep, points, surface, upright, rng, most=25):
-    """Flat connected parts of a surface: the largest Plane first, then what is left."""
-    remaining = surface.copy()
+    """Flat connected parts of a surface: the largest plane first, then what is left."""
+    left = surface.copy()
+    known = np.nan_to_num(points, nan=1e9)
     for _ in range(most):
-        if remaining.sum() < FEWEST_POINTS:
+        if left.sum() < FEWEST_POINTS:
             return
-        plane = best_plane(points[remaining], upright, rng)
+        plane = best_plane(points[left], upright, rng)
         if plane is None:
             return
-        on_plane = remaining & (np.nan_to_num(plane.misses(points), nan=np.inf) < PLANE_NOISE)
-        labels = surfaces(np.where(on_plane, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
+        normal, distance = plane
+        on = left & (np.abs(known @ normal - distance) < PLANE_NOISE)
+        labels = surfaces(np.where(on, sweep.ranges, np.nan), sweep.bearings, sweep.pitch)
         count = np.bincount(labels[labels >= 0])
         for label in np.flatnonzero(count >= max(FEWEST_POINTS, 0.2 * count.max())):
             yield labels == label, plane
-        remaining &= ~on_plane
+        left &= ~on
 
 
 def best_plane(points, upright, rng, trials=200, sample=1500):
-    """Random sample consensus over neighbouring points, then total least squares over all that
-    agree; None if none.
-    """
+    """Random sample consensus over neighbours, then least squares over all that agree, or None."""
     few = points[rng.permutation(len(points))[:sample]]
     seeds = few[rng.integers(len(few), size=trials)]
-    apart = cdist(seeds, few)
-    preference = np.where((apart < 0.3) & (apart > 1e-6), rng.random(apart.shape), -1.0)
-    others = few[np.argpartition(-preference, 1, axis=1)[:, :2]]
+    near = cdist(seeds, few)
+    neighbours = (near < 0.3) & (near > 1e-6)  # metres
+    lots = np.where(neighbours, rng.random(near.shape), -1.0)
+    others = few[np.argpartition(-lots, 1, axis=1)[:, :2]]
     second = upright
     if upright is None:
         second = others[:, 1] - seeds
     normals = np.cross(others[:, 0] - seeds, second)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     good = length[:, 0] > 1e-9
-    if not good.any():
-        return None
     normals = normals[good] / length[good]
     offsets = np.sum(normals * seeds[good], axis=1)
-    best = np.sum(np.abs(normals @ few.T - offsets[:, None]) < PLANE_NOISE, axis=1).argmax()
-    plane = Plane(normals[best], offsets[best])
+    if len(normals) == 0:
+        return None
+    misses = np.abs(normals @ few.T - offsets[:, None])
+    best = np.sum(misses < PLANE_NOISE, axis=1).argmax()
+    plane = normals[best], offsets[best]
     for _ in range(3):
-        inliers = points[plane.misses(points) < PLANE_NOISE]
+        normal, distance = plane
+        on = points[np.abs(points @ normal - distance) < PLANE_NOISE]
         if upright is not None:
-            inliers = np.concatenate([inliers + 0.1 * upright, inliers - 0.1 * upright])
+            on = np.concatenate([on + 0.1 * upright, on - 0.1 * upright])
         try:
-            plane = Plane(*fit_plane(inliers)[:2])
+            plane = fit_plane(on)[:2]
         except ValueError:  # too few points, or all on one line
             return None
     return plane
 
 
 def _trimmed(points, mask, normal, limits, upright):
-    """A flat surface, if need be without thin strips of floor or wall; its Size, and whether it may
-    be the board.
+    """A flat surface, if need be without thin strips of floor or wall.
+
+    Its size, and whether it may be the board.
     """
+    least, most, longest = limits
     size = plane_size(points[mask], normal, upright)
+    area, length = size
     if upright is not None:
-        return mask, size, 0.3 * np.sqrt(limits.least) < size.length < limits.longest
-    if limits.hold(size):
-        return mask, size, True
-    core = ndimage.binary_opening(ndimage.binary_closing(mask, iterations=2), np.ones((5, 5)))
-    labels, count = ndimage.label(core)
-    if count == 0:
-        return mask, size, False
-    core = labels == np.bincount(labels[labels > 0]).argmax()
-    trimmed = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
-    return trimmed, size, limits.hold(plane_size(points[trimmed], normal))
+        return mask, size, 0.3 * np.sqrt(least) < length < longest
+    if not (least < area < most and length < longest):
+        whole = ndimage.binary_closing(mask, iterations=2)
+        core = ndimage.binary_opening(whole, np.ones((5, 5)))
+        labels, count = ndimage.label(core)
+        if count == 0:
+            return mask, size, False
+        core = labels == np.bincount(labels[labels > 0]).argmax()
+        mask = mask & ndimage.binary_dilation(core, np.ones((3, 3)))
+        area, length = plane_size(points[mask], normal)
+    return mask, size, least < area < most and length < longest
 
 
 def _size_limits(board, grown):
-    """SizeLimits of what may be seen of a board with its outline grown (m)."""
+    """Least and largest area (m2), greatest length (m) of a board with its outline grown (m)."""
     if board is not None and board.corners is not None:
         hull = ConvexHull(board.corners)
-        longest = pdist(board.corners).max()
-        return SizeLimits(
-            least=0.25 * hull.volume,
-            most=1.35 * hull.volume + grown * hull.area,
-            longest=1.2 * longest + 2 * grown,
-        )
+        area = hull.volume
+        rim = hull.area  # of a plane figure: its circumference
+        length = pdist(board.corners).max()
+        return 0.25 * area, 1.35 * area + grown * rim, 1.2 * length + 2 * grown
     if board is not None and board.pattern is not None:
-        columns, rows = board.pattern.columns + 1, board.pattern.rows + 1
-        area = columns * rows * board.pattern.square**2
-        diagonal = board.pattern.square * np.hypot(columns, rows)
-        return SizeLimits(0.3 * area, 4 * area, 2.5 * diagonal)
-    return ANY_BOARD
+        pattern = board.pattern
+        sides = pattern.square * np.array([pattern.columns + 1, pattern.rows + 1])
+        area = np.prod(sides)
+        return 0.3 * area, 4 * area, 2.5 * np.linalg.norm(sides)
+    return RIGID_SIZES
 
 
 def _fault(sweep, T_head_lrf, points, mask, normal):
-    """Why a surface of a sweep is no face of a board: few scan lines, seen along itself, patchy. ''
-    if it may be.
-    """
+    """Why a surface is no face of a board: few scan lines, seen along itself, patchy; or ''."""
     lines = int(mask.any(axis=1).sum())
     if lines < min(FEWEST_LINES, len(sweep.pitch)):
         return f" on {lines} of {len(sweep.pitch)} scan lines"
     cells = np.argwhere(mask)
     rays = points[mask] - tilt(T_head_lrf.translation, sweep.pitch[cells[:, 0]])
-    cosines = np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)
-    if np.median(cosines) * STEEPEST < 1:
+    cosine = np.abs(rays @ normal) / np.linalg.norm(rays, axis=1)
+    if np.median(cosine) * STEEPEST < 1:
         return " seen along itself"
     try:
         hull = ConvexHull(cells)
     except QhullError:
         return ""
     corners = cells[hull.vertices]
-    rim = np.gcd(*np.abs(np.roll(corners, -1, axis=0) - corners).T).sum()
-    # of the cells within the hull, by Pick's theorem
-    fill = len(cells) / (hull.volume + rim / 2 + 1)
+    sides = np.abs(np.roll(corners, -1, axis=0) - corners)
+    rim = np.gcd(*sides.T).sum()
+    within = hull.volume + rim / 2 + 1  # cells of the hull, by Pick's theorem
+    fill = len(cells) / within
     if fill < LEAST_FILL:
         return f" filled to {100 * fill:.0f} %"
     return ""
@@ -307,24 +260,22 @@ def _fault(sweep, T_head_lrf, points, mask, normal):
 
 def plane_axes(normal):
     """Two unit vectors in a plane, shape (2, 3): the first as level as the second is steep."""
-    level = [1.0, 0.0, 0.0]
-    if abs(normal[0]) >= 0.9:
-        level = [0.0, 1.0, 0.0]
-    across = np.cross(normal, level)
+    other = [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0]
+    across = np.cross(normal, other)
     across /= np.linalg.norm(across)
     return np.stack([np.cross(across, normal), across])
 
 
 def plane_size(points, normal, upright=None):
-    """Size of points in a plane."""
+    """Area (m2; 0 for a single line) and greatest length (m) of points in a plane."""
     if upright is not None:
-        return Size(0.0, float(np.ptp(points @ np.cross(normal, upright))))
+        return 0.0, float(np.ptp(points @ np.cross(normal, upright)))
     flat = points @ plane_axes(normal).T
     try:
         hull = ConvexHull(flat)
     except QhullError:
-        return Size(0.0, float(np.linalg.norm(np.ptp(flat, axis=0))))
-    return Size(float(hull.volume), float(pdist(flat[hull.vertices]).max()))
+        return 0.0, float(np.linalg.norm(np.ptp(flat, axis=0)))
+    return float(hull.volume), float(pdist(flat[hull.vertices]).max())
 
 
 MEDIAN_WIDTH = 5  # beams
@@ -408,7 +359,7 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
         T_head_lrf = RigidTransform.identity()
     if rng is None:
         rng = np.random.default_rng(0)
-    mask, plane = planar_surface(sweep, T_head_lrf, board, rng, lrf)
+    mask, normal, distance = planar_surface(sweep, T_head_lrf, board, rng, lrf)
     filtered = median_filter(sweep.ranges, mask)
     lines, information = fit_lines(filtered, sweep.bearings)
     fitted = np.where(_span(mask), _line_ranges(lines, sweep.bearings), np.nan)
@@ -419,7 +370,11 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
             f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board"
         )
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
-    reach = float(np.nanmedian(fitted))
+    covariance = np.linalg.inv(information) * sigma**2
+    spot = 0.0
+    if lrf is not None and lrf.spot_exit is not None:
+        reach = float(np.nanmedian(fitted))
+        spot = float(lrf.spot_radius(reach)) / reach
     return BoardScan(
         placement=sweep.placement,
         sweep=sweep,
@@ -428,12 +383,12 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
         filtered=filtered,
         fitted=fitted,
         lines=lines,
-        lines_covariance=np.linalg.inv(information) * sigma**2,
-        normal=plane.normal,
-        distance=plane.distance,
+        lines_covariance=covariance,
+        normal=normal,
+        distance=distance,
         sigma_range=sigma,
         n_jump_points=int(jump_points(sweep.ranges, fitted, sigma).sum()),
-        spot=_spot_radius(lrf, reach) / reach,
+        spot=spot,
     )
 
 
@@ -445,12 +400,14 @@ def median_filter(ranges, mask, width=MEDIAN_WIDTH):
     """
     if width < 1 or width % 2 == 0:
         raise ValueError(f"the width of a median filter is odd and positive, got {width}")
-    on_board = np.where(mask & np.isfinite(ranges), ranges, np.nan)
-    filtered = np.full(on_board.shape, np.nan)
-    line, beam = np.nonzero(np.isfinite(on_board))
-    padded = np.pad(on_board, ((0, 0), (width // 2, width // 2)), constant_values=np.nan)
-    filtered[line, beam] = row_median(padded[line[:, None], beam[:, None] + np.arange(width)])
-    return filtered
+    taken = np.where(np.isfinite(ranges) & mask, ranges, np.nan)
+    out = np.full(taken.shape, np.nan)
+    line, beam = np.nonzero(np.isfinite(taken))
+    half = width // 2
+    padded = np.pad(taken, ((0, 0), (half, half)), constant_values=np.nan)
+    window = beam[:, None] + np.arange(width)
+    out[line, beam] = row_median(padded[line[:, None], window])
+    return out
 
 
 def fit_lines(ranges, bearings, rounds=4):
@@ -474,18 +431,17 @@ def fit_lines(ranges, bearings, rounds=4):
     """
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     products = rays[:, :, None] * rays[:, None, :]
-    measured = np.isfinite(ranges)
-    r = np.where(measured, ranges, 1.0)
-    enough = measured.sum(axis=1) >= FEWEST_BEAMS
-    base = np.where(measured & enough[:, None], r**4, 0.0)
-    weights = base
+    seen = np.isfinite(ranges)
+    r = np.where(seen, ranges, 1.0)
+    enough = seen.sum(axis=1) >= FEWEST_BEAMS
+    base = weights = np.where(seen & enough[:, None], r**4, 0.0)
     for _ in range(rounds):
         information = np.einsum("lb,bij->lij", weights, products)
-        information[~enough] = np.eye(2)
         right = (weights / r) @ rays
+        information[~enough] = np.eye(2)
         right[~enough] = np.nan
         lines = np.linalg.solve(information, right[..., None])[..., 0]
-        misses = np.where(measured, np.abs(r - _line_ranges(lines, bearings)), np.nan)
+        misses = np.where(seen, np.abs(r - _line_ranges(lines, bearings)), np.nan)
         with np.errstate(invalid="ignore"):
             sigma = np.maximum(NORMAL * row_median(misses), 1e-4)[:, None]
             weights = np.nan_to_num(base * biweight(misses, sigma))
@@ -513,45 +469,48 @@ def _line_ranges(lines, bearings):
 
 
 def row_ends(mask):
-    """First and last True of each row; rows without one are left out. Returns (rows,
-    first, last).
+    """First and last True of each row.
+
+    Rows without one are left out. Returns (rows, first, last).
     """
     rows = np.flatnonzero(mask.any(axis=1))
-    return rows, mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
+    first = mask[rows].argmax(axis=1)
+    from_end = mask[rows, ::-1].argmax(axis=1)
+    return rows, first, mask.shape[1] - 1 - from_end
 
 
 def _span(mask, trim=0):
-    """True from the first to the last True of each row, without `trim` beams (a number, or one a
-    row) at both ends.
+    """True from the first to the last True of each row, without `trim` beams at both ends.
+
+    A number, or one a row.
     """
     rows, first, last = row_ends(mask)
     beam = np.arange(mask.shape[1])
-    span = np.zeros(mask.shape, bool)
-    span[rows] = (beam >= (first + trim)[:, None]) & (beam <= (last - trim)[:, None])
-    return span
+    out = np.zeros(mask.shape, bool)
+    after = beam >= (first + trim)[:, None]
+    before = beam <= (last - trim)[:, None]
+    out[rows] = after & before
+    return out
 
 
 def jump_points(ranges, fitted, sigma_range):
-    """Returns (L, B) that belong neither to the board nor to a surface behind it: mixed pixels and
-    outliers.
+    """Mixed pixels and outliers (L, B): neither of the board nor of a surface behind it.
 
     Returns on the board's span of a scan line that miss it by more than four sigma (two centimetres
     at least), and pieces of at most two beams (cut at jumps of that size) directly beside it.
     """
-    on_board = np.isfinite(fitted)
+    on = np.isfinite(fitted)
     threshold = max(4 * sigma_range, PLANE_NOISE)
     with np.errstate(invalid="ignore"):
-        inside = on_board & (np.abs(ranges - fitted) > threshold)
+        inside = on & (np.abs(ranges - fitted) > threshold)
     pieces = segments(ranges, jump=threshold)
     size = np.bincount(pieces[pieces >= 0], minlength=1)
     single = (pieces >= 0) & (size[pieces] <= 2)
-    beside = _span(on_board, -2) & ~on_board
-    return inside | (single & beside)
+    return inside | (single & _span(on, -2) & ~on)
 
 
 def count_jump_points(scan):
-    """Number of jump points of a BoardScan as recorded and after a median filter, for figure 5 of
-    the paper.
+    """Number of jump points of a BoardScan as recorded and after a median filter (figure 5).
 
     The filter runs over the board's returns and the jump points among and beside them, without the
     background: what step (i) of the paper leaves.
@@ -584,14 +543,17 @@ def face_points(scan, count=1000, margin=0.06):
     covariance : ndarray, shape (m, 3, 3)
     """
     with np.errstate(invalid="ignore"):
-        good = scan.mask & (np.abs(scan.sweep.ranges - scan.fitted) < 4 * scan.sigma_range)
-    clear = CLEAR * scan.spot
-    along = _interior(scan.mask, margin, clear / median_step(scan.sweep.bearings))
-    down = _interior(scan.mask.T, margin, clear / median_step(scan.sweep.pitch)).T
-    line, beam = np.nonzero(good & along & down)
+        miss = np.abs(scan.sweep.ranges - scan.fitted)
+        good = scan.mask & (miss < 4 * scan.sigma_range)
+    along = CLEAR * scan.spot / max(median_step(scan.sweep.bearings), 1e-6)
+    down = CLEAR * scan.spot / max(median_step(scan.sweep.pitch), 1e-6)
+    good &= _interior(scan.mask, margin, along)
+    good &= _interior(scan.mask.T, margin, down).T
+    line, beam = np.nonzero(good)
     if len(line) > count:
         keep = np.linspace(0, len(line) - 1, count).round().astype(int)
-        line, beam = line[keep], beam[keep]
+        line = line[keep]
+        beam = beam[keep]
     ranges = scan.sweep.ranges[line, beam]
     bearings = scan.sweep.bearings[beam]
     # keeps the covariance regular; bearings are all but exact
@@ -601,21 +563,20 @@ def face_points(scan, count=1000, margin=0.06):
 
 
 def median_step(angles):
-    """Median step between neighbouring angles, radians; infinite for one angle, a microradian at
-    least.
-    """
-    if len(angles) == 1:
+    """Median step between neighbouring angles; infinite for a single one."""
+    if len(angles) < 2:
         return np.inf
-    return max(np.median(np.abs(np.diff(angles))), 1e-6)
+    return np.median(np.abs(np.diff(angles)))
 
 
 def _interior(mask, margin, spot):
-    """Without the outer part of each row: a fraction `margin`, and `spot` cells where that leaves
-    half of the row.
+    """Without the outer part of each row: a fraction `margin`, and `spot` cells.
 
-    A row too short for that (a sweep of one line, seen by columns) stays.
+    The latter where that leaves half of the row. A row too short for that (a sweep of one line,
+    seen by columns) stays.
     """
     _, first, last = row_ends(mask)
     size = last - first
     least = np.maximum(2, np.minimum(spot, MOST_MARGIN * size))
-    return _span(mask, np.where(size < 6, 0, np.maximum(least, margin * size).astype(int)))
+    trim = np.maximum(least, margin * size).astype(int)
+    return _span(mask, np.where(size < 6, 0, trim))

@@ -1,4 +1,7 @@
-"""Straight edges in an image at sub-pixel level: profiles, votes, a robust line fit; the wide search."""
+"""Straight edges in an image at sub-pixel level: profiles, votes, a robust line fit.
+
+The wide search.
+"""
 
 from dataclasses import dataclass
 
@@ -16,11 +19,15 @@ LEAST_CONTRAST = 6.0  # grey levels (norm over the colours) that make a step
 LEAST_SUPPORT = 0.45  # share of the profiles that must agree on one line
 LEAST_SHARE = 0.2  # of the edge that must lie inside the image
 LEAST_PROFILES = 25
-SYSTEMATIC_PX = 0.1  # of a line at its centre, whatever the number of profiles: rims, paint and optics
-FULL_CONTRAST = 30.0  # grey levels: a step of this height counts half, cardboard and paint have weaker ones
+# of a line at its centre, whatever the number of profiles: rims, paint and optics
+SYSTEMATIC_PX = 0.1
+# grey levels: a step of this height counts half, cardboard and paint have weaker ones
+FULL_CONTRAST = 30.0
 PICK_SIGMA_PX = 1.0  # of a point clicked by hand
 STEP = 0.02  # of the wide search, in squares
-NEAREST, FARTHEST = 1.1, 6.0  # squares outside the outermost inner corners
+# squares outside the outermost inner corners
+NEAREST = 1.1
+FARTHEST = 6.0
 BEHIND = -1e6  # pixels; where points behind the camera are drawn
 SIDES = ("top", "right", "bottom", "left")
 SIDE_NORMALS = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
@@ -37,7 +44,8 @@ class ImageEdge:
     line : ndarray, shape (3,)
         ``l0 u + l1 v + l2 = 0`` with the unit normal pointing out of the board.
     covariance : ndarray, shape (2, 2)
-        Of the offset along the normal at `centre` (pixels) and of the angle (radians, turning the normal from u to v).
+        Of the offset along the normal at `centre` (pixels) and of the angle (radians, turning the
+        normal from u to v).
     centre : ndarray, shape (2,)
         Point of the line.
     ends : ndarray, shape (2, 2)
@@ -61,7 +69,7 @@ class EdgeNotSeen(ValueError):
 
 
 class OutlineNotSeen(ValueError):
-    """The images do not show where a board ends (a sheet on a wall, a background as bright as the board)."""
+    """The images do not show where a board ends: a sheet on a wall, a background as bright."""
 
 
 def loops():
@@ -77,41 +85,57 @@ def sample(image, model, uv):
     `cv2.remap` rounds positions to 1/32 px: a bias for lines along the pixel grid.
     """
     image = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
-    out = np.empty((uv.size // 2, image.shape[2]), np.float32)
-    loops().bilinear(image, np.ascontiguousarray(uv, float).reshape(-1, 2), model.parameters, fold(model), out)
+    pixels = np.ascontiguousarray(uv, float).reshape(-1, 2)
+    out = np.empty((len(pixels), image.shape[2]), np.float32)
+    loops().bilinear(image, pixels, model.parameters, fold(model), out)
     return out.reshape(uv.shape[:-1] + (-1,))
 
 
 def step_contrast(strip, sigma, along=AVERAGED_PROFILES):
-    """Height of the step at every place of a strip (across, along, channels), grey levels; 0 where it leaves the image.
+    """Height of the step at every place of a strip (across, along, channels), grey levels.
 
-    Derivative of a Gaussian of `sigma` samples across the edge, of `along` averaged profiles, norm over the colours.
+    0 where it leaves the image. Derivative of a Gaussian of `sigma` samples across the edge, of
+    `along` averaged profiles, norm over the colours.
     """
-    gone, places = np.isnan(strip[..., 0]), np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)
+    gone = np.isnan(strip[..., 0])
+    wide = int(4 * sigma + 0.5)
+    places = np.arange(-wide, wide + 1)
     bell = np.exp(-0.5 * (places / sigma) ** 2)
     slope = places / sigma * bell / bell.sum() * np.sqrt(2 * np.pi)
+    mean = np.full(along, 1 / along)
     filled = np.where(gone[..., None], np.float32(0), strip)
-    found = cv2.sepFilter2D(filled, cv2.CV_32F, np.full(along, 1 / along), slope, borderType=cv2.BORDER_REFLECT)
-    height = np.linalg.norm(found.reshape(strip.shape), axis=-1)
+    steps = cv2.sepFilter2D(filled, cv2.CV_32F, mean, slope, borderType=cv2.BORDER_REFLECT)
+    height = np.linalg.norm(steps.reshape(strip.shape), axis=-1)
     reach = int(np.ceil(2 * sigma))
-    near_gone = cv2.dilate(gone.astype(np.uint8), np.ones((2 * reach + 1, along), np.uint8)) > 0
+    kernel = np.ones((2 * reach + 1, along), np.uint8)
+    near_gone = cv2.dilate(gone.astype(np.uint8), kernel) > 0
     return np.where(near_gone, 0, height)
 
 
 def peaks(height, least=LEAST_CONTRAST):
-    """Local maxima of the step height by profile: column, place across (to a fraction of a sample), contrast."""
-    low, mid, high = height[:-2], height[1:-1], height[2:]
-    column, row = np.nonzero(((mid >= low) & (mid > high) & (mid > least)).T)
-    a, b, c = low[row, column], mid[row, column], high[row, column]
-    return column, row + 1 + 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-12), b
+    """Local maxima of the step height by profile: column, place across, contrast.
+
+    The place is that of a parabola through three samples.
+    """
+    low = height[:-2]
+    mid = height[1:-1]
+    high = height[2:]
+    highest = (mid >= low) & (mid > high) & (mid > least)
+    column, row = np.nonzero(highest.T)
+    a = low[row, column]
+    b = mid[row, column]
+    c = high[row, column]
+    bend = np.minimum(a - 2 * b + c, -1e-12)
+    return column, row + 1 + 0.5 * (a - c) / bend, b
 
 
 def fit_line(column, place, offset, slope, tolerance, rounds=12):
-    """Robust line ``place = offset + slope column`` through the peaks within `tolerance` samples of a start line.
+    """Robust line ``place = offset + slope column`` through the peaks near a start line.
 
-    Tukey's biweight. Returns the offset and slope (2,), their covariance, which peaks were kept, and their rms.
-    Neighbouring profiles share pixels and the same dents, so errors are correlated along the edge; the covariance is
-    multiplied by the integrated autocorrelation of the residuals.
+    Near are those within `tolerance` samples; Tukey's biweight. Returns the offset and slope (2,),
+    their covariance, which peaks were kept, and their rms. Neighbouring profiles share pixels and
+    the same dents, so errors are correlated along the edge; the covariance is multiplied by the
+    integrated autocorrelation of the residuals.
     """
     design = np.column_stack([np.ones(len(column)), column])
     for _ in range(rounds):
@@ -119,8 +143,10 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
         near = np.abs(residual) < tolerance
         if near.sum() < 3:
             return np.array([offset, slope]), np.full((2, 2), np.inf), near, np.inf
-        weight = np.where(near, biweight(residual, robust_sigma(residual[near], least=0.02)), 0)
-        new = np.linalg.solve(design.T @ (design * weight[:, None]), design.T @ (weight * place))
+        sigma = robust_sigma(residual[near], least=0.02)
+        weight = np.where(near, biweight(residual, sigma), 0)
+        normal = design.T @ (design * weight[:, None])
+        new = np.linalg.solve(normal, design.T @ (weight * place))
         done = np.allclose(new, [offset, slope], rtol=0, atol=1e-7)
         offset, slope = new
         if done:
@@ -128,32 +154,48 @@ def fit_line(column, place, offset, slope, tolerance, rounds=12):
     kept = weight > 0
     residual = (place - offset - slope * column)[kept]
     variance = residual @ residual / max(kept.sum() - 2, 1)
-    # averaged profiles share pixels: their errors are correlated at least that much, whatever a short series says
+    # averaged profiles share pixels: their errors are correlated at least that much, whatever a
+    # short series says
     factor = max(correlation_factor(column[kept], residual), 1.1 * AVERAGED_PROFILES)
     covariance = np.linalg.inv(design[kept].T @ design[kept]) * variance * factor
     return new, covariance, kept, float(np.sqrt(np.mean(residual**2)))
 
 
 def correlation_factor(column, residual, window=3.0):
-    """Integrated autocorrelation of residuals along the edge (Sokal's window), ``1 + 2 sum rho``, at least 1."""
-    column, length = column - column.min(), int(np.ptp(column)) + 1
-    series, seen = np.zeros((2, length))
-    series[column], seen[column] = residual, 1.0
-    size = 2 ** int(np.ceil(np.log2(2 * length)))
-    power, pairs = (np.fft.irfft(np.abs(np.fft.rfft(v, size)) ** 2, size)[:length] for v in (series, seen))
-    rho = power / np.maximum(pairs, 1) / max(power[0] / max(pairs[0], 1), 1e-300)
-    # a line was taken out: the residuals of white noise already sum to about -1, so no further correction is needed
+    """Integrated autocorrelation of residuals along the edge, ``1 + 2 sum rho``, at least 1.
+
+    With Sokal's window.
+    """
+    place = column - column.min()
+    length = place.max() + 1
+    series = np.zeros(length)
+    present = np.zeros(length)
+    series[place] = residual
+    present[place] = 1.0
+    mean_product = _autocorrelation(series) / np.maximum(_autocorrelation(present), 1)
+    rho = mean_product / max(mean_product[0], 1e-300)
+    # a line was taken out: the residuals of white noise already sum to about -1, so no further
+    # correction is needed
     total = 1 + 2 * np.cumsum(np.r_[0.0, rho[1 : length // 3]])
     beyond = np.flatnonzero(np.arange(len(total)) >= window * total)
-    return float(max(total[beyond[0] if len(beyond) else -1], 1.0))
+    last = beyond[0] if len(beyond) else -1
+    return float(max(total[last], 1.0))
+
+
+def _autocorrelation(series):
+    """Sums of products of a series (n,) with itself, by the distance apart."""
+    size = 2 ** int(np.ceil(np.log2(2 * len(series))))
+    power = np.abs(np.fft.rfft(series, size)) ** 2
+    return np.fft.irfft(power, size)[: len(series)]
 
 
 def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np.inf, most=np.inf):
     """Find a straight edge near a predicted stretch: an ImageEdge, or EdgeNotSeen with the reason.
 
-    `start` and `end` are the predicted ends (undistorted pixels), `outward` any vector that points out of the board;
-    the edge is searched `half_width` pixels to both sides. `prior_px` is the standard deviation of the prediction: of
-    two lines with similar support the nearer one is taken. A profile stands at every pixel, or at `most` that many.
+    `start` and `end` are the predicted ends (undistorted pixels), `outward` any vector that points
+    out of the board; the edge is searched `half_width` pixels to both sides. `prior_px` is the
+    standard deviation of the prediction: of two lines with similar support the nearer one is taken.
+    A profile stands at every pixel, or at `most` that many.
     """
     length = np.linalg.norm(end - start)
     if min(*start, *end) <= BEHIND:
@@ -167,18 +209,25 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
     columns = np.arange(0, int(length) + 1, apart)
     pad = 3 * SMOOTH_PX + 1
     across = np.arange(-half_width - pad, half_width + pad + ACROSS_STEP_PX, ACROSS_STEP_PX)
-    strip = sample(image, model, start + columns[None, :, None] * along + across[:, None, None] * normal)
-    visible = int(np.isfinite(strip[np.abs(across) <= 2.0, :, 0]).all(axis=0).sum())
+    on_edge = start + columns[None, :, None] * along
+    strip = sample(image, model, on_edge + across[:, None, None] * normal)
+    near = strip[np.abs(across) <= 2.0, :, 0]
+    visible = int(np.isfinite(near).all(axis=0).sum())
     if visible < max(LEAST_PROFILES, LEAST_SHARE * len(columns)):
-        raise EdgeNotSeen(f"cut by the image border: {100 * visible / len(columns):.0f}% of it inside the image")
-    (offset, slope), covariance, seen, rms = _line_in_strip(strip, visible, across, half_width, prior_px)
-    seen, slope, covariance = apart * seen, slope / apart, covariance / np.outer([1, apart], [1, apart])
+        share = 100 * visible / len(columns)
+        raise EdgeNotSeen(f"cut by the image border: {share:.0f}% of it inside the image")
+    fitted, covariance, profiles, rms = _line_in_strip(strip, visible, across, half_width, prior_px)
+    offset, slope = fitted
+    seen = apart * profiles
+    slope = slope / apart
+    covariance = covariance / np.outer([1, apart], [1, apart])
     middle = seen.mean()
     to_middle = np.array([[1.0, middle], [0.0, 1.0]])
     covariance = to_middle @ covariance @ to_middle.T * ACROSS_STEP_PX**2
     covariance += np.diag([1.0, 12 / max(np.ptp(seen), 1) ** 2]) * SYSTEMATIC_PX**2
     column = np.array([seen.min(), seen.max(), middle])[:, None]
-    points = start + column * along + (across[0] + ACROSS_STEP_PX * (offset + slope * column)) * normal
+    off = across[0] + ACROSS_STEP_PX * (offset + slope * column)
+    points = start + column * along + off * normal
     line = outward_line(points[0], points[1], normal)
     # a slope ds moves the far end outwards; the angle turns the normal from u to v
     turn = -np.sign(along @ [-line[1], line[0]])
@@ -187,18 +236,23 @@ def refine_edge(image, model, name, start, end, outward, half_width, prior_px=np
 
 
 def _line_in_strip(strip, visible, across, half_width, prior_px):
-    """Line of most votes in a strip's samples: offset and slope, covariance, the profiles that show it, rms."""
+    """Line of most votes in a strip: offset and slope, covariance, profiles that show it, rms."""
     height = step_contrast(strip, SMOOTH_PX / ACROSS_STEP_PX)
+    count = height.shape[1]
     column, place, contrast = peaks(height)
-    slopes = np.linspace(-1, 1, 41) * min(half_width / ACROSS_STEP_PX, 24) / height.shape[1] * 2
-    votes = loops().vote(column, place, contrast / (contrast + FULL_CONTRAST), height.shape, slopes)
+    widest = min(half_width / ACROSS_STEP_PX, 24)
+    slopes = np.linspace(-1, 1, 41) * widest / count * 2
+    weight = contrast / (contrast + FULL_CONTRAST)
+    votes = loops().vote(column, place, weight, height.shape, slopes)
     # the prediction is as uncertain at either end as it is in the middle
-    tilted = slopes[:, None] * ACROSS_STEP_PX * height.shape[1] / 2
-    allowed = (np.abs(across) <= half_width) * np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
-    best = np.unravel_index(np.argmax(votes * allowed), votes.shape)
-    slope = slopes[best[0]]
-    offset = best[1] - slope * (height.shape[1] - 1) / 2
-    line, covariance, kept, rms = fit_line(column, place, offset, slope, tolerance=1.5 / ACROSS_STEP_PX)
+    tilted = slopes[:, None] * ACROSS_STEP_PX * count / 2
+    likely = np.exp(-0.5 * (across**2 + tilted**2) / prior_px**2)
+    allowed = (np.abs(across) <= half_width) * likely
+    turned, at = np.unravel_index(np.argmax(votes * allowed), votes.shape)
+    slope = slopes[turned]
+    offset = at - slope * (count - 1) / 2
+    tolerance = 1.5 / ACROSS_STEP_PX
+    line, covariance, kept, rms = fit_line(column, place, offset, slope, tolerance)
     support = len(np.unique(column[kept])) / visible
     if support < LEAST_SUPPORT or kept.sum() < LEAST_PROFILES:
         raise EdgeNotSeen(f"no clear edge: {100 * support:.0f}% of the profiles agree on a line")
@@ -212,16 +266,25 @@ def outward_line(a, b, outward):
 
 
 def picked_edge(name, ends, inner):
-    """The edge through two points clicked by hand (2, 2); `inner` is a point of the board. Undistorted pixels."""
-    length, centre = np.linalg.norm(ends[1] - ends[0]), ends.mean(axis=0)
+    """The edge through two points clicked by hand (2, 2).
+
+    `inner` is a point of the board. Undistorted pixels.
+    """
+    length = np.linalg.norm(ends[1] - ends[0])
+    centre = ends.mean(axis=0)
     if length < 1:
-        raise ValueError(f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart")
+        raise ValueError(
+            f"edge '{name}' was picked with two points {length:.2f} px apart: pick them far apart"
+        )
     covariance = PICK_SIGMA_PX**2 * np.diag([0.5, 2 / length**2])
     return ImageEdge(name, outward_line(*ends, centre - inner), covariance, centre, ends, 2, 0.0)
 
 
 def board_line(view, edge, model):
-    """The image line of an edge as a line on the board, unit normal outwards, metres; shape (3,)."""
+    """The image line of an edge as a line on the board, unit normal outwards, metres.
+
+    Shape (3,).
+    """
     pose = view.T_camera_board.as_matrix()
     line = (model.matrix @ pose[:3, [0, 1, 3]]).T @ edge.line
     return line / np.hypot(line[0], line[1])
@@ -233,11 +296,12 @@ def wide_distances(pattern):
 
 
 def edge_votes(image, board, model, pose):
-    """Share of the profiles that agree on an edge, by side of the pattern and :func:`wide_distances` of it, (4, n).
+    """Share (4, n) of the profiles that agree on an edge, by side and :func:`wide_distances`.
 
     NaN where less than 30 % of the profiles lie inside the image.
     """
-    pattern, distances = board.pattern, wide_distances(board.pattern)
+    pattern = board.pattern
+    distances = wide_distances(board.pattern)
     size = np.array([pattern.columns - 1, pattern.rows - 1]) * pattern.square
     slopes = np.linspace(-0.025, 0.025, 11) * 4  # the profiles stand four steps apart
     out = []
@@ -256,17 +320,24 @@ def edge_votes(image, board, model, pose):
 
 
 def on_board(xy, pose, model):
-    """Undistorted pixels of points (..., 2) of the board; far outside the image where they lie behind the camera."""
+    """Undistorted pixels of points (..., 2) of the board.
+
+    Far outside the image where they lie behind the camera.
+    """
     points = np.column_stack([xy.reshape(-1, 2), np.zeros(xy.size // 2)])
     return np.nan_to_num(pinhole(pose.apply(points), model), nan=BEHIND).reshape(xy.shape)
 
 
 def common_lines(votes, board):
-    """Board lines (4, 3) that views with votes (v, 4, n), turned alike, agree on; OutlineNotSeen names an edge."""
+    """Board lines (4, 3) that views with votes (v, 4, n), turned alike, agree on.
+
+    OutlineNotSeen names an edge.
+    """
     # an edge moves by a few millimetres between placements
     wide = maximum_filter1d(np.nan_to_num(votes, nan=-1.0), 7, axis=-1)
     wide[wide < 0] = np.nan
-    distances, places = wide_distances(board.pattern), []
+    distances = wide_distances(board.pattern)
+    places = []
     for name, own in zip(SIDES, np.moveaxis(wide, 1, 0), strict=True):
         enough = np.isfinite(own).sum(axis=0) >= min(3, len(votes))
         mean = np.zeros(len(distances))
@@ -274,30 +345,35 @@ def common_lines(votes, board):
         places.append(outer_peak(gaussian_filter1d(mean, 1.0)))
         if places[-1] < 0:
             raise OutlineNotSeen(
-                f"the images do not agree on the {name} edge of board '{board.name}': give the corners of the board or "
-                "pick edges by hand"
+                f"the images do not agree on the {name} edge of board '{board.name}': give the "
+                "corners of the board or pick edges by hand"
             )
     return side_lines(board.pattern, distances[places])
 
 
 def outer_peak(votes, least=0.5, quiet=0.2, width=6):
-    """Place of the board's edge in the votes (n,) of one side: the last line before the clutter begins; -1 if none.
+    """Place of the board's edge in the votes (n,) of one side: the last line before the clutter
+    begins; -1 if none.
 
-    Two lines of a board (the border of the sheet, the edge) are `width` samples wide and `quiet` in between.
+    Two lines of a board (the border of the sheet, the edge) are `width` samples wide and `quiet` in
+    between.
     """
-    best, start = -1, 0
+    best = -1
+    start = 0
     for i in np.nonzero(votes >= least)[0]:
         if votes[i] < votes[max(i - width, 0) : i + width + 1].max():
             continue
         gap = votes[start : max(i - 2 * width, start)]
         if gap.size and gap.mean() > quiet:
             break
-        best, start = int(i), int(i) + 2 * width
+        best = int(i)
+        start = int(i) + 2 * width
     return best
 
 
 def side_lines(pattern, distances):
-    """Board lines (4, 3) parallel to the sides of the pattern, at distances outside the outermost inner corners.
+    """Board lines (4, 3) parallel to the sides of the pattern, at distances outside the outermost
+    inner corners.
 
     Parameters
     ----------

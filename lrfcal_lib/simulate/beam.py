@@ -1,6 +1,4 @@
-"""A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes, and
-beams one after another.
-"""
+"""A SICK LMS2xx laser range finder: a spot of finite size, mixed pixels, noise, codes."""
 
 import math
 from dataclasses import dataclass

@@ -203,7 +203,8 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
     edge = distances.argmax(axis=-1)
     soft = np.hypot(bench.softness * radius, bench.floor * bench.step * r)
     jitter = noise * soft * rng.standard_normal(r.shape)
-    hit = (u + jitter < _bias_of_sides(bench, rng)[edge] * radius) & sensible
+    bias = _bias_of_sides(bench, rng)[edge]
+    hit = (u + jitter < bias * radius) & sensible
     # near to an edge across the scan lines, and along them
     changes = (np.diff(hit, axis=axis, append=hit.take([-1], axis)) for axis in (0, 1))
     across, along = (
@@ -234,11 +235,12 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
 
 
 def _bias_of_sides(bench, rng):
-    """How far outside each edge of one placement a spot's centre still reads the board, spot radii, (E,)."""
+    """How far outside each edge (E,) of a placement a spot still reads the board, spot radii."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
         x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi  # of a disc within an edge x radii inside its centre
+        # of a disc within an edge x radii inside its centre
+        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
         odds = np.log(share / (1 - share))
         own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
         bias = np.interp(-own, -odds, x)
@@ -247,16 +249,16 @@ def _bias_of_sides(bench, rng):
 
 def _views(bench, pose, at, rng, noise):
     """Poses of the board in the cameras at recorded pitch angles, with errors."""
-    true, head = [], at * (1 + bench.stretch)
+    true = []
+    pitch = at * (1 + bench.stretch)  # of the head
     if bench.sigma_stop:  # one error for all cameras
-        head = head + noise * bench.sigma_stop * rng.standard_normal(len(at))
+        pitch = pitch + noise * bench.sigma_stop * rng.standard_normal(len(at))
     for camera in bench.cameras.values():
         T_source_platform = RigidTransform.identity(len(at))
         if bench.mount == "head":
-            turn = RigidTransform.from_rotation(
-                Rotation.from_rotvec(np.outer(-head, [1.0, 0.0, 0.0]))
-            )
-            T_source_platform = bench.T_head_lrf.inv() * turn
+            turn = np.outer(-pitch, [1.0, 0.0, 0.0])
+            T_head_platform = RigidTransform.from_rotation(Rotation.from_rotvec(turn))
+            T_source_platform = bench.T_head_lrf.inv() * T_head_platform
         true.append((camera * T_source_platform * pose).as_matrix())
     true = np.concatenate([*true, np.zeros((0, 4, 4))])
     drawn, covariance = _seen_poses(bench, true[:, :3], rng, noise)
@@ -324,13 +326,7 @@ def _candidates(setup, rng, rig):
     board = setup.board
     model = setup.model
     bearings = setup.bearings()
-    spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
-    turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
-    away = rng.uniform(*setup.distances, count)
-    right = rng.uniform(-0.35, 0.35, count) * away
-    up = rng.uniform(-0.12, 0.12, count)
-    centre = np.column_stack([right, away, up])
-    shift = centre - turn @ np.append(board.corners.mean(axis=0), 0.0)
+    turn, shift = _boards_ahead(setup, rng, count)
     rays = polar_to_points(np.ones(len(bearings)), bearings) @ turn
     u, ranges = _beside(board, -(shift[:, None] @ turn), rays)
     radius = setup.radius(ranges)
@@ -372,6 +368,17 @@ def _candidates(setup, rng, rig):
     }
 
 
+def _boards_ahead(setup, rng, count):
+    """Rotations (n, 3, 3) and origins (n, 3) of boards in the LRF frame that face it."""
+    spin = rng.uniform(0, 2 * np.pi, (count, 1))[:, 0]
+    turn = _facing(spin, rng.uniform(-0.6, 0.6, (count, 2))).as_matrix()
+    away = rng.uniform(*setup.distances, count)
+    right = rng.uniform(-0.35, 0.35, count) * away
+    up = rng.uniform(-0.12, 0.12, count)
+    centre = np.column_stack([right, away, up])
+    return turn, centre - turn @ np.append(setup.board.corners.mean(axis=0), 0.0)
+
+
 def _facing(spin, lean):
     """Rotation of boards that face the LRF, leant about x and y, then turned in their plane."""
     lean = np.asarray(lean)
@@ -383,7 +390,7 @@ def _facing(spin, lean):
 def _beside(board, origin, rays):
     """Distances between rays (board frame) and the lines of edges (..., E), positive outside.
 
-    Ranges to its plane.
+    And the ranges to the plane of the board.
     """
     ranges = -origin[..., 2] / rays[..., 2]
     at = origin + ranges[..., None] * rays

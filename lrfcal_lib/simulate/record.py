@@ -73,9 +73,7 @@ def world_of(setup, T_platform_board, stand=True):
 
 
 def step_angles(first, last, step):
-    """Pitch commands of a stop-and-go sweep: multiples of `step` from about `first` to about
-    `last`, radians.
-    """
+    """Pitch commands of a stop-and-go sweep: multiples of `step` about from `first` to `last`."""
     need(step > 0, f"a pitch step must be positive, got {step} rad")
     low, high = sorted((first, last))
     angles = np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step
@@ -95,9 +93,7 @@ def stops_of(setup, placement):
 
 
 def sweep_of(setup, placement):
-    """The scan lines of a placement, one at every stop of the sweep: words (L, B) as the device
-    sends them.
-    """
+    """The scan lines of a placement, one a stop of the sweep: words (L, B) as a device sends."""
     pitch = stops_of(setup, placement)[1].true
     world = world_of(setup, placement.T_platform_board)
     return scan(
@@ -110,9 +106,7 @@ def sweep_of(setup, placement):
 
 
 def close_views(setup, number):
-    """Poses ``T_platform_board`` of the board held close to a camera, by its number, while the
-    head is at pitch 0.
-    """
+    """Poses ``T_platform_board`` of the board held close to a camera while the head is at 0."""
     rig = setup.rig
     camera = setup.rig.cameras[number]
     still = rig.camera_pose(camera, 0.0).inv()
@@ -162,8 +156,7 @@ def photograph(setup, shots):
 
 
 def simulate(path, setup, workers=1):
-    """Simulate a recording and write its session into a new folder; `workers` processes render the
-    images.
+    """Simulate a recording and write its session into a new folder; `workers` render images.
 
     Raises
     ------
@@ -238,7 +231,7 @@ def _record(folder, name, setup, workers):
 def _add_placements(writer, setup, placements, truth, workers):
     """Write the images for the intrinsics, then images and sweep of each placement.
 
-    Rows of the platform's log.
+    Returns the rows of the platform's log.
     """
     beam = setup.rig.beam
     pause = setup.rig.platform.settle

@@ -1,6 +1,4 @@
-"""The simulated rig, the set-ups by name (``setups.json``), and the places that the board is
-put.
-"""
+"""The simulated rig, the set-ups by name (``setups.json``), and where the board is put."""
 
 import json
 import math
@@ -56,7 +54,7 @@ class Platform:
         need(abs(self.stretch) < 0.5, f"platform: {share}")
 
     def stop(self, commanded, direction, rng):
-        """True and measured pitch (n,) at rest at commanded angles, reached from below (+1) or above.
+        """True and measured pitch (n,) at rest at commanded angles, from below (+1) or above.
 
         The encoder sits on the motor: it sees neither backlash nor stretch.
         """
@@ -109,9 +107,7 @@ class Rig:
     stated_sigma: tuple[float, float] = (math.radians(1.5), 0.020)
 
     def camera_pose(self, camera, pitch):
-        """``T_camera_platform`` of a RigCamera while the head stands at a true pitch (or at
-        many), radians.
-        """
+        """``T_camera_platform`` of a RigCamera at a true pitch of the head, or at many, radians."""
         back = RigidTransform.from_rotation(
             Rotation.from_rotvec(np.multiply.outer(pitch, [-1.0, 0.0, 0.0]))
         )
@@ -204,9 +200,7 @@ class Setup:
 
 
 def printed_triangle():
-    """The paper's triangle (315 and 380 mm at an exact right angle) with 4 x 5 inner corners
-    beside the right angle.
-    """
+    """The paper's triangle (315 and 380 mm, a right angle) with 4 x 5 inner corners beside it."""
     return triangle_board(
         name="triangle_315_380", pattern=Chessboard(4, 5, 0.029, (0.03885, 0.03885))
     )
@@ -216,8 +210,7 @@ SETUPS = json.loads(Path(__file__).with_name("setups.json").read_text())
 
 
 def load_setup(name):
-    """A Setup of ``setups.json``, which takes over what it does not say from the one that it is
-    like.
+    """A Setup of ``setups.json``; what it does not say is taken from the one that it is like.
 
     ValueError for a name that is not there.
     """
@@ -355,7 +348,7 @@ def pairs(rig, count, distances, rng, margin=OUTSIDE):
 
 
 def _placement(number, pose, spans, image_shares, way):
-    """A Placement swept upwards (1) or downwards (-1), images at shares of the pitch that shows it."""
+    """A Placement swept upwards (1) or downwards (-1), with images at shares of the pitch."""
     sweep, seen = spans
     half = min(np.ptp(seen) * 0.4, np.radians(9.0))
     angles = np.mean(seen) + half * np.array(image_shares)

@@ -115,9 +115,7 @@ def rod(start, end, radius, sides=12):
 
 
 def curtain(width, height, depth, folds):
-    """A hanging cloth in the plane y = 0 with sine-shaped folds along x, `depth` from trough to
-    crest.
-    """
+    """A hanging cloth in the plane y = 0, sine-shaped along x, `depth` from trough to crest."""
     s = np.linspace(-0.5, 0.5, 24 * folds)
     z = np.linspace(0.0, height, 5)[:, None]
     swing = 0.7 + 0.3 * z / height  # less at the top
@@ -129,9 +127,7 @@ SHAPES = {f.__name__: f for f in (polygon, rectangle, box, lathe, cylinder, sphe
 
 
 def value_noise(points, cell):
-    """Smooth noise between 0 and 1, shape (n,), from random values on a lattice of cells of
-    this size, metres.
-    """
+    """Smooth noise (n,) between 0 and 1, from random values on a lattice of cells, metres."""
     at = points / cell
     low = np.floor(at).astype(np.int64)
     f = at - low
@@ -185,9 +181,7 @@ def tiles(points, color, joint, size):
 
 
 def printed_page(points, width, height, heading=0.1, line=0.0055):
-    """Lines of text on white paper in the plane z = 0 about the origin: words as dark bars, a
-    heading, a picture.
-    """
+    """White paper in the plane z = 0 about the origin: words as dark bars, heading, picture."""
     x = points[:, 0] / width + 0.5
     y = 0.5 - points[:, 1] / height
     row = np.floor(points[:, 1] / line).astype(int)
@@ -239,11 +233,10 @@ def book_spines(points, seed, pitch=0.035):
 
 
 def chessboard(points, board, dark, light, ring=0.5):
-    """A dark board with its chessboard, if it has one; the square diagonally before the first inner
-    corner is light.
+    """A dark board with its chessboard, if it has one.
 
-    The outermost squares are `ring` squares wide: only inner corners count, so that all may be
-    larger.
+    The square diagonally before the first inner corner is light. The outermost squares are `ring`
+    squares wide: only inner corners count, so that all may be larger.
     """
     grey = np.full(len(points), float(dark))
     pattern = board.pattern
@@ -290,9 +283,7 @@ class Lights:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end: metres along them (inf: at nothing), numbers of the triangle and of the
-    thing (-1: none).
-    """
+    """Where rays end, metres (inf: nowhere), and numbers of the triangle and thing (-1: none)."""
 
     distance: np.ndarray
     face: np.ndarray
@@ -330,9 +321,7 @@ class World:
         self._scene.add_triangles(vertices.astype(np.float32), faces[whole].astype(np.uint32))
 
     def cast(self, origins, directions):
-        """Follow rays, shape (n, 3), unit directions in the platform frame, to the first
-        surface.
-        """
+        """Follow rays (n, 3), unit directions in the platform frame, to the first surface."""
         origins = np.asarray(origins, float)
         directions = np.asarray(directions, float)
         origins, directions = np.broadcast_arrays(origins, directions)
@@ -406,9 +395,7 @@ def furnished(*parts):
 
 
 def furnished_room(*more):
-    """The room around the rig with further things in it, a World: flat, curved and thin things
-    under two lamps.
-    """
+    """The room around the rig with further things in it, under two lamps: a World."""
     parts = (
         "shell",
         "fittings",
@@ -424,9 +411,7 @@ def furnished_room(*more):
 
 
 def board_on_stand(board, T_platform_board, ring):
-    """The board, a sheet of no thickness, so that its edges are exactly its outline, held from
-    behind by a tripod.
-    """
+    """The board, a sheet of no thickness whose edges are its outline, and a tripod behind it."""
     centre = np.mean(board.corners, axis=0)
     middle = T_platform_board.apply([*centre, -0.004])
     behind = T_platform_board.apply([*centre, -0.07])
@@ -496,8 +481,7 @@ class Imager:
         need(miss < 1e-3, f"{lens}: weaken the distortion")
 
     def render(self, world, T_camera_platform, rng):
-        """Take a picture of a World with lights: blue, green, red, ndarray of uint8, shape (height,
-        width, 3).
+        """Take a picture of a World with lights: blue, green, red, uint8, (height, width, 3).
 
         `rng` places the rays in the pixels and makes the noise.
         """
@@ -566,9 +550,7 @@ class Imager:
 
 
 def _corners(grid):
-    """The four corners of every block out of a grid of block corners, shape (4, rows, columns,
-    ...).
-    """
+    """The four corners of every block of a grid of block corners, shape (4, rows, columns, ...)."""
     above = [grid[:-1, :-1], grid[:-1, 1:]]
     below = [grid[1:, :-1], grid[1:, 1:]]
     return np.stack(above + below)

@@ -355,10 +355,7 @@ def solve_projected(obs, T0=None, *, printed=False):
 
 
 def _slanted(obs, p_platform):
-    """Rows of edges 1 and 2 of placements whose edges are slanted, and why others are left out.
-
-    To the coordinate planes.
-    """
+    """Rows of edges 1 and 2 of placements whose edges are slanted, and why others are left out."""
     groups = {}
     skipped = {}
     for placement in np.unique(obs.edge_placement).tolist():
@@ -403,9 +400,7 @@ def projected_block(head, obs, groups, scatter=1.0, printed=False):
 
 
 def _to_printed_chart(t):
-    """Angle about the tilt axis that turns shifts (..., 3) of the LRF into the paper's (0, t_y,
-    0).
-    """
+    """Angle about the tilt axis that turns shifts (..., 3) into the paper's (0, t_y, 0)."""
     y, z = np.moveaxis(t[..., 1:], -1, 0)
     squared = np.maximum(np.abs(y) ** 2 + np.abs(z) ** 2, TINY)
     # of an axis through the LRF's origin: none

@@ -1,0 +1,156 @@
+"""The beams about every boundary of the board in a scan: who read it, and what stands behind."""
+
+import numpy as np
+from scipy import ndimage
+
+from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
+from lrfcal_lib.preprocess.board_in_scan import DEPTH_NOISE, median_step, plane_axes
+from lrfcal_lib.preprocess.edges_in_scan import (
+    BORDER,
+    MIXING,
+    background_odds,
+    beyond,
+    plane_range,
+)
+
+REACH = 2  # beams (or scan lines) on either side of a boundary
+CORNER = 1.0  # spot radii: a spot nearer than this to a second edge may reach over it
+SURE = 5.0  # standard deviations of a range: what is nearer to the board's plane read the board
+
+
+def edge_cells(scan, along, swept, lrf):
+    """The beams about every boundary of the board, along and across the scan lines.
+
+    Parameters
+    ----------
+    scan : BoardScan
+    along, swept : ScanEdges
+        Of :func:`lrfcal_lib.preprocess.edges_in_scan.crossings`, along and across the scan lines;
+        None instead of `swept` for a single shot.
+    lrf : LrfInfo
+        Knows the spot.
+
+    Returns
+    -------
+    recarray
+        ``line`` and ``beam`` (every pair appears once); ``bearing`` and ``pitch``, radians;
+        ``hit``, whether the beam read the board; ``side``, its number as in ScanEdges; ``range_m``,
+        distance of the board's plane along the beam, and ``radius`` of the spot there, metres;
+        ``background``, what it adds to the log odds at which the reading flips, as far as distances
+        and incidence tell it; ``across``, whether the boundary was found across the scan lines (the
+        neighbour is a scan line, not a beam); ``step``, angle between neighbours in that direction,
+        radians. Of all straight sides, without cells in holes, at the border of the view, where
+        something nearer hides the board, with two edges in one spot, and beside a background less
+        than a pulse length (1 m) behind, whose echo melts into the board's. Where most of the
+        outline has such a background they stay, with `background` 0; so do all cells where most
+        boundaries have no return behind them (clouds cut to the board).
+    """
+    found = [edges for edges in (along, swept) if edges is not None]
+    sweep = scan.sweep
+    line = np.concatenate([edges.line[edges.side >= 0] for edges in found])
+    beam = np.concatenate([edges.beam[edges.side >= 0] for edges in found])
+    step = np.concatenate([edges.step[edges.side >= 0] for edges in found])
+    side = np.concatenate([edges.side[edges.side >= 0] for edges in found])
+    rays = polar_to_points(1.0, sweep.bearings)
+    board, cosine = plane_range(scan, rays, sweep.pitch[:, None])
+    board[~(board > 0)] = np.nan
+    radius = lrf.spot_radius(board)
+    here = board[line, beam]
+    behind = beyond(scan, line, beam, step)
+    seen = np.isfinite(behind)
+    mixed = behind - here < MIXING
+    close = len(seen) == 0 or np.mean(seen) < 0.5 or np.mean(mixed) >= 0.5
+    if close:
+        odds = np.zeros(len(here))
+        usable = np.arange(len(here))
+    else:
+        odds = background_odds(here, behind)
+        usable = np.flatnonzero(seen & ~mixed)
+    row, k, line, beam = _neighbours(usable, line, beam, step, scan.mask.shape)
+    # before a far background also beams that noise takes off the plane read the board
+    near = max(SURE * scan.sigma_range, DEPTH_NOISE)
+    gaps = median_step(sweep.pitch), median_step(sweep.bearings)
+    with np.errstate(invalid="ignore"):
+        miss = sweep.ranges - board
+        excess = miss[line, beam]
+        hit = scan.mask[line, beam]
+        if not close:
+            hit = hit | (np.abs(excess) < near)
+        # without what hides the board, and without holes: nothing, or something near, read inside
+        # the boundary
+        hides = excess < -near
+        keep = hit | (~hides & ((excess > MIXING) | (k > 0)))
+        if not close:
+            mixing = (np.abs(miss) > near) & (miss < MIXING)
+            size = np.nanmedian((radius / board)[scan.mask])
+            keep &= ~_within_a_spot(mixing, size, gaps)[line, beam]
+    sides = [s for edges in found for s in edges.sides]
+    reach = (CORNER * radius / np.abs(cosine))[line, beam]
+    keep &= _on_one_side(scan, (line, beam), board, reach, sides, side[row])
+    across = step[row, 0] != 0
+    cells = {
+        "line": line,
+        "beam": beam,
+        "bearing": sweep.bearings[beam],
+        "pitch": sweep.pitch[line],
+        "hit": hit,
+        "side": side[row],
+        "range_m": board[line, beam],
+        "radius": radius[line, beam],
+        "background": odds[row],
+        "across": across,
+        "step": np.where(across, *gaps),
+    }
+    return np.rec.fromarrays([*cells.values()], names=[*cells])[keep]
+
+
+def _within_a_spot(mixing, size, gaps):
+    """Cells (L, B) whose spot may reach a surface (not the odd reading) that mixes with the board.
+
+    `size` is the radius of the spot as an angle, `gaps` are those between lines and beams, radians.
+    """
+    surface = ndimage.binary_opening(mixing, np.ones((2, 2)))
+    reach = np.ceil(size / np.maximum(gaps, 1e-6))
+    spot = 2 * np.minimum(reach, 30).astype(int) + 1
+    return ndimage.binary_dilation(surface, np.ones(spot))
+
+
+def _neighbours(usable, line, beam, step, shape):
+    """Cells about boundaries, each once: number of the nearest, step k from it, line and beam."""
+    k, row = np.meshgrid(np.arange(1 - REACH, REACH + 1), usable, indexing="ij")
+    k = k.ravel()
+    row = row.ravel()
+    order = np.argsort(np.abs(k - 0.5), kind="stable")
+    k = k[order]
+    row = row[order]
+    boundary = np.stack([line, beam], axis=1)
+    cell = boundary[row] + k[:, None] * step[row]
+    margin = np.where(step[row] != 0, BORDER, 0)
+    inside = np.all((cell >= margin) & (cell < shape - margin), axis=1)
+    k = k[inside]
+    row = row[inside]
+    line, beam = cell[inside].T
+    _, first = np.unique(line * shape[1] + beam, return_index=True)
+    return row[first], k[first], line[first], beam[first]
+
+
+def _on_one_side(scan, cells, board, reach, sides, side):
+    """Cells on the stretch of their own side whose spot reaches no other one.
+
+    All of them where sides are not known.
+    """
+    axes = plane_axes(scan.normal)
+    line, beam = cells
+    p_lrf = polar_to_points(board[cells], scan.sweep.bearings[beam])
+    flat = lrf_to_platform(p_lrf, scan.sweep.pitch[line], scan.T_head_lrf) @ axes.T
+    keep = ~np.isin(side, [s.side for s in sides])
+    alone = np.ones(len(side), bool)
+    for s in sides:
+        first, last = s.ends @ axes.T
+        x, y = (last - first) / np.linalg.norm(last - first)
+        along = (flat - first) @ [x, y]
+        apart = np.abs((flat - first) @ [-y, x])
+        mine = side == s.side
+        keep |= mine & (along > 0) & (along < s.length)
+        alone &= mine | ~(apart < reach)
+    return keep & alone
