@@ -22,7 +22,12 @@ from lrfcal_lib.session.stated import FILES, opened
 from lrfcal_lib.session.write import whole
 
 SCHEMA = 1
-AXIS_PARAMETERS = ["out_of_scan_plane_rad", "in_scan_plane_rad", "offset_in_scan_plane_m", "offset_across_scan_plane_m"]
+AXIS_PARAMETERS = [
+    "out_of_scan_plane_rad",
+    "in_scan_plane_rad",
+    "offset_in_scan_plane_m",
+    "offset_across_scan_plane_m",
+]
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
 SCENES_ONLY = (
     "all placements show scenes, and a calibration needs the board: "
@@ -37,13 +42,15 @@ FRAMES = (
 def calibration_record(calibration, method, judged=None):
     """Everything that a Calibration says about the results of a method, ready for JSON.
 
-    Schema, library version, verdict, session with the SHA-256 of its files, frames and units, platform, and for each
-    camera its pose, intrinsics, covariance, and residual statistics. 'joint' brings its own platform, range offset and
-    pitch terms, and what it says about the sensor. `judged` is the Verdict on these results, where ``judge`` was asked
-    already.
+    Schema, library version, verdict, session with the SHA-256 of its files, frames and units,
+    platform, and for each camera its pose, intrinsics, covariance, and residual statistics. 'joint'
+    brings its own platform, range offset and pitch terms, and what it says about the sensor.
+    `judged` is the Verdict on these results, where ``judge`` was asked already.
     """
-    session, platform = calibration.prepared.session, calibration.platform
-    axis, every = platform.axis_with(method), calibration.solutions.items()
+    session = calibration.prepared.session
+    platform = calibration.platform
+    axis = platform.axis_with(method)
+    every = calibration.solutions.items()
     record = {
         "schema": SCHEMA,
         "lrfcal": __version__,
@@ -53,61 +60,105 @@ def calibration_record(calibration, method, judged=None):
         "method": method,
         "verdict": (judged or judge(calibration, method, suggest=False)).record(),
         "platform": {
-            **_transform(platform.transform(axis)), "maps": "lrf to head",
-            "axis_covariance": platform.parameters()[axis][1].tolist(), "axis_covariance_of": AXIS_PARAMETERS,
-        },  # fmt: skip
-        "cameras": {c: _camera(calibration, c, method, found) for (c, name), found in every if name == method},
+            **_transform(platform.transform(axis)),
+            "maps": "lrf to head",
+            "axis_covariance": platform.parameters()[axis][1].tolist(),
+            "axis_covariance_of": AXIS_PARAMETERS,
+        },
+        "cameras": {
+            c: _camera(calibration, c, method, found)
+            for (c, name), found in every
+            if name == method
+        },
     }
-    if method == "joint":  # what it says about range finder and pitch, and what it left out in words
-        joint, sigma = calibration.joint.solution, calibration.joint.solution.sigma
-        sensor = {name: {"value": joint.sensor[name], "sigma": sigma[name]} for name in joint.sensor if name in sigma}
-        record["sensor"] = sensor | {"noise": joint.noise, "excluded": list(joint.excluded.values())}
+    # what it says about range finder and pitch, and what it left out in words
+    if method == "joint":
+        joint = calibration.joint.solution
+        sigma = calibration.joint.solution.sigma
+        sensor = {
+            name: {"value": joint.sensor[name], "sigma": sigma[name]}
+            for name in joint.sensor
+            if name in sigma
+        }
+        record["sensor"] = sensor | {
+            "noise": joint.noise,
+            "excluded": list(joint.excluded.values()),
+        }
     return record
 
 
 def _camera(calibration, camera, method, solution):
-    """Pose, intrinsics and residuals of a camera; of the joint estimate without the edge bias, from its own boards."""
+    """Pose, intrinsics and residuals of a camera.
+
+    Of the joint estimate without the edge bias, from its own boards.
+    """
     obs = calibration.observations[camera, "joint" if method == "joint" else "half_step"]
-    edge, model = edge_residuals_px(obs, solution.transform, solution.model), calibration.prepared.models[camera]
-    misfit = {"edge_rms_px": rms(edge), "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution))}
+    edge = edge_residuals_px(obs, solution.transform, solution.model)
+    model = calibration.prepared.models[camera]
+    misfit = {
+        "edge_rms_px": rms(edge),
+        "plane_rms_mm": 1000 * rms(plane_residuals_of(obs, solution)),
+    }
     if method == "joint":
         misfit = joint_fit(calibration.joint, [camera])
     model = solution.model or model
-    lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), model.parameters.tolist(), strict=True))
+    lens = dict(
+        zip(
+            ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+            model.parameters.tolist(),
+            strict=True,
+        )
+    )
     return {
-        "maps": f"{obs.source} to {obs.camera}", **_transform(solution.transform),
+        "maps": f"{obs.source} to {obs.camera}",
+        **_transform(solution.transform),
         "sigma": dict(zip(solution.names[:6], solution.trusted_sigma[:6].tolist(), strict=True)),
         "covariance": solution.trusted[:6, :6].tolist(),
-        "intrinsics": {"width": model.width, "height": model.height, **lens}, "converged": bool(solution.converged),
-        "unobservable": list(solution.unobservable), **misfit, "n_crossings": len(edge),
+        "intrinsics": {"width": model.width, "height": model.height, **lens},
+        "converged": bool(solution.converged),
+        "unobservable": list(solution.unobservable),
+        **misfit,
+        "n_crossings": len(edge),
         "placements": obs.all_placements.tolist(),
-    }  # fmt: skip
+    }
 
 
 def _transform(transform):
-    pose = {"rotvec_rad": transform.rotation.as_rotvec().tolist(), "translation_m": transform.translation.tolist()}
+    pose = {
+        "rotvec_rad": transform.rotation.as_rotvec().tolist(),
+        "translation_m": transform.translation.tolist(),
+    }
     return {"matrix": transform.as_matrix().tolist(), **pose}
 
 
 def file_hashes(session):
-    """SHA-256 of every file that a session was read from, by its path within it; of no other that lies there."""
+    """SHA-256 of every file that a session was read from, by its path within it.
+
+    Of no other that lies there.
+    """
     files = {session.path / name for name in FILES if os.path.lexists(session.path / name)}
     hashes = {}
     for file in sorted(files | {record.file for record in session.image_records}):
         with opened(file, session.path) as stream:
-            hashes[file.relative_to(session.path).as_posix()] = hashlib.file_digest(stream, "sha256").hexdigest()
+            hashes[file.relative_to(session.path).as_posix()] = hashlib.file_digest(
+                stream, "sha256"
+            ).hexdigest()
     return hashes
 
 
 def write_calibration(path, record):
-    """Write a :func:`calibration_record` as JSON, NaN as null; ValueError if it cannot be written."""
+    """Write a :func:`calibration_record` as JSON, NaN as null.
+
+    ValueError if it cannot be written.
+    """
     plain = json.loads(json.dumps(record), parse_constant=lambda name: None)
     with whole(path) as draft:
         draft.write_text(json.dumps(plain, indent=1) + "\n")
 
 
 def write_clouds(folder, calibration, method):
-    """Write ``cloud.ply`` (the boards) and, where there are scenes, ``scene.ply`` and ``scene.pcd``.
+    """Write ``cloud.ply`` (the boards) and, where there are scenes, ``scene.ply`` and
+    ``scene.pcd``.
 
     A sigma is what a joint estimate predicts, otherwise the stated noise of ranges.
 
@@ -136,7 +187,9 @@ def write_clouds(folder, calibration, method):
 
 
 def _kinds_of_clouds(prepared):
-    """The clouds that can be had, the longest work first: True of the scenes, False of the boards."""
+    """The clouds that can be had, the longest work first: True of the scenes, False of the
+    boards.
+    """
     kinds = []
     session = prepared.session
     if session.scene_placements:
@@ -163,7 +216,10 @@ def _write_cloud(folder, calibration, method, scene):
 
 
 def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as PCD. ValueError if the file cannot be written."""
+    """Write what a PLY of :func:`write_ply` holds as PCD.
+
+    ValueError if the file cannot be written.
+    """
     import open3d as o3d
 
     cloud = o3d.t.io.read_point_cloud(str(ply))
@@ -173,7 +229,8 @@ def write_pcd(path, ply):
 
 
 def write_mesh(path, ply, step=0.02):
-    """Write a surface mesh of a PLY of :func:`write_ply` as PLY: Poisson's, cut where there are no points.
+    """Write a surface mesh of a PLY of :func:`write_ply` as PLY: Poisson's, cut where there are no
+    points.
 
     Parameters
     ----------
@@ -194,7 +251,9 @@ def write_mesh(path, ply, step=0.02):
     if not len(cloud.points):
         raise ValueError(f"{ply}: no point has a normal, a surface needs neighbouring scan lines")
     depth = int(np.ceil(np.log2(np.ptp(np.asarray(cloud.points), axis=0).max() / step))) + 1
-    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=min(depth, 11), n_threads=1)
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=min(depth, 11), n_threads=1
+    )
     corners = o3d.geometry.PointCloud(mesh.vertices)
     mesh.remove_vertices_by_mask(np.asarray(corners.compute_point_cloud_distance(cloud)) > 2 * step)
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0, 1))
@@ -206,7 +265,8 @@ def write_mesh(path, ply, step=0.02):
 
 
 def calibrate_session(path, out=None):
-    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and clouds.
+    """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and
+    clouds.
 
     Parameters
     ----------
@@ -223,7 +283,8 @@ def calibrate_session(path, out=None):
     Raises
     ------
     ValueError
-        For a session that cannot be opened, or a file that cannot be written, which stays as it was.
+        For a session that cannot be opened, or a file that cannot be written, which stays as it
+        was.
     """
     session = open_session(path)
     if not session.board_placements:

@@ -1,4 +1,6 @@
-"""Calibration methods of one camera on one least-squares core: the same observations in, a `Solution` out."""
+"""Calibration methods of one camera on one least-squares core: the same observations in, a
+`Solution` out.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,7 +30,8 @@ class Method:
     label : str
         For tables and figures.
     residual : callable
-        ``residual(pose, obs) -> Block``: its residuals, two or more, at ``T_camera_source`` (..., 3, 4).
+        ``residual(pose, obs) -> Block``: its residuals, two or more, at ``T_camera_source`` (...,
+        3, 4).
     estimate : callable
         What is done with the residual; least squares in the pose by default.
     options : dict
@@ -49,26 +52,62 @@ class Method:
 
 PLAIN = {"weighted": False}  # as published: every residual counts the same
 METHODS = {
-    "line_printed": Method("one_scan", "crossing", 6, "lines as the paper prints them", line_block, options=PLAIN),
+    "line_printed": Method(
+        "one_scan", "crossing", 6, "lines as the paper prints them", line_block, options=PLAIN
+    ),
     "line_last_beam": Method(
-        "last_beam", "crossing", 6, "lines, last beam, all edges", line_block, options=PLAIN, along=True
+        "last_beam",
+        "crossing",
+        6,
+        "lines, last beam, all edges",
+        line_block,
+        options=PLAIN,
+        along=True,
     ),
     "line": Method("half_step", "crossing", 6, "lines, half step", line_block),
-    "line_ml": Method("half_step", "crossing", 7, "lines, likelihood", lines.interval_block, lines.estimate_likely),
-    "zhang_pless_printed": Method(
-        "half_step", "plane", 3, "Zhang-Pless, unweighted", planes.plane_block, planes.estimate_from_planes, PLAIN
+    "line_ml": Method(
+        "half_step", "crossing", 7, "lines, likelihood", lines.interval_block, lines.estimate_likely
     ),
-    "zhang_pless": Method("half_step", "plane", 3, "Zhang-Pless", planes.plane_block, planes.estimate_from_planes),
+    "zhang_pless_printed": Method(
+        "half_step",
+        "plane",
+        3,
+        "Zhang-Pless, unweighted",
+        planes.plane_block,
+        planes.estimate_from_planes,
+        PLAIN,
+    ),
+    "zhang_pless": Method(
+        "half_step", "plane", 3, "Zhang-Pless", planes.plane_block, planes.estimate_from_planes
+    ),
     "zhang_pless_k": Method(
-        "half_step", "plane", 3, "Zhang-Pless with K", planes.planes_and_pattern, planes.estimate_with_lens, {"lens": 4}
+        "half_step",
+        "plane",
+        3,
+        "Zhang-Pless with K",
+        planes.planes_and_pattern,
+        planes.estimate_with_lens,
+        {"lens": 4},
     ),
     "zhang_pless_joint": Method(
-        "half_step", "plane", 3, "Zhang-Pless with K and lens", planes.planes_and_pattern, planes.estimate_with_lens
+        "half_step",
+        "plane",
+        3,
+        "Zhang-Pless with K and lens",
+        planes.planes_and_pattern,
+        planes.estimate_with_lens,
     ),
     "wasielewski_strauss": Method(
-        "half_step", "crossing", 6, "Wasielewski-Strauss, in space", lines.distance_block, options=PLAIN
+        "half_step",
+        "crossing",
+        6,
+        "Wasielewski-Strauss, in space",
+        lines.distance_block,
+        options=PLAIN,
     ),
-    "bauermann": Method("half_step", "scene", 3, "after Bauermann, outline corners", lines.point_block),
+    "bauermann": Method(
+        "half_step", "scene", 3, "after Bauermann, outline corners", lines.point_block
+    ),
 }
 SHIPPED = MappingProxyType(dict(METHODS))  # without rows that others put there later
 CANDIDATES = ("zhang_pless", "line")  # the better one is handed over where no joint estimate is
@@ -80,7 +119,8 @@ STARTS = {
 
 
 def starting_transform(obs, uses="crossing"):
-    """Start values of ``T_camera_source`` (one, or a stack with the best one first) from what the observations hold.
+    """Start values of ``T_camera_source`` (one, or a stack with the best one first) from what the
+    observations hold.
 
     Raises DegenerateGeometry when no way determines the pose, with the reason of each.
     """
@@ -111,19 +151,22 @@ def solve_camera(observations, method=None, T0=None, *, search=True, **options):
         Of `METHODS`. By default what is handed over where there is no joint estimate: lines or
         planes, whichever errs less on placements left out (:func:`best_method`).
     T0 : RigidTransform, optional
-        Start value of ``T_camera_source``, one or one a trial; found by :func:`starting_transform` when left out.
+        Start value of ``T_camera_source``, one or one a trial; found by :func:`starting_transform`
+        when left out.
     search : bool
-        A single T0 competes with the start value found: the better minimum is handed back. False: T0 is near it.
+        A single T0 competes with the start value found: the better minimum is handed back. False:
+        T0 is near it.
     **options
-        ``loss`` (None or 'cauchy') of single crossings, points or whole placements, with its ``scale``
-        (standard deviations, or 'auto'); ``weighted`` (False: every residual counts the same, True: by the propagated
-        noise); ``max_iterations``.
+        ``loss`` (None or 'cauchy') of single crossings, points or whole placements, with its
+        ``scale`` (standard deviations, or 'auto'); ``weighted`` (False: every residual counts the
+        same, True: by the propagated noise); ``max_iterations``.
 
     Returns
     -------
     Solution
-        Its covariance knows the noise of single points; `covariance_placements` also covers what all of a placement
-        have in common. Trials that are degenerate do not converge; nothing is raised for them.
+        Its covariance knows the noise of single points; `covariance_placements` also covers what
+        all of a placement have in common. Trials that are degenerate do not converge; nothing is
+        raised for them.
 
     Raises
     ------
@@ -137,7 +180,9 @@ def solve_camera(observations, method=None, T0=None, *, search=True, **options):
     row = row_of(method)
     obs = observations.along() if row.along else observations
     obs.require(row.uses, row.fewest)
-    options, found, problem = {"method": method, "uses": row.uses} | row.options | options, [], None
+    options = {"method": method, "uses": row.uses} | row.options | options
+    found = []
+    problem = None
     starts = [] if T0 is None else [pose_array(T0)]
     if T0 is None or (search and T0.single and getattr(obs, f"{row.uses}_points").ndim == 2):
         try:
@@ -148,7 +193,9 @@ def solve_camera(observations, method=None, T0=None, *, search=True, **options):
     for pose in starts:
         trials = np.broadcast_shapes(getattr(obs, f"{row.uses}_points").shape[:-2], pose.shape[:-2])
         try:
-            found.append(row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options))
+            found.append(
+                row.estimate(row.residual, obs, np.broadcast_to(pose, trials + (3, 4)), **options)
+            )
         except (DegenerateGeometry, np.linalg.LinAlgError) as error:
             problem = problem or error
     if not found:
@@ -195,7 +242,10 @@ def left_out(obs, judge, method, full):
     for placement in judge.all_placements:
         with suppress(DegenerateGeometry):
             rest = obs.select(obs.all_placements[obs.all_placements != placement])
-            yield judge.select([placement]), solve_camera(rest, method, full.transform, search=False)
+            yield (
+                judge.select([placement]),
+                solve_camera(rest, method, full.transform, search=False),
+            )
 
 
 def best_method(observations, solutions):
@@ -219,7 +269,8 @@ def best_method(observations, solutions):
     Notes
     -----
     A rule of thumb, made after the two sessions it was first used on had been seen. It picks one
-    winner by a margin that may be within the noise (53.0 against 58.1 px mm on the LMS400 recording).
+    winner by a margin that may be within the noise (53.0 against 58.1 px mm on the LMS400
+    recording).
     """
     errors = {}
     for method in CANDIDATES:
@@ -245,7 +296,9 @@ def _left_out_errors(obs, method, full):
     for held, solution in left_out(obs, obs.along(), method, full):
         edges.append(edge_residuals_px(held, solution.transform))
         planes_m.append(plane_residuals_m(held, solution.transform))
-    return tuple(np.sqrt(_mean(np.square(np.concatenate([[], *part])))) for part in (edges, planes_m))
+    return tuple(
+        np.sqrt(_mean(np.square(np.concatenate([[], *part])))) for part in (edges, planes_m)
+    )
 
 
 def _mean(values):
@@ -256,9 +309,14 @@ def _mean(values):
 
 
 def best_minimum(obs, uses, found):
-    """The best of some Solutions, with another one as `rival` that explains the data nearly as well."""
-    misses, before = zip(*(misses_of(obs, uses, solution.transform) for solution in found), strict=True)
-    sizes, before = planes.sizes_of_minima(np.square(misses)), np.array(before)
+    """The best of some Solutions, with another one as `rival` that explains the data nearly as
+    well.
+    """
+    misses, before = zip(
+        *(misses_of(obs, uses, solution.transform) for solution in found), strict=True
+    )
+    sizes = planes.sizes_of_minima(np.square(misses))
+    before = np.array(before)
     order = np.lexsort([sizes, ~before])
     best = found[order[0]]
     nearly = (before == before[order[0]]) & (sizes <= planes.NEARLY * sizes[order[0]])
@@ -268,10 +326,16 @@ def best_minimum(obs, uses, found):
 
 
 def misses_of(obs, uses, transform):
-    """Distances or pixels by which observations miss at a pose, and whether the board lies before the camera."""
+    """Distances or pixels by which observations miss at a pose, and whether the board lies
+    before the camera.
+    """
     points = getattr(obs, f"{uses}_points")
     block = {"crossing": line_block, "scene": lines.point_block}.get(uses)
-    misses = plane_residuals_m(obs, transform) if block is None else block(pose_array(transform), obs).residuals
+    misses = (
+        plane_residuals_m(obs, transform)
+        if block is None
+        else block(pose_array(transform), obs).residuals
+    )
     return misses[np.isfinite(misses)], bool(np.mean(transform.apply(points)[:, 2] < 0) <= 0.5)
 
 
@@ -280,7 +344,8 @@ NUMBERS = 2  # a plane's distance and the slope of the scan: neighbouring points
 
 
 def find_outlying_placements(obs):
-    """Find placements whose planes disagree with the others', without being told how many there are.
+    """Find placements whose planes disagree with the others', without being told how many there
+    are.
 
     Returns
     -------
@@ -296,20 +361,27 @@ def find_outlying_placements(obs):
 
     Notes
     -----
-    Residuals are compared with their own level, not with the stated noise: the median over the accepted placements of
-    the mean square, divided by its expectation, sets the scale.
+    Residuals are compared with their own level, not with the stated noise: the median over the
+    accepted placements of the mean square, divided by its expectation, sets the scale.
     """
-    keep, some, options = None, obs, {"scale": "auto", "weighted": False}
+    keep = None
+    some = obs
+    options = {"scale": "auto", "weighted": False}
     T = solve_camera(obs, "zhang_pless", loss="cauchy", **options).transform
     for _ in range(11):
         residuals = plane_residuals_m(obs, T)
         known = np.isfinite(residuals)
-        placements, index, count = np.unique(obs.plane_placement[known], return_inverse=True, return_counts=True)
+        placements, index, count = np.unique(
+            obs.plane_placement[known], return_inverse=True, return_counts=True
+        )
         mean = np.bincount(index, residuals[known] ** 2) / count
         level = np.median(mean if keep is None else mean[keep]) / chdtri(NUMBERS, 0.5)
-        before, keep = keep, mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
+        before = keep
+        keep = mean <= level * chdtri(NUMBERS, 1 - ACCEPTED)
         if np.array_equal(before, keep):
             break
         some = obs.select(placements[keep])
         T = solve_camera(some, "zhang_pless", T, search=False, **options).transform
-    return placements[keep].tolist(), dict(zip(placements[~keep].tolist(), np.sqrt(mean[~keep]).tolist(), strict=True))
+    return placements[keep].tolist(), dict(
+        zip(placements[~keep].tolist(), np.sqrt(mean[~keep]).tolist(), strict=True)
+    )
