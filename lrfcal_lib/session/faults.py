@@ -226,6 +226,17 @@ def dark_images(session) -> list[Fault]:
     return found
 
 
+def faults_of_dark(session, dark) -> list[Fault]:
+    """The Faults of all dark images (ImageRecords) of a session, one a camera."""
+    found = []
+    for camera in session.cameras:
+        records = [record for record in dark if record.camera == camera]
+        if records:
+            count = f"{len(records)} of {len(session.images(camera))}"
+            found.append(too_dark(session, records, count))
+    return found
+
+
 def too_dark(session, records, how_many: str) -> Fault:
     """The Fault of dark images of one camera."""
     first = records[0]

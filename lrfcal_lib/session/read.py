@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
-from lrfcal_lib.session.faults import dark_image, faults_of_files, too_dark
+from lrfcal_lib.session.faults import dark_image, faults_of_dark, faults_of_files
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -517,18 +517,8 @@ def validate(path):
                 dark.append(record)
         except SessionError as error:
             found.append(str(error))
-    return [stated.printable(problem) for problem in found + _too_dark(session, dark)]
-
-
-def _too_dark(session, dark):
-    """Sentences about the dark images (ImageRecords) of a session, one a camera."""
-    found = []
-    for camera in session.cameras:
-        records = [record for record in dark if record.camera == camera]
-        if records:
-            count = f"{len(records)} of {len(session.images(camera))}"
-            found.append(too_dark(session, records, count).words)
-    return found
+    found += [fault.words for fault in faults_of_dark(session, dark)]
+    return [stated.printable(problem) for problem in found]
 
 
 def _disorder(session):
