@@ -53,8 +53,8 @@ class Bench(Devices):
     pitch_step: float = np.radians(0.5)  # between scan lines, radians
     range_offset: float = 0.0  # metres
     stretch: float = 0.0  # of the recorded pitch: the head turns 1 + stretch times as far
-    sigma_stop: float = 0.0  # standard deviation of the recorded pitch at the stop of an image, radians
-    spread: float = 0.0  # standard deviation of the log odds of the edge from side to side: uneven backgrounds
+    sigma_stop: float = 0.0  # standard deviation of the recorded pitch at stops for images, radians
+    spread: float = 0.0  # standard deviation of the edge's log odds from side to side: backgrounds
     floor: float = 0.0  # least softness, in beam steps; real edges have none, the model of the joint estimate has
 
 
@@ -176,11 +176,11 @@ def _scan_lines(bench, pose, pitch, bearings, rng, noise):
 
 
 def _bias_of_sides(bench, rng):
-    """How far outside each edge of one placement a spot's centre still reads the board, spot radii, (E,)."""
+    """How far outside each edge of a placement a spot still reads the board, spot radii, (E,)."""
     bias = np.full(len(bench.board.edges), float(bench.bias))
     if bench.spread:
         x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
-        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi  # of a disc within an edge x radii inside its centre
+        share = (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi  # of a disc, inside of the edge
         odds = np.log(share / (1 - share))
         own = np.interp(bias, x, odds) + bench.spread * rng.standard_normal(len(bias))
         bias = np.interp(-own, -odds, x)
