@@ -1,12 +1,14 @@
 """Whole sessions of rigs that nothing was tuned on, as files with their truth, and how a calibration does on them.
 
-Everything is drawn from a seed: mount and place of the cameras, lens, spot and noise of the range finder, board
-(outline, size of its squares, dark or white), what stands behind it, how the head lies about its pitch. The rendering
-shares nothing with the library but lens, spot pattern and echo. ::
+Everything is drawn from a seed: mount and place of the cameras, lens, spot and noise of the range
+finder, board (outline, size of its squares, dark or white), what stands behind it, how the head
+lies about its pitch. The rendering shares nothing with the library but lens, spot pattern and echo.
+::
 
-    session = varied_sessions.record(folder / "a", seed=7)              # some seconds
-    session = varied_sessions.record(folder / "b", seed=7, mount="platform", white=True, square_px=7.0)
-    outcome = varied_sessions.judged(session)                           # chi-square, scores, lengths, verdict
+    session = varied_sessions.record(folder / "a", seed=7)              # some seconds session =
+    varied_sessions.record(folder / "b", seed=7, mount="platform", white=True, square_px=7.0)
+    outcome = varied_sessions.judged(session)                           # chi-square, scores,
+    lengths, verdict
 """
 
 import json
@@ -151,10 +153,11 @@ def _board(v, square):
 def _cast(origin, direction, T, lines, pattern, tones, sheets):
     """Nearest surface along rays (n, 3): distance (inf for none), reflectivity, and the cosine of incidence.
 
-    One origin may serve all rays. `T` (3, 4) is ``T_platform_board``, `lines` its sides, `pattern` its first corner,
-    square, columns, rows and ring; `tones` the board, the squares that differ from it, the light on it, whether a
-    camera looks, and which squares differ (0 or 1); `sheets` (k, 7) are rectangles behind the board that face the rig:
-    y, least and greatest x and z, reflectivity for the LRF and for cameras.
+    One origin may serve all rays. `T` (3, 4) is ``T_platform_board``, `lines` its sides, `pattern`
+    its first corner, square, columns, rows and ring; `tones` the board, the squares that differ
+    from it, the light on it, whether a camera looks, and which squares differ (0 or 1); `sheets`
+    (k, 7) are rectangles behind the board that face the rig: y, least and greatest x and z,
+    reflectivity for the LRF and for cameras.
     """
     n = len(direction)
     distance, value, cosine = np.full(n, np.inf), np.zeros(n), np.ones(n)
@@ -378,8 +381,9 @@ def drawn(seed):
 class Outcome:
     """How a calibration did on a session whose truth is known.
 
-    `names` (k), `errors` (k,) and `covariance` (k, k) are of the shared unknowns that have a truth; `lengths` are
-    errors of the `combined` edge lengths in their standard deviations; `answer` and `words` are the verdict's.
+    `names` (k), `errors` (k,) and `covariance` (k, k) are of the shared unknowns that have a truth;
+    `lengths` are errors of the `combined` edge lengths in their standard deviations; `answer` and
+    `words` are the verdict's.
     """
 
     names: tuple

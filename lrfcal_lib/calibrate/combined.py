@@ -42,8 +42,8 @@ def combined_outlines(joint):
 
     Plane, sides, errors of the sweep's pitch and a correction of the calibration are estimated together for each
     placement; the calibration that has not seen it counts as an observation with its own covariance. What image edges
-    are worth is taken from their residuals over all placements; what residuals cannot show, from the scatter of the
-    lengths.
+    are worth is taken from their residuals over all placements; what residuals cannot show, from
+    the scatter of the lengths.
 
     Parameters
     ----------
@@ -82,18 +82,19 @@ def combined_outlines(joint):
 
 
 def as_scattered(measured):
-    """Boards (see :func:`combined_outlines`) with standard deviations grown to how lengths scatter over placements.
+    """Boards (see :func:`combined_outlines`), as well known as their lengths agree over placements.
 
-    Errors that all images of a side share (paint, a rim, a pattern close by), or all beams about it, show in no
-    residual of its placement. But it is one board everywhere, whatever its size.
+    Errors that all images of a side share (paint, a rim, a pattern close by), or all beams about
+    it, show in no residual of its placement. But it is one board everywhere, whatever its size.
     """
     square, freedom = 0.0, 0
     for name in {name for board, _ in measured.values() for name in board.lengths}:
-        known = [(board.lengths[name], board.sigma[name]) for board, _ in measured.values() if name in board.lengths]
-        length, sigma = np.array(known).T
+        showing = [board for board, _ in measured.values() if name in board.lengths]
+        length = np.array([board.lengths[name] for board in showing])
+        sigma = np.array([board.sigma[name] for board in showing])
         mean = np.average(length, weights=sigma**-2)
         square += np.sum(((length - mean) / sigma) ** 2)
-        freedom += len(known) - 1
+        freedom += len(showing) - 1
     grow = np.sqrt(max(square / freedom, 1.0)) if freedom > 0 else 1.0
     out = {}
     for placement, (board, scanned) in measured.items():

@@ -63,7 +63,8 @@ class Block:
         w = self.whitener
         if w.ndim == self.residuals.ndim:
             return w[..., None] * rows
-        return (w @ rows.reshape(rows.shape[:-2] + (-1, w.shape[-1], rows.shape[-1]))).reshape(rows.shape)
+        groups = rows.reshape(rows.shape[:-2] + (-1, w.shape[-1], rows.shape[-1]))
+        return (w @ groups).reshape(rows.shape)
 
     @cached_property
     def white(self):

@@ -309,11 +309,12 @@ class JointData:
     `face`, `beam` and `view` hold the fields of that group of JointObservations, with ``ray`` (LRF frame) or, for
     views, ``whitener`` (p, v, 6, 6); `lines` (e, 3) are the board's, `middle` and `direction` (p,) the sweeps'. Then
     come factors on the stated standard deviations of ranges and of each camera's views, the standard deviation of the
-    recorded pitch at a stop (what a head at rest is off by, radians; see :mod:`lrfcal_lib.fit.stops`), shares of
-    independent errors per observation (below one where neighbours repeat each other's errors), `lapse` (see
-    :func:`beam_terms`), what is expected of the sweeps' own offset (radians) and stretch, the scale of the sides'
-    deviations of the log odds (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are
-    dark), and the stated platform, which yields where the data contradict it.
+    recorded pitch at a stop (what a head at rest is off by, radians; see
+    :mod:`lrfcal_lib.fit.stops`), shares of independent errors per observation (below one where
+    neighbours repeat each other's errors), `lapse` (see :func:`beam_terms`), what is expected of
+    the sweeps' own offset (radians) and stretch, the scale of the sides' deviations of the log odds
+    (Student's t with `SIDE_FREEDOM` degrees of freedom: most backgrounds are alike, some are dark),
+    and the stated platform, which yields where the data contradict it.
     """
 
     face: dict

@@ -104,12 +104,14 @@ class Solution:
     def trusted(self):
         """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
 
-        That of the noise C, and where a parameter scatters more over placements than chance explains, as much more,
-        C + h C h. What is added has the correlations of C: left and right camera lean on the same axis, and growing one
-        of them by itself (``g C g``) would claim that their difference is known better than anybody measured it.
+        That of the noise C, and where a parameter scatters more over placements than chance
+        explains, as much more, C + h C h. What is added has the correlations of C: left and right
+        camera lean on the same axis, and growing one of them by itself (``g C g``) would claim that
+        their difference is known better than anybody measured it.
 
-        Of the square of the logarithm of the ratio of both variances, what n placements leave to chance (trigamma of
-        (n - 1) / 2) is taken off. A large excess over many placements counts in full.
+        Of the square of the logarithm of the ratio of both variances, what n placements leave to
+        chance (trigamma of (n - 1) / 2) is taken off. A large excess over many placements counts in
+        full.
         """
         known = (self.sigma > 0) & np.isfinite(self.sigma)
         ratio = np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lrfcal_lib.fit.least_squares import Block
 
-SAME_STOP = np.radians(0.001)  # recorded pitch angles that agree to this are one stop: platforms record 0.01 deg or so
+SAME_STOP = np.radians(0.001)  # of recorded pitch angles: platforms record steps of 0.01 deg or so
 
 
 def same_stop(pitch, used):
@@ -18,10 +18,10 @@ def same_stop(pitch, used):
 
 @dataclass(frozen=True)
 class ViewBlock(Block):
-    """Board poses in images (p, 6 v), each whitened by itself, with the error of the pitch that a stop's images share.
+    """Board poses in images (p, 6 v), and the error of the pitch that the images of a stop share.
 
-    The covariance of whitened views of a stop is ``I + sigma^2 g g^T``, of which ``I - h h^T`` with h along g is the
-    inverse root: no matrix larger than that of one view is needed.
+    The covariance of whitened views of a stop is ``I + sigma^2 g g^T``, of which ``I - h h^T`` with
+    h along g is the inverse root: no matrix larger than that of one view is needed.
 
     Attributes
     ----------

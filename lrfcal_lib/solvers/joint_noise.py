@@ -85,7 +85,8 @@ def estimate_noise(state, data, unknowns):
         data = view_levels(data, blocks["view"], hessian, gradient, unknowns.shared)
     count = SWEEPS[unknowns.sweep]
     if unknowns.sides and "beam" in blocks:
-        data = replace(data, side_sigma=side_level(state.sides, data, own, gradient[:, unknowns.shared :]))
+        level = side_level(state.sides, data, own, gradient[:, unknowns.shared :])
+        data = replace(data, side_sigma=level)
     if count:
         variance = np.diagonal(spread, axis1=1, axis2=2)[:, 6 : 6 + count]
         found = np.sqrt(np.mean(state.sweeps[:, :count] ** 2 + variance, axis=0))
@@ -130,12 +131,14 @@ def _part(values, used):
 def beam_share(state, data, block, unknowns, spread):
     """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
 
-    What board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a placement's own
-    unknowns. The steps count a little more information than there is where beams may say nothing (`lapse`, see
-    :func:`beam_terms`); the share brings that down to the true curvature of the cost.
+    What board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a
+    placement's own unknowns. The steps count a little more information than there is where beams
+    may say nothing (`lapse`, see :func:`beam_terms`); the share brings that down to the true
+    curvature of the cost.
 
-    Never above that: where readings flip more sharply than the floor of the softness, crossings lie so regularly
-    between the beams that scores hardly scatter, but edges are no better known than the spacing of the beams says.
+    Never above that: where readings flip more sharply than the floor of the softness, crossings lie
+    so regularly between the beams that scores hardly scatter, but edges are no better known than
+    the spacing of the beams says.
     """
     ray = rays(state, data, data.beam)
     a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
@@ -170,9 +173,10 @@ def beam_share(state, data, block, unknowns, spread):
 def view_levels(data, block, hessian, gradient, shared):
     """Scale of the pose errors in images and error of the pitch at a stop: the most likely pair.
 
-    The likelihood is the restricted one: what the unknowns take up of the residuals is no sign of small errors. A board
-    that moves with its images hides what all of them share, so that stops of one placement tell the error of the pitch
-    by their differences alone. `hessian` (p, k, k) and `gradient` (p, k) are of all blocks, `shared` unknowns first.
+    The likelihood is the restricted one: what the unknowns take up of the residuals is no sign of
+    small errors. A board that moves with its images hides what all of them share, so that stops of
+    one placement tell the error of the pitch by their differences alone. `hessian` (p, k, k) and
+    `gradient` (p, k) are of all blocks, `shared` unknowns first.
 
     One scale serves all cameras: with one view each, a camera could buy itself perfection at the other's cost.
     """
@@ -204,8 +208,8 @@ class ViewEvidence:
     hessian, gradient, square : ndarray, shapes (p, k, k), (p, k), (p,)
         Those of the views without an error of the pitch, and the sum of their squared residuals.
     by_stop, along, strength : ndarray, shapes (p, v, k), (p, v), (p, v)
-        Of every stop (zeros where there are fewer stops than images): products of the whitened derivative g by its
-        pitch with the Jacobian, with the residuals, with itself.
+        Of every stop (zeros where there are fewer stops than images): products of the whitened
+        derivative g by its pitch with the Jacobian, with the residuals, with itself.
     rows, shared : int
     """
 
@@ -230,8 +234,9 @@ class ViewEvidence:
         z, J = whiten(single)
         transposed = np.swapaxes(J, -1, -2)
         g = block.white_by_pitch[0]
-        first = block.same & (np.argmax(block.same, axis=1)[:, None] == np.arange(g.shape[1])[None, :, None])
-        stop = first.astype(float)  # (p, stop, view): one at the views of a stop, in the row of the first of them
+        # (p, stop, view): one at the views of a stop, in the row of the first of them
+        first = np.argmax(block.same, axis=1)[:, None] == np.arange(g.shape[1])[None, :, None]
+        stop = (block.same & first).astype(float)
         rows = g.shape[:2] + (6, -1)
         return cls(
             *other,
@@ -246,10 +251,11 @@ class ViewEvidence:
         )
 
     def judged(self, variance, factor, scale):
-        """Negative log likelihood of an error of the pitch and a factor on the scale, and a better factor.
+        """Negative log likelihood of an error of the pitch and a factor on the scale; a better factor.
 
-        `variance` is that of the pitch at the scale that the views are whitened with (a factor serves both). Of the
-        factor one row more is believed, as large as stated: where nothing else shows the scale, it is the stated one.
+        `variance` is that of the pitch at the scale that the views are whitened with (a factor
+        serves both). Of the factor one row more is believed, as large as stated: where nothing else
+        shows the scale, it is the stated one.
         """
         f2, c = factor**2, self.shared
         less = variance / (1 + variance * self.strength)
@@ -258,17 +264,20 @@ class ViewEvidence:
         gradient = self.gradient - (weighted @ self.along[..., None])[..., 0]
         square = self.square - np.sum(less * self.along**2, axis=-1)
         whole, right = self.other_hessian + hessian / f2, self.other_gradient + gradient / f2
-        whole = whole + 1e-12 * np.eye(whole.shape[-1]) * np.trace(whole, axis1=1, axis2=2)[:, None, None]
+        size = np.trace(whole, axis1=1, axis2=2)[:, None, None]
+        whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
         reduced, score, back = eliminate(whole, right, c, rcond=None)
         total = np.sum(reduced, axis=0)
         inverse = np.linalg.inv(total)
         step = -inverse @ np.sum(score, axis=0)
         own = -(back[..., c] + back[..., :c] @ step)
         moved = np.concatenate([np.broadcast_to(step, (len(own), c)), own], axis=-1)
-        left = square + 2 * np.vecdot(moved, gradient) + np.vecdot(moved, (hessian @ moved[..., None])[..., 0])
+        bent = (hessian @ moved[..., None])[..., 0]
+        left = square + 2 * np.vecdot(moved, gradient) + np.vecdot(moved, bent)
         # share of the views in what is known of the unknowns: rows that these take up
         inner = np.linalg.inv(whole[:, c:, c:])
-        spread = np.concatenate([np.broadcast_to(np.eye(c), (len(own), c, c)), -back[..., :c]], axis=1)
+        every = np.broadcast_to(np.eye(c), (len(own), c, c))
+        spread = np.concatenate([every, -back[..., :c]], axis=1)
         taken = np.sum(inner * hessian[:, c:, c:]) + np.sum((spread @ inverse) * (hessian @ spread))
         weight = np.linalg.slogdet(whole[:, c:, c:])[1].sum() + np.linalg.slogdet(total)[1]
         cost = 0.5 * (
@@ -282,10 +291,11 @@ class ViewEvidence:
 def side_level(sides, data, hessian, gradient):
     """Scale of the sides' deviations, Student's t, by expectation and maximisation.
 
-    Student's t is a normal distribution whose precision varies from side to side; what is expected of it hangs on the
-    whole expected square of a deviation. A side that the beams hardly show is as uncertain as the scale says, and must
-    not pull it down. One side more is believed to deviate as is usual: where nothing shows the scale, that is it.
-    `hessian` (p, k, k) and `gradient` (p, k) are of a placement's own unknowns, the sides last; shared ones are held.
+    Student's t is a normal distribution whose precision varies from side to side; what is expected
+    of it hangs on the whole expected square of a deviation. A side that the beams hardly show is as
+    uncertain as the scale says, and must not pull it down. One side more is believed to deviate as
+    is usual: where nothing shows the scale, that is it. `hessian` (p, k, k) and `gradient` (p, k)
+    are of a placement's own unknowns, the sides last; shared ones are held.
     """
     edges, sigma2 = sides.shape[1], data.side_sigma**2
     shown = np.zeros(sides.shape, bool)
