@@ -19,7 +19,7 @@ NOISE_WORDS = {
     "view_scale": "scatter of board poses in images, in stated standard deviations",
     "face_share": "independent errors per range",
     "beam_share": "independent errors per beam at an edge",
-    "sigma_pitch": "error of the pitch of single images [deg]",
+    "sigma_pitch": "error of the pitch at a stop [deg]",
     "side_sigma": "spread of the edge bias from side to side [log odds]",
 }
 HALVES_COLUMNS = (
