@@ -216,9 +216,9 @@ def name_sides(prepared):
     """Name the sides that scans cross: the nearest edge of the board, which the images place in the scan.
 
     The cameras' poses come from the planes alone (Zhang and Pless), which needs no names. Returns edge names by
-    placement and side number, those that got none likewise (DroppedSide), and problems: of :func:`rough_poses`, and why
-    sides have no name. Those farther than 8 cm from every edge have none; nor has any where nobody knows the outline of
-    the board.
+    placement and side number, those that got none likewise (DroppedSide), and problems: of
+    :func:`rough_poses`, and why sides have no name. Those farther than 8 cm from every edge have
+    none; nor has any where nobody knows the outline of the board.
     """
     rough, problems = rough_poses(prepared)
     names, dropped = {}, {}
@@ -278,7 +278,7 @@ def rough_poses(prepared):
 
 
 def nearest_edges(board, sides):
-    """Edge names of sides (board-frame points by number), each given once, and DroppedSide of those that got none."""
+    """Edge names of sides (board-frame points by number), each given once, and the DroppedSide."""
     lines, names, dropped, numbers = board.lines(), {}, {}, list(sides)
     distances = [np.abs(p[:, :2] @ lines[:, :2].T + lines[:, 2]) for p in sides.values()]
     cost = np.array([np.median(d, axis=0) for d in distances]).reshape(-1, len(lines))
