@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import calibrated
 from falsified import FALSIFIED, changed, scaled, second_camera
 from joint_draws import draw, rng
-from shared import campaign
+from shared import DATA, campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
-from lrfcal_lib.evaluate.verdict import contradicts_stated, verdict
+from lrfcal_lib.evaluate.verdict import contradicts_stated, diagnose, verdict
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.session.stated import LrfInfo
@@ -115,6 +116,19 @@ def test_what_moves_the_result_by_two_standard_deviations_is_never_silent(seed, 
         reasons, _, solution = judged(HARMFUL[name], seed, mount, **devices)
         if list(solution.boards) == list(honest.boards):
             assert reasons or moved(solution, honest) < 2.0, name
+
+
+@campaign
+@pytest.mark.parametrize("name", ["sim_lms221", "lms400"])
+def test_nor_is_it_in_recordings(request, name):
+    stored = name == "sim_lms221"
+    joint = (calibrated(DATA / name) if stored else request.getfixturevalue(name)).joint
+    for what, change in HARMFUL.items():
+        falsified = change(joint.observations)
+        solution = solve_joint(falsified, required=False, **joint.settings)
+        reasons = contradicts_stated(replace(joint, solution=solution))[0] + diagnose(solution)
+        if list(solution.boards) == list(joint.solution.boards):
+            assert reasons or moved(solution, joint.solution) < 2.0, what
 
 
 def test_noise_names_the_camera():

@@ -219,9 +219,8 @@ def prepare(session):
     """
     ready = prepare_images(prepare_scans(session))
     names, dropped, problems = name_sides(ready)
-    ready = without(
-        replace(ready, names=names, dropped=dropped, problems=ready.problems | problems)
-    )
+    problems = ready.problems | problems
+    ready = without(replace(ready, names=names, dropped=dropped, problems=problems))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
 
 

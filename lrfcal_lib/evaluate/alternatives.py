@@ -18,9 +18,10 @@ STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
 MIDDLE = np.pi / 2  # the bearing straight ahead
 ASKED = 4.0  # standard deviations beyond which the data contradict a statement, whatever it does
-PREFERRED = 2.0  # chance alone exceeds so many standard deviations once in 20 times; enough where it does harm:
+PREFERRED = 2.0  # so many are exceeded by chance once in 20 times; enough where it does harm:
 MOVED = 2.0  # standard deviations by which what is handed over would move
-HELD, INSTEAD = 0.001, 6.0  # metres; standard deviations beyond which bearings may stand for a range offset
+HELD = 0.001  # metres, of a range offset that is asked whether bearings may stand for it
+INSTEAD = 6.0  # standard deviations beyond which they do
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
 FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
@@ -59,7 +60,7 @@ class Alternative:
 
 
 def _views(obs, s, origin=(0.0, 0.0)):
-    """Squares larger by s about the pattern's first corner (`origin`, metres, in the board's frame)."""
+    """Squares larger by s about the pattern's first corner (`origin`, metres, board frame)."""
     pose = obs.view_pose.copy()
     corner = pose[:, :3, :2] @ np.asarray(origin)
     pose[:, :3, 3] = (1 + s) * pose[:, :3, 3] + s * corner
@@ -113,10 +114,11 @@ ALTERNATIVES = {
 
 
 def alternatives_of(prepared):
-    """Those of `ALTERNATIVES` that are there to be wrong in a session (Prepared): dict of str to Alternative.
+    """Those of `ALTERNATIVES` that are there to be wrong in a session (Prepared), by kind.
 
-    A plain board has no squares. An outline that the images measured is not stated, and scales with the squares; one
-    that is stated stays as it is, and squares that are larger reach farther from the pattern's first corner.
+    A plain board has no squares. An outline that the images measured is not stated, and scales with
+    the squares; one that is stated stays as it is, and squares that are larger reach farther from
+    the pattern's first corner.
     """
     stated = dict(ALTERNATIVES)
     pattern = prepared.board.pattern
@@ -126,7 +128,8 @@ def alternatives_of(prepared):
         del stated["outline"]
         stated["squares"] = replace(stated["squares"], change=_views_and_outline)
     else:
-        stated["squares"] = replace(stated["squares"], change=partial(_views, origin=pattern.origin))
+        about_first_corner = partial(_views, origin=pattern.origin)
+        stated["squares"] = replace(stated["squares"], change=about_first_corner)
     if prepared.session.lrf.spot_exit is None:
         del stated["spot"]
     return stated
@@ -145,7 +148,7 @@ class Doubt:
     ratio : float
         Likelihood ratio (squared score).
     moved : float
-        By how many of its standard deviations the axis or a camera would move, the largest one, were it so.
+        By how many of its standard deviations the axis or a camera would move at most, were it so.
     words : str
     """
 
@@ -197,28 +200,36 @@ def weigh(solution, admitted_offset, stated=ALTERNATIVES):
         own = (score + reduced @ step) @ covariance[-1]  # what each placement still pulls at the value found
         sigma = np.sqrt(max(covariance[-1, -1], np.sum(own**2) * len(own) / max(len(own) - 1, 1)))
         along = covariance[:c, -1] / max(covariance[-1, -1], 1e-300) * step[-1]
-        moved = float(np.max(np.abs(along[handed]) / solution.solution.trusted_sigma[handed], initial=0.0))
+        moves = np.abs(along[handed]) / solution.solution.trusted_sigma[handed]
         if 0 < sigma < UNKNOWN * alternative.worth:
             size, spread = (f"{x * alternative.unit:.2g}" for x in (abs(step[-1]), sigma))
             words = alternative.words.format(size=size, sigma=spread, sign=alternative.signs[int(step[-1] < 0)])
             words = f"{words}: {alternative.remedy}"
-            found.append(Doubt(kind, float(step[-1]), float(sigma), float((step[-1] / sigma) ** 2), moved, words))
+            doubt = Doubt(
+                kind=kind,
+                value=float(step[-1]),
+                sigma=float(sigma),
+                ratio=float((step[-1] / sigma) ** 2),
+                moved=float(np.max(moves, initial=0.0)),
+                words=words,
+            )
+            found.append(doubt)
     return sorted(found, key=lambda doubt: -doubt.ratio)
 
 
 def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
     """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well.
 
-    Beyond chance whatever they do, or preferred by the data where what is handed over would move by more than its
-    standard deviation tells. Kinds named in `faint` are asked for by the latter alone.
+    Beyond chance whatever they do, or preferred by the data where what is handed over would move by
+    more than its standard deviation tells. Kinds named in `faint` need the latter.
     """
-    found = [doubt for doubt in weigh(solution, admitted_offset, stated) if abs(doubt.value) < stated[doubt.kind].reach]
-    freedom = max(len(solution.boards) - 1, 1)  # of the scatter over placements, which is itself known so well only
+    freedom = max(len(solution.boards) - 1, 1)  # of the scatter over placements
     preferred = stdtrit(freedom, ndtr(PREFERRED)) ** 2
     asked = []
-    for doubt in found:
+    for doubt in weigh(solution, admitted_offset, stated):
         harmful = doubt.ratio > preferred and doubt.moved > MOVED
-        if harmful or (doubt.kind not in faint and _certain(doubt, stated)):
+        certain = doubt.kind not in faint and _certain(doubt, stated)
+        if abs(doubt.value) < stated[doubt.kind].reach and (harmful or certain):
             asked.append(doubt)
     return [doubt for doubt in asked if doubt.ratio > AS_GOOD * asked[0].ratio]
 

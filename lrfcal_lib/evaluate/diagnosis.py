@@ -16,9 +16,11 @@ SHEET_SHARE = 0.5  # a sheet bent less than this share of what the scan shows do
 LENS_PARTS, LENS_CORNERS, LENS_MISS = np.array([6, 4]), 20, 0.15  # of an image; corners in a part; pixels
 OFF_MIDDLE = 0.2  # of the image's size
 OTHER_SIZE = "as with intrinsics of another image size"
-WIDE = np.radians(80.0)  # across an image, by its focal length: beyond, five numbers hardly hold a lens
-REMEDY = "state intrinsics of this image size, or take sharp images of the chessboard all over the picture"
-REMEDY_WIDE = "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
+WIDE = np.radians(80.0)  # across an image, by the focal length: five numbers hardly hold it
+REMEDY = "state intrinsics of this image size, or take sharp images with the chessboard all over"
+REMEDY_WIDE = (
+    "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
+)
 SAME_TURN = 0.5  # two cameras whose turns differ by less than this share of the larger one moved together
 
 
@@ -95,7 +97,8 @@ def lens_words(prepared):
         if words:
             wide = 2 * np.arctan2(model.width / 2, model.fx) > WIDE
             remedy = REMEDY_WIDE if wide else REMEDY
-            out[camera] = f"the lens of camera '{camera}' is not that of its model ({'; '.join(words)}): {remedy}"
+            lens = f"the lens of camera '{camera}' is not that of its model"
+            out[camera] = f"{lens} ({'; '.join(words)}): {remedy}"
     return out
 
 

@@ -203,7 +203,9 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
     }  # fmt: skip
     maps = {"cloud_mm": 1000 * cloud.rms()} | {f"{camera}_px": found.rms() for camera, found in seen.items()}
     regions = {camera: _regions(found.sigma[DISTANCES.index(2.0)]) for camera, found in seen.items()}
-    errors = {d: bounded({name: float(rms[i]) for name, rms in maps.items()}) for i, d in enumerate(DISTANCES)}
+    errors = {}
+    for i, distance in enumerate(DISTANCES):
+        errors[distance] = bounded({name: float(rms[i]) for name, rms in maps.items()})
     large = {name: value for name, value in errors[2.0].items() if not value <= POOR[name[-2:]]}
     if large:
         bad = any(not value <= BAD[name[-2:]] for name, value in large.items())
@@ -215,7 +217,8 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
 
 def bounded(errors):
     """Errors by name, millimetres and pixels; infinite where so large a one is no bound at all."""
-    return {name: value if value < NO_BOUND[name[-2:]] else np.inf for name, value in errors.items()}
+    bounds = {name: NO_BOUND[name[-2:]] for name in errors}
+    return {name: value if value < bounds[name] else np.inf for name, value in errors.items()}
 
 
 def _regions(sigma):
@@ -338,8 +341,8 @@ def contradicts_stated(joint):
     asked, instead = _asked(joint)
     doubt = abs(offset) if instead in asked else 0.0
     if level > ABSURD and not asked:
-        words = f"{NOT_WEIGHED}: no single one explains why ranges fit {level:.0f} times worse than stated"
-        reasons.append(Reason(NO, "not weighed", words))
+        why = f"no single one explains why ranges fit {level:.0f} times worse than stated"
+        reasons.append(Reason(NO, "not weighed", f"{NOT_WEIGHED}: {why}"))
     if asked:
         best = asked[0]
         large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
@@ -373,7 +376,7 @@ def contradicts_stated(joint):
 
 def _asked(joint):
     """Statements that the data contradict (Doubts), and one that stands for a range offset, which may be of them."""
-    # of the spot many backgrounds of different distance tell, others where a wrong one does harm only
+    # many backgrounds of different distance tell of the spot, others where a wrong one does harm
     many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
     stated = alternatives_of(joint.prepared)
     admitted = joint.prepared.session.lrf.admitted_offset
@@ -429,18 +432,20 @@ def _left_out(calibration, method):
 
 
 def sides_elsewhere(prepared):
-    """Edges of the board that lie elsewhere in most scans that cross them (Prepared): list of Reason."""
+    """Edges of the board that lie elsewhere in most scans across them (Prepared)."""
     reasons = []
+    elsewhere = [side for own in prepared.dropped.values() for side in own.values()]
     for edge in prepared.board.edges:
-        dropped = [side for own in prepared.dropped.values() for side in own.values() if side.edge == edge]
+        dropped = [side for side in elsewhere if side.edge == edge]
         crossed = len(dropped) + sum(edge in own.values() for own in prepared.names.values())
         if len(dropped) < FEWEST or len(dropped) <= MOST * crossed:
             continue
         turn = np.degrees(np.median([side.turn for side in dropped]))
         off = 1000 * np.median([side.distance for side in dropped])
         words = (
-            f"the board's edge '{edge}' lies elsewhere than its outline says in {len(dropped)} of {crossed} scans "
-            f"({off:.0f} mm off, turned by {turn:.1f} deg) and is not used there: measure the board's edges (corners_m)"
+            f"the board's edge '{edge}' lies elsewhere than its outline says in {len(dropped)} of "
+            f"{crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) and is not used there: "
+            "measure the board's edges (corners_m)"
         )
         reasons.append(Reason(CARE, "outline", words))
     return reasons
@@ -494,20 +499,24 @@ def _of_placements(solution):
 
 
 def noise_of_images(solution):
-    """How far board poses in the images of each camera scatter, in stated standard deviations: by its name in words.
+    """How far board poses in the images of each camera scatter, in stated standard deviations.
 
-    All cameras have one level; how their residuals differ tells whose it is. What errors of the intrinsics cause is
-    taken off.
+    By its name in words. All cameras have one level; how their residuals differ tells whose it is.
+    What errors of the intrinsics cause is taken off.
     """
     obs = solution.observations
     if len(obs.view_camera) == 0:
         return {}
-    level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)  # with intrinsics as stated
+    level = solution.noise["view_scale"] / np.hypot(1.0, solution.lens_scale)
     factors = np.linalg.cholesky(obs.view_covariance)
-    squares = np.mean(np.linalg.solve(factors, solution.residuals("view")[..., None])[..., 0] ** 2, axis=1)
+    white = np.linalg.solve(factors, solution.residuals("view")[..., None])[..., 0]
+    squares = np.mean(white**2, axis=1)
     usual = max(np.mean(squares), np.finfo(float).tiny)
-    of_camera = {name: np.mean(squares[obs.view_camera == i]) for i, name in enumerate(obs.cameras)}
-    return {f"images of '{name}'": float(level * np.sqrt(mean / usual)) for name, mean in of_camera.items()}
+    scatter = {}
+    for i, name in enumerate(obs.cameras):
+        mean = np.mean(squares[obs.view_camera == i])
+        scatter[f"images of '{name}'"] = float(level * np.sqrt(mean / usual))
+    return scatter
 
 
 def _of_residuals(solution):

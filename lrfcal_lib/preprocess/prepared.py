@@ -55,9 +55,10 @@ class DroppedSide:
     def words(self):
         """Why it is not used."""
         if self.turn:
-            angle = np.rad2deg(self.turn)
-            return f"the scan's side '{self.edge}' is turned by {angle:.1f} deg against the board: not used"
-        return f"a side of the scan is {1000 * self.distance:.0f} mm from the edge '{self.edge}': not used"
+            turned = f"turned by {np.rad2deg(self.turn):.1f} deg against the board"
+            return f"the scan's side '{self.edge}' is {turned}: not used"
+        off = f"{1000 * self.distance:.0f} mm from the edge '{self.edge}'"
+        return f"a side of the scan is {off}: not used"
 
 
 @dataclass(frozen=True)

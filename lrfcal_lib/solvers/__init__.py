@@ -312,11 +312,9 @@ def best_minimum(obs, uses, found):
     """The best of some Solutions, with another one as `rival` that explains the data nearly as
     well.
     """
-    misses, before = zip(
-        *(misses_of(obs, uses, solution.transform) for solution in found), strict=True
-    )
+    misses = [misses_of(obs, uses, solution.transform) for solution in found]
+    before = np.array([lies_before(obs, uses, solution.transform) for solution in found])
     sizes = planes.sizes_of_minima(np.square(misses))
-    before = np.array(before)
     order = np.lexsort([sizes, ~before])
     best = found[order[0]]
     nearly = (before == before[order[0]]) & (sizes <= planes.NEARLY * sizes[order[0]])
@@ -326,17 +324,19 @@ def best_minimum(obs, uses, found):
 
 
 def misses_of(obs, uses, transform):
-    """Distances or pixels by which observations miss at a pose, and whether the board lies
-    before the camera.
-    """
-    points = getattr(obs, f"{uses}_points")
+    """Distances or pixels by which observations miss at a pose."""
     block = {"crossing": line_block, "scene": lines.point_block}.get(uses)
-    misses = (
-        plane_residuals_m(obs, transform)
-        if block is None
-        else block(pose_array(transform), obs).residuals
-    )
-    return misses[np.isfinite(misses)], bool(np.mean(transform.apply(points)[:, 2] < 0) <= 0.5)
+    if block is None:
+        misses = plane_residuals_m(obs, transform)
+    else:
+        misses = block(pose_array(transform), obs).residuals
+    return misses[np.isfinite(misses)]
+
+
+def lies_before(obs, uses, transform):
+    """Whether a pose puts (most of) the board before the camera."""
+    depth = transform.apply(getattr(obs, f"{uses}_points"))[:, 2]
+    return bool(np.mean(depth < 0) <= 0.5)
 
 
 ACCEPTED = 0.999  # a good placement is accepted with this probability, were the errors normal

@@ -382,8 +382,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
         bad = list(best.left_out)
         raise DegenerateGeometry(
             f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
-            f"boards elsewhere than scans ({', '.join(map(str, bad[:8]))}); check that images and scans carry "
-            "the right numbers"
+            f"boards elsewhere than scans ({', '.join(map(str, bad[:8]))}); check that images and "
+            "scans carry the right numbers"
         )
     return best, second_minima(obs, tried, best)
 
@@ -399,7 +399,7 @@ def refuse_contradiction(state, data, most):
 
 
 def second_minima(obs, tried, best):
-    """In words, which cameras a start value that explains the data nearly as well puts far from the best one's."""
+    """In words, which cameras a start value that fits nearly as well puts elsewhere."""
     others = sorted(tried, key=lambda start: start.badness)
     rivals = {}
     for start in (start for start in others if start.badness <= NEARLY**2 * best.badness):

@@ -145,7 +145,7 @@ def check_normals(sets, camera, least=0.02):
 SUBSETS, MINIMAL = 400, 40
 SAME_TURN = np.radians(10.0)  # poses nearer to each other than this are one minimum
 MOST_APART = 6  # minima to choose from
-CAPPED = 16.0  # times the usual square: a larger miss, four standard deviations, belongs to no minimum
+CAPPED = 16.0  # times the usual square: a larger miss (four standard deviations) fits no minimum
 NEARLY = 1.2  # times the misses of the best minimum: another one explains the data nearly as well
 SEEN = 0.8  # of the placements: a few may be wrong
 ROTATIONS = 200
@@ -175,7 +175,7 @@ def start_from_planes(obs):
     candidates = _before_boards(np.concatenate(found), sets, _centred(triangles)[1])
 
     def trimmed(count):
-        """Order of the candidates by their mean square over so many placements, those they suit best."""
+        """Order of the candidates by their mean square over so many placements that suit best."""
         squares = np.sort(_squares(candidates, triangles, sets), axis=1)
         return np.argsort(squares[:, :count].mean(axis=1))
 
@@ -185,7 +185,8 @@ def start_from_planes(obs):
     # more placements than a closed form uses; half of them may be wrong, or all but one right
     counts = {p // 2 + 2, max(p // 2 + 2, 7 if flat else 5)}
     orders = [trimmed(min(count, p)) for count in counts]
-    best = candidates[np.unique([row for order in orders for row in (*order[:4], *_apart(candidates, order))])]
+    first = [row for order in orders for row in (*order[:4], *_apart(candidates, order))]
+    best = candidates[np.unique(first)]
     options = {"loss": "cauchy", "scale": "auto", "max_iterations": 12, "tolerance": 0.01}
     robust, *_ = minimise(evaluate, best, move_pose, **options)
     plain, *_ = minimise(evaluate, robust, move_pose, max_iterations=12, tolerance=0.01)
@@ -196,7 +197,7 @@ def start_from_planes(obs):
 
 
 def _squares(poses, triangles, sets):
-    """Mean squared distances (n, p) of the points of every placement from its plane, at some poses (n, 3, 4)."""
+    """Mean squared distances (n, p) of each placement's points from its plane, at n poses."""
     residuals = plane_residuals(poses[:, None], triangles, sets.boards)[0]
     return np.sum(residuals**2, axis=2) / sets.number
 
@@ -204,15 +205,17 @@ def _squares(poses, triangles, sets):
 def sizes_of_minima(squares, weights=None):
     """Robust sizes (n,) of the misses at n minima, which tell the one that explains the data best.
 
-    Roots of weighted means of squares (n, k), each one counted up to `CAPPED` times the level: that of the minimum with
-    the smallest median, one level for all. The median alone would not see what half of the data say.
+    Roots of weighted means of squares (n, k), each one counted up to `CAPPED` times the level: that
+    of the minimum with the smallest median, one level for all. The median alone would not see what
+    half of the data say.
     """
     level = np.median(squares, axis=1).min()
-    return np.sqrt(np.average(np.minimum(squares, CAPPED * level + SIGMA_FLOOR**2), axis=1, weights=weights))
+    capped = np.minimum(squares, CAPPED * level + SIGMA_FLOOR**2)
+    return np.sqrt(np.average(capped, axis=1, weights=weights))
 
 
 def _apart(poses, order):
-    """Indices of poses, the first ones in some order that are turned against all before, at most `MOST_APART`."""
+    """Indices of the first poses in some order that are turned against all before, `MOST_APART`."""
     found, left = [], np.asarray(order)
     while len(left) and len(found) < MOST_APART:
         first = left[0]
