@@ -1,4 +1,6 @@
-"""What else could be wrong: statements tested one by one against the data, with words that name cause and remedy."""
+"""What else could be wrong: statements tested one by one against the data, with words that name
+cause and remedy.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,8 +13,13 @@ from scipy.special import ndtr, stdtrit
 
 from lrfcal_lib.fit.least_squares import eliminate, whiten
 from lrfcal_lib.fit.residuals import SENSOR, gather, named_blocks
-from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, axis_of, transform_difference
-from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    axis_difference,
+    axis_of,
+    transform_difference,
+)
+from lrfcal_lib.solvers.joint import JointSolution, solve_joint
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
@@ -24,11 +31,15 @@ HELD = 0.001  # metres, of a range offset that is asked whether bearings may sta
 INSTEAD = 6.0  # standard deviations beyond which they do
 UNKNOWN = 100.0  # times what is worth a word: so large a standard deviation says nothing
 FAR = 4.0  # standard deviations of the stated axis and its own
-FAR_TURN, FAR_SHIFT = np.radians(30.0), 0.3  # of a camera from its guess
-ALIKE = 0.15  # log odds; sides are expected to deviate no more than this while statements are weighed
+# of a camera from its guess
+FAR_TURN = np.radians(30.0)
+FAR_SHIFT = 0.3
+# log odds; sides are expected to deviate no more than this while statements are weighed
+ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
 BETTER = 3.0  # times less scatter of ranges with the other sense
-AS_GOOD = 0.6  # of the best alternative's likelihood ratio: another one explains the data nearly as well
+# of the best alternative's likelihood ratio: another one explains the data nearly as well
+AS_GOOD = 0.6
 
 
 @dataclass(frozen=True)
@@ -46,7 +57,8 @@ class Alternative:
     unit : float
         What s is multiplied by for the words.
     words : str
-        With ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs` where s is positive.
+        With ``{size}`` and ``{sigma}`` of s, and ``{sign}``: the first of `signs` where s is
+        positive.
     remedy : str
     """
 
@@ -73,44 +85,62 @@ def _views_and_outline(obs, s):
 
 
 def _bearings(obs, s):
-    turned = (MIDDLE + (bearing - MIDDLE) * (1 + s) for bearing in (obs.face_bearing, obs.beam_bearing))
+    turned = (
+        MIDDLE + (bearing - MIDDLE) * (1 + s) for bearing in (obs.face_bearing, obs.beam_bearing)
+    )
     return replace(obs, **dict(zip(("face_bearing", "beam_bearing"), turned, strict=True)))
 
 
 def _lag(obs, s):
-    late = {"face_pitch": s * obs.direction[obs.face_placement], "beam_pitch": s * obs.direction[obs.beam_placement]}
+    late = {
+        "face_pitch": s * obs.direction[obs.face_placement],
+        "beam_pitch": s * obs.direction[obs.beam_placement],
+    }
     return replace(obs, **{name: getattr(obs, name) + by for name, by in late.items()})
 
 
 ALTERNATIVES = {
     "squares": Alternative(
-        _views, "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
+        _views,
+        "the chessboard's squares are {size} +- {sigma} % {sign} than stated",
         "measure a square over many of them",
     ),
     "outline": Alternative(
         lambda obs, s: replace(obs, corners=obs.corners * (1 + s)),
-        "the board's outline is {size} +- {sigma} % {sign} than stated", "measure the board's edges",
+        "the board's outline is {size} +- {sigma} % {sign} than stated",
+        "measure the board's edges",
     ),
     "ranges": Alternative(
-        lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)), "all ranges are {size} +- {sigma} % {sign}",
+        lambda obs, s: replace(obs, face_range=obs.face_range * (1 + s)),
+        "all ranges are {size} +- {sigma} % {sign}",
         "measure a square and an edge of the board, check the unit of the ranges",
-        ("too short, or board and squares smaller than stated", "too long, or board and squares larger than stated"),
+        (
+            "too short, or board and squares smaller than stated",
+            "too long, or board and squares larger than stated",
+        ),
     ),
     "bearings": Alternative(
-        _bearings, "bearings are {size} +- {sigma} % too {sign}",
-        "check the angular step that session.json states", ("small", "large"),
+        _bearings,
+        "bearings are {size} +- {sigma} % too {sign}",
+        "check the angular step that session.json states",
+        ("small", "large"),
     ),
     "spot": Alternative(
         lambda obs, s: replace(obs, beam_radius=obs.beam_radius * (1 + s)),
         "the spot of the range finder is {size} +- {sigma} % {sign} than stated",
-        "state spot_exit_m and spot_divergence_rad as its maker does", worth=0.2, reach=5.0,
+        "state spot_exit_m and spot_divergence_rad as its maker does",
+        worth=0.2,
+        reach=5.0,
     ),
     "lag": Alternative(
-        _lag, "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
+        _lag,
+        "the pitch of scan lines comes {size} +- {sigma} deg {sign} in the sense of the sweep",
         "check the time stamps of pitch and scans, sweep slower or stop for every scan",
-        ("late", "early"), worth=np.radians(0.05), unit=np.degrees(1.0),
+        ("late", "early"),
+        worth=np.radians(0.05),
+        unit=np.degrees(1.0),
     ),
-}  # fmt: skip
+}
 
 
 def alternatives_of(prepared):
@@ -147,6 +177,9 @@ class Doubt:
         As the data have it, with its standard deviation.
     ratio : float
         Likelihood ratio (squared score).
+    freedom : float
+        Degrees of freedom of `sigma`: placements less one where it comes from their scatter,
+        infinite where it comes from the noise.
     moved : float
         By how many of its standard deviations the axis or a camera would move at most, were it so.
     words : str
@@ -156,16 +189,24 @@ class Doubt:
     value: float
     sigma: float
     ratio: float
+    freedom: float
     moved: float
     words: str
 
+    def exceeds(self, deviations):
+        """Whether chance alone goes so far as seldom as a normal variable goes beyond
+        `deviations`.
+        """
+        return self.ratio > stdtrit(self.freedom, ndtr(deviations)) ** 2
+
 
 def weigh(solution, admitted_offset, stated=ALTERNATIVES):
-    """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest first.
+    """Every alternative tested by itself, all that was estimated free: list of Doubt, the likeliest
+    first.
 
-    A score test at the solution: no estimate is repeated. The standard deviation is the larger one of noise and scatter
-    over placements. A range offset takes up what a wrong size does to ranges; it is expected to be what the maker
-    admits.
+    A score test at the solution: no estimate is repeated. The standard deviation is the larger one
+    of noise and scatter over placements. A range offset takes up what a wrong size does to ranges;
+    it is expected to be what the maker admits.
 
     Parameters
     ----------
@@ -175,59 +216,113 @@ def weigh(solution, admitted_offset, stated=ALTERNATIVES):
     stated : dict of str to Alternative
         What may be wrong.
     """
-    state, unknowns, obs = solution.state, solution.unknowns, solution.observations
-    # sides that may deviate, and beams that may say nothing, take up what a wrong statement does to edges
-    levels = solution.data.levels | {"side_sigma": min(solution.data.side_sigma, ALIKE), "lapse": 0.0}
-    before, c = named_blocks(state, gather(obs, **levels), unknowns), unknowns.shared
-    before = {name: whiten(block) for name, block in before.items()}
-    handed = [i for i, name in enumerate(solution.solution.names) if name not in SENSOR]
-    prior, pull = np.zeros((2, c + 1))
-    if "range_offset" in unknowns.sensor:
-        where = unknowns.columns["range_offset"]
-        prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
-        pull[where] = prior[where] * solution.sensor["range_offset"]
-    found = []
+    test = ScoreTest.at(solution, admitted_offset)
+    doubts = []
     for kind, alternative in stated.items():
-        after = named_blocks(state, gather(alternative.change(obs, STEP), **levels), unknowns)
-        hessian = gradient = 0.0
-        for name, (r, J) in before.items():
-            J = np.insert(J, c, (whiten(after[name], False)[0] - r) / STEP, axis=-1)
+        doubt = test.doubt(kind, alternative)
+        if 0 < doubt.sigma < UNKNOWN * alternative.worth:
+            doubts.append(doubt)
+    return sorted(doubts, key=lambda doubt: -doubt.ratio)
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """The joint estimate at its solution, ready to be asked for one unknown more.
+
+    Attributes
+    ----------
+    solution : JointSolution
+    levels : dict
+        Noise levels; sides that may deviate, and beams that may say nothing, would take up what a
+        wrong statement does to edges.
+    blocks : dict of str to (ndarray, ndarray)
+        Whitened residuals and Jacobians.
+    prior, pull : ndarray, shape (c + 1,)
+        Information on the shared unknowns and one more that the maker's range offset adds, and its
+        score.
+    """
+
+    solution: JointSolution
+    levels: dict
+    blocks: dict
+    prior: np.ndarray
+    pull: np.ndarray
+
+    @classmethod
+    def at(cls, solution, admitted_offset):
+        """The test at a JointSolution."""
+        unknowns = solution.unknowns
+        levels = dict(solution.data.levels)
+        levels["side_sigma"] = min(solution.data.side_sigma, ALIKE)
+        levels["lapse"] = 0.0
+        data = gather(solution.observations, **levels)
+        blocks = named_blocks(solution.state, data, unknowns)
+        prior = np.zeros(unknowns.shared + 1)
+        pull = np.zeros(unknowns.shared + 1)
+        if "range_offset" in unknowns.sensor:
+            where = unknowns.columns["range_offset"]
+            prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
+            pull[where] = prior[where] * solution.sensor["range_offset"]
+        whitened = {name: whiten(block) for name, block in blocks.items()}
+        return cls(solution, levels, whitened, prior, pull)
+
+    def normal_equations(self, alternative):
+        """Hessian and gradient by placement, with the alternative's size as the last shared
+        unknown.
+        """
+        changed = gather(alternative.change(self.solution.observations, STEP), **self.levels)
+        after = named_blocks(self.solution.state, changed, self.solution.unknowns)
+        hessian = 0.0
+        gradient = 0.0
+        for name, (residuals, jacobian) in self.blocks.items():
+            by_size = (whiten(after[name], False)[0] - residuals) / STEP
+            J = np.insert(jacobian, self.solution.unknowns.shared, by_size, axis=-1)
             back = np.swapaxes(J, -1, -2)
-            hessian, gradient = hessian + back @ J, gradient + (back @ r[..., None])[..., 0]
-        reduced, score, _ = eliminate(hessian, gradient, c + 1)
-        covariance = np.linalg.pinv(reduced.sum(axis=0) + np.diag(prior), rcond=1e-13, hermitian=True)
-        step = -covariance @ (score.sum(axis=0) + pull)
-        own = (score + reduced @ step) @ covariance[-1]  # what each placement still pulls at the value found
-        sigma = np.sqrt(max(covariance[-1, -1], np.sum(own**2) * len(own) / max(len(own) - 1, 1)))
-        along = covariance[:c, -1] / max(covariance[-1, -1], 1e-300) * step[-1]
-        moves = np.abs(along[handed]) / solution.solution.trusted_sigma[handed]
-        if 0 < sigma < UNKNOWN * alternative.worth:
-            size, spread = (f"{x * alternative.unit:.2g}" for x in (abs(step[-1]), sigma))
-            words = alternative.words.format(size=size, sigma=spread, sign=alternative.signs[int(step[-1] < 0)])
-            words = f"{words}: {alternative.remedy}"
-            doubt = Doubt(
-                kind=kind,
-                value=float(step[-1]),
-                sigma=float(sigma),
-                ratio=float((step[-1] / sigma) ** 2),
-                moved=float(np.max(moves, initial=0.0)),
-                words=words,
-            )
-            found.append(doubt)
-    return sorted(found, key=lambda doubt: -doubt.ratio)
+            hessian = hessian + back @ J
+            gradient = gradient + (back @ residuals[..., None])[..., 0]
+        return hessian, gradient
+
+    def doubt(self, kind, alternative):
+        """What the data say of an alternative, a Doubt."""
+        shared = self.solution.unknowns.shared
+        reduced, score, _ = eliminate(*self.normal_equations(alternative), shared + 1)
+        information = reduced.sum(axis=0) + np.diag(self.prior)
+        covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
+        step = -covariance @ (score.sum(axis=0) + self.pull)
+        value = float(step[-1])
+        # what each placement still pulls at the value found
+        pulls = (score + reduced @ step) @ covariance[-1]
+        freedom = max(len(pulls) - 1, 1)
+        noise = covariance[-1, -1]
+        scatter = np.sum(pulls**2) * len(pulls) / freedom
+        sigma = float(np.sqrt(max(noise, scatter)))
+        along = covariance[:shared, -1] / max(noise, 1e-300) * value
+        handed = [i for i, name in enumerate(self.solution.solution.names) if name not in SENSOR]
+        moves = np.abs(along[handed]) / self.solution.solution.trusted_sigma[handed]
+        sizes = {"size": abs(value), "sigma": sigma}
+        sizes = {name: f"{size * alternative.unit:.2g}" for name, size in sizes.items()}
+        words = alternative.words.format(**sizes, sign=alternative.signs[int(value < 0)])
+        return Doubt(
+            kind=kind,
+            value=value,
+            sigma=sigma,
+            ratio=float((value / max(sigma, 1e-300)) ** 2),
+            freedom=freedom if scatter > noise else np.inf,
+            moved=float(np.max(moves, initial=0.0)),
+            words=f"{words}: {alternative.remedy}",
+        )
 
 
 def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
-    """The alternatives that the data ask for: list of Doubt, the best one and those that explain them as well.
+    """The alternatives that the data ask for: list of Doubt, the best one and those that explain
+    them as well.
 
     Beyond chance whatever they do, or preferred by the data where what is handed over would move by
     more than its standard deviation tells. Kinds named in `faint` need the latter.
     """
-    freedom = max(len(solution.boards) - 1, 1)  # of the scatter over placements
-    preferred = stdtrit(freedom, ndtr(PREFERRED)) ** 2
     asked = []
     for doubt in weigh(solution, admitted_offset, stated):
-        harmful = doubt.ratio > preferred and doubt.moved > MOVED
+        harmful = doubt.exceeds(PREFERRED) and doubt.moved > MOVED
         certain = doubt.kind not in faint and _certain(doubt, stated)
         if abs(doubt.value) < stated[doubt.kind].reach and (harmful or certain):
             asked.append(doubt)
@@ -236,21 +331,26 @@ def doubtful(solution, admitted_offset, stated=ALTERNATIVES, faint=()):
 
 def _certain(doubt, stated):
     """Whether the data contradict a statement beyond chance, by as much as is worth a word."""
-    return doubt.ratio > ASKED**2 and abs(doubt.value) > stated[doubt.kind].worth
+    return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
 
 
 def not_an_offset(solution, stated=ALTERNATIVES):
-    """The Doubt about bearings where they explain the data far better than the range offset found does, or None.
+    """The Doubt about bearings where they explain the data far better than the range offset found
+    does, or None.
 
-    Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with the offset held.
+    Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with
+    the offset held.
     """
-    offset, sigma = solution.sensor["range_offset"], solution.sigma.get("range_offset")
+    offset = solution.sensor["range_offset"]
+    sigma = solution.sigma.get("range_offset")
     if sigma is not None:
         square = (offset / sigma) ** 2
         best = weigh(solution, HELD, stated)[0] if square > ASKED**2 else None
         asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and best.kind == "bearings"
         if asked and (best.moved > MOVED or _certain(best, stated)):
-            return replace(best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)")
+            return replace(
+                best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
+            )
     return None
 
 
@@ -260,50 +360,83 @@ def plausible(solution):
 
 
 def other_sense(joint):
-    """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way round; else ''.
+    """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way
+    round; else ''.
 
-    Everything is estimated again. A pitch of the other sense is the same but for a half turn of the range finder. A
-    camera on the base contradicts either; without one a mirrored rig fits as well, see :func:`far_from_stated`.
+    Everything is estimated again. A pitch of the other sense is the same but for a half turn of the
+    range finder. A camera on the base contradicts either; without one a mirrored rig fits as well,
+    see :func:`far_from_stated`.
     """
-    obs, level = joint.solution.observations, joint.solution.noise["face_scale"]
-    turned = replace(obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing)
+    obs = joint.solution.observations
+    level = joint.solution.noise["face_scale"]
+    turned = replace(
+        obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing
+    )
     with suppress(DegenerateGeometry):
         again = solve_joint(turned, required=False, **joint.settings)
         better = level / again.noise["face_scale"]
-        if again.converged and not again.unobservable and better > (BETTER if plausible(joint.solution) else 1.0):
+        if (
+            again.converged
+            and not again.unobservable
+            and better > (BETTER if plausible(joint.solution) else 1.0)
+        ):
             return f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} times as well then"
     return ""
 
 
 def far_from_stated(joint):
-    """What lies far from where session.json puts it (JointCalibration): list of words and by what angle (radians).
+    """What lies far from where session.json puts it (JointCalibration): list of words and by what
+    angle (radians).
 
-    A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of the other sense turns
-    the axis about: only the statement of the platform, a camera's guess, or its name can tell.
+    A sensor that is mounted upside down sees the mirror image of every scan line, and a pitch of
+    the other sense turns the axis about: only the statement of the platform, a camera's guess, or
+    its name can tell.
     """
-    session, solution, far = joint.prepared.session, joint.solution, []
+    session = joint.prepared.session
+    solution = joint.solution
+    far = []
     why = "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras look like this"
     if session.T_head_lrf is not None and joint.settings["axis"]:
         found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
         own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
         if np.any(found > FAR * np.hypot(session.platform_sigma, own)):
-            far.append((f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}", found[0]))
-    guesses = {name: found.guess for name, found in session.cameras.items() if found.guess is not None}
+            far.append(
+                (
+                    f"the tilt axis lies {_apart(*found)} from where session.json states it: {why}",
+                    found[0],
+                )
+            )
+    guesses = {
+        name: found.guess for name, found in session.cameras.items() if found.guess is not None
+    }
     for camera in (name for name in solution.transforms if name in guesses):
-        apart = {name: transform_difference(solution.transforms[camera], guess) for name, guess in guesses.items()}
+        apart = {
+            name: transform_difference(solution.transforms[camera], guess)
+            for name, guess in guesses.items()
+        }
         turn, shift = apart[camera]
         nearest = min(apart, key=lambda name: apart[name][0] * LEVER + apart[name][1])
         if turn > FAR_TURN or shift > FAR_SHIFT:
-            far.append((f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn))
+            far.append(
+                (f"camera '{camera}' stands {_apart(turn, shift)} from its guess: {why}", turn)
+            )
         elif nearest != camera:
             far.append(
-                (f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?", turn)
+                (
+                    f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?",
+                    turn,
+                )
             )
     sides = {camera: _seat(solution, camera)[0] for camera in solution.transforms if not far}
     for left, right in permutations(sides, 2):
         if "left" in left.lower() and "right" in right.lower() and sides[left] > sides[right]:
             off = 1000 * (sides[left] - sides[right])
-            far.append((f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': exchanged folders?", 0.0))
+            far.append(
+                (
+                    f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': exchanged folders?",
+                    0.0,
+                )
+            )
     return far
 
 
@@ -317,11 +450,15 @@ def _apart(angle, distance):
 
 
 def places_of_cameras(solution):
-    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it here."""
+    """Where the cameras of a JointSolution stand, in words: who mixed up their folders sees it
+    here.
+    """
     words = []
     for camera in solution.transforms:
         x, y, z = 1000 * _seat(solution, camera)
         sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
         places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
-        words.append(f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder.")
+        words.append(
+            f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder."
+        )
     return words
