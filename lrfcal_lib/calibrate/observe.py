@@ -444,7 +444,10 @@ def rough_poses(prepared):
             off = f"its plane is {1000 * max(miss.values()):.0f} mm rms off the"
             words = f"camera {wrong[0]}: {off} scan"
             if len(wrong) == len(miss) > 1:
-                words = f"scan: {off} board in the images of all {len(miss)} cameras ({_causes(prepared, placement)})"
+                words = (
+                    f"scan: {off} board in the images of all {len(miss)} cameras "
+                    f"({_causes(prepared, placement)})"
+                )
             problems[placement] = f"{words}; left out"
     return rough, problems
 
@@ -454,7 +457,10 @@ def _causes(prepared, placement):
     causes = "another surface, mixed readings"
     views = {camera: {placement: seen[placement]} for camera, seen in prepared.views.items() if placement in seen}
     if small_squares(views, prepared.board.pattern):
-        causes += f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
+        causes += (
+            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be "
+            "biased"
+        )
     return causes
 
 

@@ -41,8 +41,10 @@ LAPSE = 0.01  # share of beams about an edge that something else than the edge d
 PITCH_POINTS = 300  # of a placement's face, for the errors of its pitch
 ASSUMED = np.radians(10.0), 0.1  # how well an axis is known that nothing tells
 UNKNOWN_AXIS = (
-    "the tilt axis is neither stated nor determined by the sweeps, and taken to lie along x through the mirror: state "
-    "the platform in session.json, or record sweeps of straight edges and images at several pitch angles"
+    "the tilt axis is neither stated nor determined by the sweeps, and taken to lie along x "
+    "through the mirror: state "
+    "the platform in session.json, or record sweeps of straight edges and images at several "
+    "pitch angles"
 )
 LEAST_SIDES = 8  # of all placements, for a spread of the edge bias from side to side
 
@@ -617,10 +619,14 @@ def views_of(calibration, method, placement):
     if records and not views:
         asked = ", ".join(sorted({record.camera for record in records}))
         known = ", ".join(posed) or "no camera"
-        why = f"they are of {asked}, the calibration by '{method}' poses {known}: take that of the same rig"
+        why = (
+            f"they are of {asked}, the calibration by '{method}' poses {known}: take that of the "
+            "same rig"
+        )
         if {record.camera for record in records} & set(posed):
             why = "of none is the pitch known: state pitch_deg in images.csv"
         raise ValueError(
-            f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; {why}"
+            f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "
+            f"{why}"
         )
     return views

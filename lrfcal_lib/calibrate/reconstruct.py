@@ -27,7 +27,10 @@ SIGMAS = 2.2  # by which a reading must miss the surfaces on both sides
 ROUGH = 1.2  # residuals of the planes that readings lie on, standard deviations of a range
 GAIN_POINTS = 30_000  # that compare the exposures of images
 FRAME = "frame: platform (x = tilt axis, y ahead, z up at pitch 0)"
-UNITS = "units: metres, radians; sigma in metres, image is the number of the image that counts most (-1: none)"
+UNITS = (
+    "units: metres, radians; sigma in metres, image is the number of the image that counts most "
+    "(-1: none)"
+)
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # of pairs of neighbours: lines and beams
 
 
@@ -70,7 +73,10 @@ class Cloud:
 
     def __repr__(self):
         share = 100 * self.seen.mean() if len(self.seen) else 0.0
-        return f"Cloud({len(self.points)} points of {len(set(self.placement))} placements, {share:.1f} % coloured)"
+        return (
+            f"Cloud({len(self.points)} points of {len(set(self.placement))} placements, "
+            f"{share:.1f} % coloured)"
+        )
 
     def rows(self, index):
         """Some of the points."""
@@ -288,7 +294,8 @@ def reconstruct(sweep, views, T_head_lrf, corrections, *, lrf, continuous=False,
     """
     if not np.isfinite(sweep.ranges).any():
         raise ValueError(
-            f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no range)"
+            f"placement {sweep.placement}: an empty sweep ({len(sweep.ranges)} scan lines, no "
+            "range)"
         )
     ends, view = (
         np.degrees([min(v), max(v)]).round(2) for v in (sweep.bearings, lrf.field_of_view)
@@ -300,7 +307,8 @@ def reconstruct(sweep, views, T_head_lrf, corrections, *, lrf, continuous=False,
             f"bearings {ends[0]} to {ends[1]} deg, '{lrf.model}' sees {view[0]} to {view[1]} deg"
         )
         raise ValueError(
-            f"placement {sweep.placement}: {words}: take the calibration of the rig that recorded it"
+            f"placement {sweep.placement}: {words}: take the calibration of the rig that "
+            "recorded it"
         )
     turns = np.abs(np.diff(sweep.pitch))
     steps = float(np.median(turns[turns > 0])) if turns.any() else 0.0, lrf.bearing_step

@@ -380,7 +380,10 @@ def other_sense(joint):
             and not again.unobservable
             and better > (BETTER if plausible(joint.solution) else 1.0)
         ):
-            return f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} times as well then"
+            return (
+                f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} "
+                "times as well then"
+            )
     return ""
 
 
@@ -395,7 +398,10 @@ def far_from_stated(joint):
     session = joint.prepared.session
     solution = joint.solution
     far = []
-    why = "check its statement; bearings or pitch of the other sense, or exchanged folders of cameras look like this"
+    why = (
+        "check its statement; bearings or pitch of the other sense, or exchanged folders of "
+        "cameras look like this"
+    )
     if session.T_head_lrf is not None and joint.settings["axis"]:
         found = axis_difference(solution.axis, axis_of(session.T_head_lrf))
         own = np.sqrt(np.diag(solution.covariance("axis_", "offset_")).reshape(2, 2).sum(axis=1))
@@ -423,7 +429,8 @@ def far_from_stated(joint):
         elif nearest != camera:
             far.append(
                 (
-                    f"camera '{camera}' stands where camera '{nearest}' is said to stand: exchanged folders?",
+                    f"camera '{camera}' stands where camera '{nearest}' is said to stand: "
+                    "exchanged folders?",
                     turn,
                 )
             )
@@ -433,7 +440,8 @@ def far_from_stated(joint):
             off = 1000 * (sides[left] - sides[right])
             far.append(
                 (
-                    f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': exchanged folders?",
+                    f"camera '{left}' sits {off:.0f} mm to the right of camera '{right}': "
+                    "exchanged folders?",
                     0.0,
                 )
             )
@@ -459,6 +467,7 @@ def places_of_cameras(solution):
         sides = ((x, "right", "left"), (y, "before", "behind"), (z, "above", "below"))
         places = [f"{abs(v):.0f} mm {names[int(v < 0)]}" for v, *names in sides]
         words.append(
-            f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the range finder."
+            f"Seen along the middle beam, camera '{camera}' sits {', '.join(places)} of the "
+            "range finder."
         )
     return words

@@ -216,7 +216,8 @@ def likeliest_step(solution):
     A score test with all that was estimated free. Where placements scatter more than their noise
     explains, the statistic is measured by their scatter.
     """
-    unknowns, placements = solution.unknowns, len(solution.observations.placements)
+    unknowns = solution.unknowns
+    placements = len(solution.observations.placements)
     last = placements - BESIDE
     if last < BESIDE or not unknowns.poses or not len(solution.observations.cameras):
         return None
@@ -283,7 +284,8 @@ def with_two_poses(obs, step, name):
 
 def change_between(solution, first, later, camera, prepared):
     """The CameraChange between two poses of a camera, which `solution` knows by these names."""
-    obs, model = solution.observations, prepared.models[camera]
+    obs = solution.observations
+    model = prepared.models[camera]
     index = obs.cameras.index(later)
     change = solution.transforms[later] * solution.transforms[first].inv()
     shift = solution.transforms[later].translation - solution.transforms[first].translation
@@ -328,7 +330,8 @@ def growth_of_focal_length(prepared, camera, placement):
         return unknown
     points = raised_points(prepared.board.pattern, prepared.relief)
     model = prepared.models[camera]
-    lengths, spreads = [], []
+    lengths = []
+    spreads = []
     for later in (False, True):
         views = [
             view
@@ -350,7 +353,8 @@ def growth_by_depth(solution, camera):
 
     A score test with all that was estimated free: who magnifies sees boards nearer than they are.
     """
-    unknowns, obs = solution.unknowns, solution.observations
+    unknowns = solution.unknowns
+    obs = solution.observations
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
     levels = solution.data.levels

@@ -146,7 +146,8 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
     list of Fault
         Those of the files first; harmless ones are left out.
     """
-    prepared, joint = calibration.prepared, calibration.joint
+    prepared = calibration.prepared
+    joint = calibration.joint
     session = prepared.session
     found = [fault for fault in faults_of_files(session) if not fault.harmless]
     found += dark_images(session)
@@ -159,7 +160,8 @@ def recording_faults(calibration: Calibration) -> list[Fault]:
 
 def changes_of_cameras(calibration):
     """The CameraChanges of a Calibration, also where its joint estimate explains nothing."""
-    prepared, joint = calibration.prepared, calibration.joint
+    prepared = calibration.prepared
+    joint = calibration.joint
     changes = [] if joint is None else camera_changes(joint.solution, prepared, joint.settings)
     if changes or explains(joint):
         return changes
@@ -268,7 +270,8 @@ def plane_observations(prepared, camera, reading):
         mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
         poses = mirror @ poses @ mirror
 
-    points, placements = [np.zeros((0, 3))], [np.zeros(0, int)]
+    points = [np.zeros((0, 3))]
+    placements = [np.zeros(0, int)]
     for placement in views.keys() & prepared.scans.keys():
         image_pitch = 0.0
         if mount == "head":
@@ -383,7 +386,8 @@ def _moved(change):
 
 def exchanged_placements(calibration):
     """Pairs of placements that are left out, and whose images fit the scans of each other."""
-    prepared, joint = calibration.prepared, calibration.joint
+    prepared = calibration.prepared
+    joint = calibration.joint
     session = prepared.session
     lost = [
         p
@@ -413,7 +417,8 @@ def exchanged_placements(calibration):
 
 def _same_board(calibration, scan, placement):
     """Whether a BoardScan shows the board where all images of a placement put it."""
-    prepared, solution = calibration.prepared, calibration.joint.solution
+    prepared = calibration.prepared
+    solution = calibration.joint.solution
     board = prepared.board
     corners = board.pattern.points() if board.corners is None else board.corners
     middle = corners.mean(axis=0)[:2]

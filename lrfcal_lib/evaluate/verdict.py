@@ -1,4 +1,6 @@
-"""Can this calibration be trusted, for what error, and what to record next: the first page of a report."""
+"""Can this calibration be trusted, for what error, and what to record next: the first page of a
+report.
+"""
 
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -18,28 +20,51 @@ from lrfcal_lib.evaluate.alternatives import (
     places_of_cameras,
 )
 from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
-from lrfcal_lib.evaluate.next_placement import Suggestion, brief, group_sigma, outline, suggest_placement
+from lrfcal_lib.evaluate.next_placement import (
+    Suggestion,
+    brief,
+    group_sigma,
+    outline,
+    suggest_placement,
+)
 from lrfcal_lib.evaluate.recording_faults import explained, recording_faults
 from lrfcal_lib.evaluate.tables import placements_table
-from lrfcal_lib.evaluate.uncertainty import COLUMNS, Chain, chain_of, point_sigma, projection_sigma, range_noise
+from lrfcal_lib.evaluate.uncertainty import (
+    COLUMNS,
+    Chain,
+    chain_of,
+    point_sigma,
+    projection_sigma,
+    range_noise,
+)
 from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.planes import rival_words
 
-YES, CARE, NO = "yes", "with care", "no"
-FIRST = {YES: "This calibration can be trusted", CARE: "Use this calibration with care",
-         NO: "This calibration cannot be trusted"}  # fmt: skip
+YES = "yes"
+CARE = "with care"
+NO = "no"
+FIRST = {
+    YES: "This calibration can be trusted",
+    CARE: "Use this calibration with care",
+    NO: "This calibration cannot be trusted",
+}
 DISTANCES = (1.0, 2.0, 5.0)  # metres
-FEWEST, FEW, MANY = 3, 6, 12  # placements: too few, few, enough to know their scatter
+# placements: too few, few, enough to know their scatter
+FEWEST = 3
+FEW = 6
+MANY = 12
 PARALLEL = np.radians(6.0)  # normals of the boards about their mean
 SAME_DISTANCE = 0.12  # range of the distances, relative to their median
 SMALL_PITCH = np.radians(3.0)  # range of the recorded pitch
 SMALL_IMAGE_PITCH = np.radians(2.0)  # range within a placement of images of a camera on the head
 MISFIT = 4.0  # normalised squared residual, relative to the median placement's
 MODEL_ERROR = 2.5  # scatter over placements, in standard deviations of the noise
-STATED, ABSURD = 2.5, 10.0  # residuals in units of the stated noise: worth a word, and not that noise at all
+# residuals in units of the stated noise: worth a word, and not that noise at all
+STATED = 2.5
+ABSURD = 10.0
 DEPENDENT = 0.2  # share of independent errors: sigma comes from a fifth of the ranges only
 CONTRADICTS = 3.0  # standard deviations beyond which a difference is none of chance
 LARGE = {"squares": 0.02, "ranges": 0.02}  # errors of sizes that no estimate survives
@@ -47,29 +72,38 @@ LARGE_SCALE = 0.01  # of the pitch
 RIM = 0.95  # of the radius of a spot: no share of it is left to flip a reading
 LOST = 0.1  # share of the placements that may be left out without a warning
 SIZES = (
-    "check the stated size of the board and of the squares of its chessboard (expected errors count this as an error "
+    "check the stated size of the board and of the squares of its chessboard (expected errors "
+    "count this as an error "
     "of every range)"
 )
 POOR = {"mm": 10.0, "px": 5.0}  # at 2 m
 BAD = {"mm": 50.0, "px": 25.0}
 BEARINGS = np.radians(np.linspace(60, 120, 7))
-LEAST_FIELD = np.radians(10.0)  # errors are judged at least this far up and down from the middle of the sweeps
+# errors are judged at least this far up and down from the middle of the sweeps
+LEAST_FIELD = np.radians(10.0)
 MOST = 0.5  # share of the scans across an edge: where so many lie elsewhere, its statement does
 LEFT_OUT = 0.2  # share of the placements that is a finding of its own
 RECORD = (
-    f"Record next: {FEW} or more placements that all cameras see, the board leaning every way by 20 deg and more, at "
+    f"Record next: {FEW} or more placements that all cameras see, the board leaning every way by "
+    "20 deg and more, at "
     "several distances, with a sweep over its edges and images at several pitch angles each."
 )
-REGIONS = [" ".join(both).strip() or "middle" for both in product(("top", "", "bottom"), ("left", "", "right"))]
+REGIONS = [
+    " ".join(both).strip() or "middle"
+    for both in product(("top", "", "bottom"), ("left", "", "right"))
+]
 NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
-SAID = ("not converged", "the data do not determine")  # warnings of the solver that are findings of their own
+# warnings of the solver that are findings of their own
+SAID = ("not converged", "the data do not determine")
 
 NO_BOUND = {"mm": 1e4, "px": 1e4}  # ten metres; more pixels than an image has
 
 LIES = {
-    "as recorded": {}, "squares 5 % too small": {"squares": -0.05},
-    "all sizes 5 % too large": {"outline": 0.05, "squares": 0.05}, "angular step 3 % too large": {"bearings": 0.03},
-}  # fmt: skip
+    "as recorded": {},
+    "squares 5 % too small": {"squares": -0.05},
+    "all sizes 5 % too large": {"outline": 0.05, "squares": 0.05},
+    "angular step 3 % too large": {"bearings": 0.03},
+}
 
 
 @dataclass(frozen=True)
@@ -80,10 +114,11 @@ class Reason:
     ----------
     answer : {'with care', 'no'}
     kind : str
-        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from stated', 'sense', of
-        :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'not weighed', 'convergence', 'unobservable', 'cameras',
-        'lens', 'second minimum', 'placements', 'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded',
-        'model error', 'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
+        A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from
+        stated', 'sense', of :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'not weighed',
+        'convergence', 'unobservable', 'cameras', 'lens', 'second minimum', 'placements',
+        'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error',
+        'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
     words : str
     """
 
@@ -102,14 +137,17 @@ class Verdict:
     reasons : tuple of Reason
         The worst first; empty for 'yes'.
     errors : dict of float to dict of str to float
-        By distance in metres: 'cloud_mm' and, by camera, '<camera>_px', one standard deviation (root mean square over
-        the field), errors of the model included as far as they scatter over placements; inf where nothing bounds them.
+        By distance in metres: 'cloud_mm' and, by camera, '<camera>_px', one standard deviation
+        (root mean square over the field), errors of the model included as far as they scatter over
+        placements; inf where nothing bounds them.
     regions : dict of str to dict of str to float
-        By camera and ninth of its image ('top left', 'top', ..., 'middle'): pixels at 2 m; NaN where no scan reaches.
+        By camera and ninth of its image ('top left', 'top', ..., 'middle'): pixels at 2 m; NaN
+        where no scan reaches.
     range_noise_mm : float
         Of every single point, on top.
     sweep_mm : float
-        What the pitch error that every sweep has of its own adds to the cloud at 2 m; 0 where not estimated.
+        What the pitch error that every sweep has of its own adds to the cloud at 2 m; 0 where not
+        estimated.
     suggestion : Suggestion or None
     no_suggestion : str
         Why there is none.
@@ -129,8 +167,14 @@ class Verdict:
 
     def record(self):
         """Answer, reasons and expected errors, ready for JSON."""
-        reasons, errors = [vars(reason) for reason in self.reasons], {f"{d:g}": e for d, e in self.errors.items()}
-        found = {"answer": self.answer, "reasons": reasons, "notes": self.notes, "expected_error_at_m": errors}
+        reasons = [vars(reason) for reason in self.reasons]
+        errors = {f"{d:g}": e for d, e in self.errors.items()}
+        found = {
+            "answer": self.answer,
+            "reasons": reasons,
+            "notes": self.notes,
+            "expected_error_at_m": errors,
+        }
         return found | {"expected_px_at_2_m": self.regions}
 
     def sentences(self):
@@ -145,11 +189,16 @@ class Verdict:
         out += self.notes
         if self.errors:
             out.append(
-                "These are single standard deviations of the calibration, with errors of the model as they show "
-                f"between placements; each range has {brief(self.range_noise_mm)} mm of noise of its own."
+                "These are single standard deviations of the calibration, with errors of the "
+                "model as they show "
+                f"between placements; each range has {brief(self.range_noise_mm)} mm of noise of "
+                "its own."
             )
         if self.sweep_mm:
-            out.append(f"Of the cloud's error at 2 m, {brief(self.sweep_mm)} mm come from the pitch of single sweeps.")
+            out.append(
+                f"Of the cloud's error at 2 m, {brief(self.sweep_mm)} mm come from the pitch of "
+                "single sweeps."
+            )
         out.append(self.suggestion.sentence() if self.suggestion else self.no_suggestion)
         return [sentence for sentence in out if sentence]
 
@@ -159,7 +208,9 @@ def _error_words(errors):
     for name, value in errors.items():
         what, unit = name.rsplit("_", 1)
         where = "in the cloud" if what == "cloud" else f"in the image of '{what}'"
-        words.append(f"{brief(value)} {unit} {where}" if np.isfinite(value) else f"no bound {where}")
+        words.append(
+            f"{brief(value)} {unit} {where}" if np.isfinite(value) else f"no bound {where}"
+        )
     return ", ".join(words)
 
 
@@ -174,7 +225,8 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     suggest : bool
         Also look for the next placement.
     doubt : float
-        By how much all ranges may be wrong beside what the estimate knows, metres; see :func:`contradicts_stated`.
+        By how much all ranges may be wrong beside what the estimate knows, metres; see
+        :func:`contradicts_stated`.
     **options
         Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
     """
@@ -182,27 +234,42 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
     pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
     found = _expected(chains, models, pitch, range_noise(solution), diagnose(solution), doubt)
     try:
-        return replace(found, suggestion=suggest_placement(solution, models, **options) if suggest else None)
+        return replace(
+            found, suggestion=suggest_placement(solution, models, **options) if suggest else None
+        )
     except DegenerateGeometry as error:
         return replace(found, no_suggestion=f"No placement can be suggested: {error}.")
 
 
 def _expected(chains, models, pitch, noise, reasons, doubt):
-    """A verdict by reasons and by the errors that are to be expected over the recorded pitch (not a narrow strip)."""
-    # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have taken it up
+    """A verdict by reasons and by the errors that are to be expected over the recorded pitch
+    (not a narrow strip).
+    """
+    # boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places have
+    # taken it up
     unsure = np.diag([doubt**2 * (name in ("range_offset", *POSE_NAMES[3:])) for name in COLUMNS])
-    chains = {k: replace(v, covariances=tuple(C + unsure for C in v.covariances)) for k, v in chains.items()}
+    chains = {
+        k: replace(v, covariances=tuple(C + unsure for C in v.covariances))
+        for k, v in chains.items()
+    }
     low, high = (pitch.min(), pitch.max()) if len(pitch) else (0.0, 0.0)
     middle = (low + high) / 2
     field = min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD)
-    cloud = point_sigma(chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2)
+    cloud = point_sigma(
+        chains[None], BEARINGS, np.linspace(*field, 9), DISTANCES, reference=sum(field) / 2
+    )
     looks = {"image_pitch": sum(field) / 2, "pitches": field}
     seen = {
         camera: projection_sigma(chain, camera, models[camera], DISTANCES, (12, 9), **looks)
-        for camera, chain in chains.items() if camera is not None
-    }  # fmt: skip
-    maps = {"cloud_mm": 1000 * cloud.rms()} | {f"{camera}_px": found.rms() for camera, found in seen.items()}
-    regions = {camera: _regions(found.sigma[DISTANCES.index(2.0)]) for camera, found in seen.items()}
+        for camera, chain in chains.items()
+        if camera is not None
+    }
+    maps = {"cloud_mm": 1000 * cloud.rms()} | {
+        f"{camera}_px": found.rms() for camera, found in seen.items()
+    }
+    regions = {
+        camera: _regions(found.sigma[DISTANCES.index(2.0)]) for camera, found in seen.items()
+    }
     errors = {}
     for i, distance in enumerate(DISTANCES):
         errors[distance] = bounded({name: float(rms[i]) for name, rms in maps.items()})
@@ -212,7 +279,9 @@ def _expected(chains, models, pitch, noise, reasons, doubt):
         words = f"the expected error at 2 m is {_error_words(large)}"
         reasons = [*reasons, Reason(NO if bad else CARE, "error", words)]
     sweep = 1000 * float(np.sqrt(np.mean(cloud.parts["sweep"][DISTANCES.index(2.0)] ** 2)))
-    return _answered(Verdict(YES, (), errors, 1000 * float(noise), sweep, None, regions=regions), reasons)
+    return _answered(
+        Verdict(YES, (), errors, 1000 * float(noise), sweep, None, regions=regions), reasons
+    )
 
 
 def bounded(errors):
@@ -225,7 +294,10 @@ def _regions(sigma):
     """Root mean square of a map (rows, columns) over the ninths of an image, by their names."""
     parts = [part for rows in np.array_split(sigma, 3) for part in np.array_split(rows, 3, axis=1)]
     known = [part[~np.isnan(part)] for part in parts]
-    return {n: float(np.sqrt(np.mean(p**2))) if p.size else np.nan for n, p in zip(REGIONS, known, strict=True)}
+    return {
+        n: float(np.sqrt(np.mean(p**2))) if p.size else np.nan
+        for n, p in zip(REGIONS, known, strict=True)
+    }
 
 
 def _answered(found, reasons):
@@ -236,48 +308,75 @@ def _answered(found, reasons):
 
 
 def judge(calibration, method=None, **options):
-    """Judge what a calibration hands over, by itself and by what became of the recording: a :class:`Verdict`.
+    """Judge what a calibration hands over, by itself and by what became of the recording: a
+    :class:`Verdict`.
 
-    'no' without errors, and with what to record, where nothing is handed over. `method` is that whose camera poses are
-    handed over, as :func:`lrfcal_lib.calibrate.pipeline.handed_over` says when left out; options of :func:`verdict`
-    (what the LRF sees and the board's features are known).
+    'no' without errors, and with what to record, where nothing is handed over. `method` is that
+    whose camera poses are handed over, as :func:`lrfcal_lib.calibrate.pipeline.handed_over` says
+    when left out; options of :func:`verdict` (what the LRF sees and the board's features are
+    known).
     """
-    prepared, joint = calibration.prepared, calibration.joint
-    lens = [Reason(NO if OTHER_SIZE in words else CARE, "lens", words) for words in lens_words(prepared).values()]
+    prepared = calibration.prepared
+    joint = calibration.joint
+    lens = [
+        Reason(NO if OTHER_SIZE in words else CARE, "lens", words)
+        for words in lens_words(prepared).values()
+    ]
     faults = recording_faults(calibration)
-    lens = [Reason(NO if fault.severe else CARE, fault.kind, fault.words) for fault in faults] + lens
+    lens = [
+        Reason(NO if fault.severe else CARE, fault.kind, fault.words) for fault in faults
+    ] + lens
     # also where the joint estimate is not handed over: a wrong size may be why
     sizes, doubt = ([], 0.0) if joint is None or explained(faults) else contradicts_stated(joint)
     method = method or handed_over(calibration)
     if method is None:
-        refused, lost = Reason(NO, "handed over", _refusal(calibration)), problem_words(prepared.problems)
+        refused = Reason(NO, "handed over", _refusal(calibration))
+        lost = problem_words(prepared.problems)
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",) if lost else ()
-        return replace(_answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]), notes=notes)
+        return replace(
+            _answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]),
+            notes=notes,
+        )
     if method == "joint":
-        found = verdict(joint.solution, prepared.models, doubt=doubt, **sight_of(prepared) | options)
+        found = verdict(
+            joint.solution, prepared.models, doubt=doubt, **sight_of(prepared) | options
+        )
     else:
         found = _without_joint(calibration, method, doubt)
     reasons, words = _left_out(calibration, method)
     reasons += sides_elsewhere(prepared)
-    if any("placements are left out" in reason.words for reason in reasons):  # with words of what was excluded
+    # with words of what was excluded
+    if any("placements are left out" in reason.words for reason in reasons):
         found = replace(found, reasons=tuple(r for r in found.reasons if r.kind != "excluded"))
     axis = calibration.platform.axis_with(method)
     places = places_of_cameras(joint.solution) if method == "joint" else []
-    notes = (f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.", *places, words)
+    notes = (
+        f"Handed over: the cameras of the method '{method}' and the axis '{axis}'.",
+        *places,
+        words,
+    )
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
-        known, within = 100 / np.sqrt(2 * (n - 1)), stdtrit(n - 1, 0.95)
+        known = 100 / np.sqrt(2 * (n - 1))
+        within = stdtrit(n - 1, 0.95)
         words = f"The scatter over {n} placements is itself known to {known:.0f} % only"
-        notes += (f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",)
+        notes += (
+            f"{words}: 90 % of errors lie within {within:.1f} of its standard deviations, not 1.6.",
+        )
     return replace(_answered(found, lens + sizes + reasons), notes=notes)
 
 
 def _refusal(calibration):
-    """Why nothing can be handed over: what keeps the joint estimate, or else every camera, from an answer."""
-    prepared, problems = calibration.prepared, calibration.problems
+    """Why nothing can be handed over: what keeps the joint estimate, or else every camera, from
+    an answer.
+    """
+    prepared = calibration.prepared
+    problems = calibration.problems
     why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
     if not prepared.views:
         why = prepared.problems.get("images", "the session has no camera")
-        why += "; the tilt axis is known from the edges in the sweeps" * bool(calibration.platform.solutions)
+        why += "; the tilt axis is known from the edges in the sweeps" * bool(
+            calibration.platform.solutions
+        )
     return f"nothing can be handed over: {why}"
 
 
@@ -290,28 +389,50 @@ def sight_of(prepared):
 
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
-    prepared, problems, joint = calibration.prepared, calibration.problems, calibration.joint
-    solved = {camera: found for (camera, name), found in calibration.solutions.items() if name == method}
-    bad = [] if joint is None else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
+    prepared = calibration.prepared
+    problems = calibration.problems
+    joint = calibration.joint
+    solved = {
+        camera: found for (camera, name), found in calibration.solutions.items() if name == method
+    }
+    bad = (
+        []
+        if joint is None
+        else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
+    )
     why = "; ".join(bad) or problems.get(("rig", "joint"), "another method was asked for")
     answer = NO if joint is None or not joint.solution.converged else CARE
     reasons = [Reason(answer, "handed over", f"the joint estimate is not handed over ({why})")]
-    fewest = min(len(calibration.observations[camera, "half_step"].all_placements) for camera in solved)
+    fewest = min(
+        len(calibration.observations[camera, "half_step"].all_placements) for camera in solved
+    )
     if fewest < FEW:
-        reasons.append(Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed"))
+        reasons.append(
+            Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed")
+        )
     lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
-    reasons += [Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})") for c, why in lost.items()]
+    reasons += [
+        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})")
+        for c, why in lost.items()
+    ]
     reasons += [
         Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
-        for camera, found in solved.items() if found.rival is not None
-    ]  # fmt: skip
+        for camera, found in solved.items()
+        if found.rival is not None
+    ]
     unknown = calibration.platform.problems.get("combined")
-    if unknown and any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()):
+    if unknown and any(
+        np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()
+    ):
         reasons.append(Reason(NO, "far from stated", unknown))
     # the range offset of the cloud may be what the maker admits
-    platform, session, unseen = calibration.platform, prepared.session, np.zeros((0, len(COLUMNS)))
-    rest, admitted = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch)), session.lrf.admitted_offset
-    head, offset = pose_array(platform.transform("combined")), np.diag([admitted**2, 0.0, 0.0])
+    platform = calibration.platform
+    session = prepared.session
+    unseen = np.zeros((0, len(COLUMNS)))
+    rest = (unseen, (prepared.pitch_noise.offset, prepared.pitch_noise.stretch))
+    admitted = session.lrf.admitted_offset
+    head = pose_array(platform.transform("combined"))
+    offset = np.diag([admitted**2, 0.0, 0.0])
     sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
@@ -324,18 +445,24 @@ def _without_joint(calibration, method, doubt):
 
 
 def contradicts_stated(joint):
-    """Reasons to doubt what session.json states, and by how much all ranges are off if a size is wrong (metres).
+    """Reasons to doubt what session.json states, and by how much all ranges are off if a size is
+    wrong (metres).
 
-    What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the scale of the pitch.
+    What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the
+    scale of the pitch.
     """
-    lrf, reasons, doubt = joint.prepared.session.lrf, [], 0.0
+    lrf = joint.prepared.session.lrf
+    reasons = []
+    doubt = 0.0
     level = joint.solution.noise["face_scale"]
     hopeless = not alternatives.plausible(joint.solution) or level > ABSURD
-    if hopeless and (words := alternatives.other_sense(joint)):  # what else is found wrong comes from that
+    # what else is found wrong comes from that
+    if hopeless and (words := alternatives.other_sense(joint)):
         return [Reason(NO, "sense", words)], doubt
     if not joint.solution.converged:
         return [Reason(NO, "not weighed", f"{NOT_WEIGHED}: the estimate has not converged")], doubt
-    offset, admitted = joint.solution.sensor["range_offset"], lrf.admitted_offset
+    offset = joint.solution.sensor["range_offset"]
+    admitted = lrf.admitted_offset
     sigma = joint.solution.sigma
     margin = CONTRADICTS * sigma.get("range_offset", 0.0)
     asked, instead = _asked(joint)
@@ -345,27 +472,41 @@ def contradicts_stated(joint):
         reasons.append(Reason(NO, "not weighed", f"{NOT_WEIGHED}: {why}"))
     if asked:
         best = asked[0]
-        large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(best.kind, np.inf)
+        large = best.ratio > (2 * CONTRADICTS) ** 2 and abs(best.value) > LARGE.get(
+            best.kind, np.inf
+        )
         words = f"statements contradict the data: {'; or '.join(doubt.words for doubt in asked)}"
         reasons.append(Reason(NO if large else CARE, best.kind, words))
         off = max((abs(found.value) for found in asked if found.kind in LARGE), default=0.0)
         doubt = max(doubt, off * float(np.median(joint.solution.observations.face_range)))
     if abs(offset) > admitted + margin and instead not in asked:
         words = (
-            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm that are admitted of "
-            f"the range finder (session.json may state systematic_error_m): {SIZES}; the unit of the ranges; the "
+            f"the range offset of {1000 * offset:.0f} mm is beyond the {1000 * admitted:.0f} mm "
+            "that are admitted of "
+            f"the range finder (session.json may state systematic_error_m): {SIZES}; the unit of "
+            "the ranges; the "
             "angular step"
         )
-        reasons.append(Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words))
+        reasons.append(
+            Reason(NO if abs(offset) > 2 * admitted + margin else CARE, "range offset", words)
+        )
         doubt = max(doubt, abs(offset))
     if abs(bias := joint.solution.edge_bias) > RIM:
-        words = f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius outside the edges)"
-        words = f"{words}: state spot_exit_m and spot_divergence_rad as they are, or measure the board's edges"
+        words = (
+            f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius "
+            "outside the edges)"
+        )
+        words = (
+            f"{words}: state spot_exit_m and spot_divergence_rad as they are, or measure the "
+            "board's edges"
+        )
         reasons.append(Reason(CARE, "spot", words))
-    scale, spread = joint.solution.sensor["pitch_scale"], sigma.get("pitch_scale", 0.0)
+    scale = joint.solution.sensor["pitch_scale"]
+    spread = sigma.get("pitch_scale", 0.0)
     if abs(scale) > max(CONTRADICTS * spread, LARGE_SCALE):
         words = (
-            f"the platform turns {100 * abs(scale):.1f} +- {100 * spread:.1f} % {'more' if scale > 0 else 'less'} than "
+            f"the platform turns {100 * abs(scale):.1f} +- {100 * spread:.1f} % "
+            f"{'more' if scale > 0 else 'less'} than "
             "its recorded pitch says: check its gear or encoder (the estimate has taken this off)"
         )
         reasons.append(Reason(CARE, "pitch scale", words))
@@ -375,9 +516,13 @@ def contradicts_stated(joint):
 
 
 def _asked(joint):
-    """Statements that the data contradict (Doubts), and one that stands for a range offset, which may be of them."""
+    """Statements that the data contradict (Doubts), and one that stands for a range offset,
+    which may be of them.
+    """
     # many backgrounds of different distance tell of the spot, others where a wrong one does harm
-    many = len(joint.solution.boards) >= MANY and np.any(joint.solution.observations.beam_background)
+    many = len(joint.solution.boards) >= MANY and np.any(
+        joint.solution.observations.beam_background
+    )
     stated = alternatives_of(joint.prepared)
     admitted = joint.prepared.session.lrf.admitted_offset
     asked = doubtful(joint.solution, admitted, stated, faint=() if many else ("spot",))
@@ -386,18 +531,24 @@ def _asked(joint):
 
 
 def falsified(joint):
-    """Statements falsified on purpose, everything estimated again (JointCalibration): what is doubted first.
+    """Statements falsified on purpose, everything estimated again (JointCalibration): what is
+    doubted first.
 
     Columns falsified, range_offset_mm (that the estimate finds), doubted (words).
     """
-    rows, stated = [], alternatives_of(joint.prepared)
+    rows = []
+    stated = alternatives_of(joint.prepared)
     for name, sizes in LIES.items():
-        obs, offset = joint.observations, np.nan
+        obs = joint.observations
+        offset = np.nan
         for kind in (kind for kind in sizes if kind in stated):
             obs = stated[kind].change(obs, sizes[kind])
         try:
-            solution = solve_joint(obs, required=False, **joint.settings) if sizes else joint.solution
-            offset, reasons = solution.sensor["range_offset"], contradicts_stated(replace(joint, solution=solution))[0]
+            solution = (
+                solve_joint(obs, required=False, **joint.settings) if sizes else joint.solution
+            )
+            offset = solution.sensor["range_offset"]
+            reasons = contradicts_stated(replace(joint, solution=solution))[0]
             words = reasons[0].words if reasons else "nothing"
         except DegenerateGeometry as error:
             words = f"refused: {error}"
@@ -407,25 +558,38 @@ def falsified(joint):
 
 def _left_out(calibration, method):
     """All placements that the result does not rest on, counted and with their reasons."""
-    prepared, excluded = calibration.prepared, {}
+    prepared = calibration.prepared
+    excluded = {}
     table = placements_table(prepared, calibration.observations).set_index("placement")
     used = set(table.index[table.used]) - set(prepared.problems)
     if method == "joint":
-        used, excluded = set(calibration.joint.solution.boards), calibration.joint.solution.excluded
-    lost, reasons = [p for p in table.index if p not in used], []
+        used = set(calibration.joint.solution.boards)
+        excluded = calibration.joint.solution.excluded
+    lost = [p for p in table.index if p not in used]
+    reasons = []
     for camera, views in prepared.views.items():
         why = {p: views[p].reason if p in views else "no image" for p in table.index}
         unseen = [f"{p} ({words})" for p, words in why.items() if words]
         if len(unseen) > LEFT_OUT * len(table):
-            words = f"camera '{camera}' does not see the board in {len(unseen)} of {len(table)} placements"
+            words = (
+                f"camera '{camera}' does not see the board in {len(unseen)} of {len(table)} "
+                "placements"
+            )
             reasons.append(Reason(CARE, "left out", f"{words}: {', '.join(unseen)}"))
     large = len(lost) > LOST * len(table)
     every = prepared.problems | (excluded if large else {})
     parts = [words for key, words in every.items() if key not in table.index]
-    also = f"Parts left out beside whole placements: {len(parts)} ({'; '.join(parts)})." if parts else ""
+    also = (
+        f"Parts left out beside whole placements: {len(parts)} ({'; '.join(parts)})."
+        if parts
+        else ""
+    )
     if not lost:
         return reasons, f"All {len(table)} placements were used. {also}".strip()
-    why = [f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})" for p in lost]
+    why = [
+        f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})"
+        for p in lost
+    ]
     words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
     reasons += [Reason(CARE, "left out", words)] * large
     return reasons, f"{'' if large else f'{words}.'} {also}".strip()
@@ -453,13 +617,30 @@ def sides_elsewhere(prepared):
 
 def diagnose(solution):
     """Weaknesses of a JointSolution and of the recording behind it: list of Reason."""
-    iterations, obs = solution.solution.iterations, solution.observations
-    seen = [(len(np.unique(obs.view_placement[obs.view_camera == i])), c) for i, c in enumerate(obs.cameras)]
+    iterations = solution.solution.iterations
+    obs = solution.observations
+    seen = [
+        (len(np.unique(obs.view_placement[obs.view_camera == i])), c)
+        for i, c in enumerate(obs.cameras)
+    ]
     own = [words for words in solution.warnings if not words.startswith(SAID)]
     findings = [
-        (not solution.converged, NO, "convergence", f"the estimate has not converged after {iterations} iterations"),
-        *((n < FEWEST, CARE, "cameras", f"camera '{c}' sees the board in {n} placements only") for n, c in seen),
-        (solution.unobservable, NO, "unobservable", f"the data do not determine {'; '.join(solution.unobservable)}"),
+        (
+            not solution.converged,
+            NO,
+            "convergence",
+            f"the estimate has not converged after {iterations} iterations",
+        ),
+        *(
+            (n < FEWEST, CARE, "cameras", f"camera '{c}' sees the board in {n} placements only")
+            for n, c in seen
+        ),
+        (
+            solution.unobservable,
+            NO,
+            "unobservable",
+            f"the data do not determine {'; '.join(solution.unobservable)}",
+        ),
         *_of_placements(solution),
         *_of_residuals(solution),
         *((True, CARE, "warning", words) for words in own),
@@ -469,12 +650,16 @@ def diagnose(solution):
 
 def _of_placements(solution):
     """What is weak about the recorded poses: rows of whether, answer, kind and words."""
-    obs, boards, n = solution.observations, solution.state.boards, len(solution.boards)
+    obs = solution.observations
+    boards = solution.state.boards
+    n = len(solution.boards)
     head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
-    turned, shown = obs.view_pitch[head], obs.view_placement[head]
+    turned = obs.view_pitch[head]
+    shown = obs.view_placement[head]
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, turned])
     place = np.concatenate([obs.face_placement, obs.beam_placement, shown])
-    # the pitch shows the axis: of each placement, of the whole recording where a camera stands on the base
+    # the pitch shows the axis: of each placement, of the whole recording where a camera stands on
+    # the base
     within = "" if "platform" in obs.mounts else " within a placement"
     span = largest_range(pitch, place if within else 0 * place)
     axis = any(name in solution.solution.names for name in AXIS_NAMES)
@@ -484,18 +669,42 @@ def _of_placements(solution):
     middles = boards[:, :, :3] @ outline(solution).mean(axis=0) + boards[:, :, 3]
     distance = np.linalg.norm(middles - solution.T_head_lrf.translation, axis=1)
     return [
-        (n < FEW, NO if n < FEWEST else CARE, "placements",
-         f"{n} placements only, {FEW} or more are needed to see errors of the model"),
-        (axis and span < SMALL_PITCH, NO, "pitch",
-         f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{within}: the tilt axis is hardly determined"),
-        (axis and span >= SMALL_PITCH and flat, CARE, "image pitch",
-         "every placement has its images at one pitch: the tilt axis rests on the scans of small boards"),
-        (n > 1 and off < PARALLEL, CARE, "parallel",
-         f"all boards are parallel (within {np.degrees(off):.1f} deg): lean them every way by 20 deg and more"),
-        (n > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance), CARE, "distance",
-         f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): errors elsewhere are "
-         "extrapolated, and the range offset is hard to tell from shifts"),
-    ]  # fmt: skip
+        (
+            n < FEW,
+            NO if n < FEWEST else CARE,
+            "placements",
+            f"{n} placements only, {FEW} or more are needed to see errors of the model",
+        ),
+        (
+            axis and span < SMALL_PITCH,
+            NO,
+            "pitch",
+            f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{within}: the tilt "
+            "axis is hardly determined",
+        ),
+        (
+            axis and span >= SMALL_PITCH and flat,
+            CARE,
+            "image pitch",
+            "every placement has its images at one pitch: the tilt axis rests on the scans of "
+            "small boards",
+        ),
+        (
+            n > 1 and off < PARALLEL,
+            CARE,
+            "parallel",
+            f"all boards are parallel (within {np.degrees(off):.1f} deg): lean them every way by "
+            "20 deg and more",
+        ),
+        (
+            n > 1 and np.ptp(distance) < SAME_DISTANCE * np.median(distance),
+            CARE,
+            "distance",
+            f"all boards stand at one distance ({distance.min():.2f} to {distance.max():.2f} m): "
+            "errors elsewhere are "
+            "extrapolated, and the range offset is hard to tell from shifts",
+        ),
+    ]
 
 
 def noise_of_images(solution):
@@ -520,25 +729,51 @@ def noise_of_images(solution):
 
 
 def _of_residuals(solution):
-    """What residuals and their scatter say against the model: rows of whether, answer, kind and words."""
-    level, misfit = max(np.median([*solution.misfit.values()]), 1.0), solution.misfit.items()
-    misfits = ", ".join(f"{p} ({np.sqrt(z / level):.1f} times)" for p, z in misfit if z > MISFIT * level)
-    clustered, ratio, worst = solution.solution.covariance_placements, {"axis": 0.0}, "axis"
+    """What residuals and their scatter say against the model: rows of whether, answer, kind and
+    words.
+    """
+    level = max(np.median([*solution.misfit.values()]), 1.0)
+    misfit = solution.misfit.items()
+    misfits = ", ".join(
+        f"{p} ({np.sqrt(z / level):.1f} times)" for p, z in misfit if z > MISFIT * level
+    )
+    clustered = solution.solution.covariance_placements
+    ratio = {"axis": 0.0}
+    worst = "axis"
     if clustered is not None:
-        plain, scatter = (group_sigma(C, solution) for C in (solution.solution.covariance, clustered))
+        plain, scatter = (
+            group_sigma(C, solution) for C in (solution.solution.covariance, clustered)
+        )
         ratio = {name: scatter[name] / max(sigma, 1e-12) for name, sigma in plain.items()}
         worst = max(ratio, key=ratio.get)
     what = "the axis" if worst == "axis" else f"camera '{worst}'"
     noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
-    large = ", ".join(f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED)
-    share = solution.noise["face_share"]  # beams about an edge always repeat errors: they share a background
+    large = ", ".join(
+        f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED
+    )
+    # beams about an edge always repeat errors: they share a background
+    share = solution.noise["face_share"]
     return [
         (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
         (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
-        (ratio[worst] > MODEL_ERROR, CARE, "model error",
-         f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: an error of the model"),
-        (large, NO if max(noise.values()) > ABSURD else CARE, "noise",
-         f"residuals are larger than the stated noise ({large})"),
-        (share < DEPENDENT, CARE, "dependent", f"only {100 * share:.0f} % of the errors of ranges are independent: "
-         "neighbours err alike (boards that bend, a pitch that is off)"),
-    ]  # fmt: skip
+        (
+            ratio[worst] > MODEL_ERROR,
+            CARE,
+            "model error",
+            f"placements disagree about {what} {ratio[worst]:.1f} times more than noise "
+            "explains: an error of the model",
+        ),
+        (
+            large,
+            NO if max(noise.values()) > ABSURD else CARE,
+            "noise",
+            f"residuals are larger than the stated noise ({large})",
+        ),
+        (
+            share < DEPENDENT,
+            CARE,
+            "dependent",
+            f"only {100 * share:.0f} % of the errors of ranges are independent: "
+            "neighbours err alike (boards that bend, a pitch that is off)",
+        ),
+    ]

@@ -9,7 +9,12 @@ from scipy.special import polygamma
 
 from lrfcal_lib.model.camera import CameraModel
 
-AXIS_NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "offset_in_scan_plane", "offset_across_scan_plane")
+AXIS_NAMES = (
+    "axis_out_of_scan_plane",
+    "axis_in_scan_plane",
+    "offset_in_scan_plane",
+    "offset_across_scan_plane",
+)
 AXIS_WORDS = (
     "the tilt of the axis out of the scan plane",
     "the turn of the axis within the scan plane",
@@ -20,7 +25,10 @@ AXIS_WORDS = (
 
 @dataclass(frozen=True)
 class PlatformPrior:
-    """A rough measurement of the axis; standard deviations of its two angles (radians) and two offsets (metres)."""
+    """A rough measurement of the axis.
+
+    Standard deviations of its two angles (radians) and two offsets (metres).
+    """
 
     T_head_lrf: RigidTransform
     sigma_direction: float
@@ -36,21 +44,26 @@ class Solution:
     transform : RigidTransform or None
         The estimate (a stack of them for a batch of trials).
     parameters : ndarray, shape (..., k)
-        For a transform its rotation vector and translation (radians, metres), then whatever else was unknown.
+        For a transform its rotation vector and translation (radians, metres), then whatever else
+        was unknown.
     names : tuple of str, length k
     converged, iterations, cost_history
-        The last, shape (iterations + 1, ...): half the sum of squared whitened residuals (or of the loss).
+        The last, shape (iterations + 1, ...): half the sum of squared whitened residuals (or of the
+        loss).
     residuals, jacobian : ndarray, shapes (..., n) and (..., n, k)
-        Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]`` for a transform).
+        Whitened at the solution, without the robust weights; Jacobian by the increments (``[w, v]``
+        for a transform).
     weights : ndarray, shape (..., n)
         Robust weights, 1 without a loss.
     covariance : ndarray, shape (..., k, k)
-        Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the stated noise is too
-        small, and the covariance is multiplied by `inflation`, chi-square per degree of freedom; never shrunk below 1.
+        Of the increments, from the propagated noise. Where chi-square is above its 99.9 % limit the
+        stated noise is too small, and the covariance is multiplied by `inflation`, chi-square per
+        degree of freedom; never shrunk below 1.
     covariance_placements : ndarray, shape (..., k, k), or None
-        Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T`` where ``d_g`` is the
-        change of the estimate when placement g is left out. Model errors are common to one placement, which the first
-        covariance cannot know. None where one placement alone carries an unknown, or with fewer than three placements.
+        Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T``
+        where ``d_g`` is the change of the estimate when placement g is left out. Model errors are
+        common to one placement, which the first covariance cannot know. None where one placement
+        alone carries an unknown, or with fewer than three placements.
     n_placements : int
         G.
     unobservable : tuple of str
@@ -98,11 +111,16 @@ class Solution:
     def sigma_placements(self):
         """Standard deviations from `covariance_placements`, shape (..., k); NaN without."""
         found = self.covariance_placements
-        return np.full_like(self.sigma, np.nan) if found is None else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+        return (
+            np.full_like(self.sigma, np.nan)
+            if found is None
+            else np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+        )
 
     @property
     def trusted(self):
-        """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well something is known.
+        """Covariance to rely on, shape (..., k, k): the one rule for every statement of how well
+        something is known.
 
         That of the noise C, and where a parameter scatters more over placements than chance
         explains, as much more, C + h C h. What is added has the correlations of C: left and right
@@ -114,7 +132,9 @@ class Solution:
         full.
         """
         known = (self.sigma > 0) & np.isfinite(self.sigma)
-        ratio = np.divide(self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known)
+        ratio = np.divide(
+            self.sigma_placements, self.sigma, out=np.ones_like(self.sigma), where=known
+        )
         excess = 2 * np.log(np.fmax(ratio, 1.0))
         chance = polygamma(1, (self.n_placements - 1) / 2)
         believed = np.maximum(excess - chance / np.maximum(excess, 1e-9), 0.0)
@@ -128,5 +148,8 @@ class Solution:
         return np.sqrt(np.diagonal(self.trusted, axis1=-2, axis2=-1))
 
     def __repr__(self):
-        state = f"{'converged' if np.all(self.converged) else 'NOT converged'} after {self.iterations} iterations"
+        state = (
+            f"{'converged' if np.all(self.converged) else 'NOT converged'} after "
+            f"{self.iterations} iterations"
+        )
         return f"Solution({self.method}: {state}, {self.n_observations} observations)"

@@ -1,4 +1,6 @@
-"""One maximum-likelihood estimate of the whole rig from ranges, edges and images at all pitch angles."""
+"""One maximum-likelihood estimate of the whole rig from ranges, edges and images at all pitch
+angles.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -10,24 +12,42 @@ from lrfcal_lib.fit.least_squares import minimise, solve
 from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_parameters, pose_transform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    pose_array,
+    pose_parameters,
+    pose_transform,
+)
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
-from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images, start_states, state_of
+from lrfcal_lib.solvers.joint_start import (
+    FEWEST_ANGLE_POINTS,
+    boards_in_images,
+    start_states,
+    state_of,
+)
 from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
-START_STEPS, FIRST_STEPS, NOISE_ROUNDS, ROUND_STEPS, MOST_STEPS = 8, 60, 10, 10, 300
+START_STEPS = 8
+FIRST_STEPS = 60
+NOISE_ROUNDS = 10
+ROUND_STEPS = 10
+MOST_STEPS = 300
 OWN = ("boards", "sweeps", "sides")  # what every placement has of its own
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
-ROUGH_STEP, LAST_STEP = 1e-2, 1e-4  # standard deviations: a shorter step ends a round, and the whole
+# standard deviations: a shorter step ends a round, and the whole
+ROUGH_STEP = 1e-2
+LAST_STEP = 1e-4
 UNSEEN = 0.5  # a direction whose standard deviation exceeds this (rad, m) is called unobservable
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
 LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
-ROUGH_MISS, LAST_MISS = 0.08, 0.025  # metres, of a board from where images of it put it: of a start value, of the end
+# metres, of a board from where images of it put it: of a start value, of the end
+ROUGH_MISS = 0.08
+LAST_MISS = 0.025
 FAR_MISS = 5.0  # times the usual miss: an image puts the board elsewhere
 WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "range_offset": "the range offset",
@@ -51,13 +71,15 @@ class JointSolution:
     data, unknowns : JointData, Unknowns
         Padded observations with the noise levels used, and what was unknown; for `solvers` only.
     T_head_lrf : RigidTransform
-        In the gauge of the stated platform (rotation about the axis and shift along it cannot be observed).
+        In the gauge of the stated platform (rotation about the axis and shift along it cannot be
+        observed).
     transforms : dict of str to RigidTransform
         ``T_camera_lrf`` or ``T_camera_platform`` by camera.
     boards : dict of int to RigidTransform
         ``T_platform_board`` by placement.
     sensor : dict of str to float
-        Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by direction (rad).
+        Range offset (m), log odds and log softness of the edge, pitch scale, pitch offset by
+        direction (rad).
     sweeps : dict of int to ndarray
         Offset (rad) and stretch of the recorded pitch of each sweep.
     noise : dict of str to float
@@ -65,14 +87,16 @@ class JointSolution:
     misfit : dict of int to float
         Normalised squared residuals of each placement (1 is what the noise explains).
     excluded : dict of int or str to str
-        Placements (and, under names of their own, cameras and single images) left out, with the reason.
+        Placements (and, under names of their own, cameras and single images) left out, with the
+        reason.
     lens : ndarray, shape (c, c)
         The part of the covariances that comes from the intrinsics, which all placements share.
     lens_scale : float
-        By how much errors of the intrinsics let board poses in images scatter, in stated standard deviations.
+        By how much errors of the intrinsics let board poses in images scatter, in stated standard
+        deviations.
     warnings : tuple of str
-        What is suspicious: no convergence, noise that contradicts what is stated, a weak axis, errors of the pitch that
-        the data ask for.
+        What is suspicious: no convergence, noise that contradicts what is stated, a weak axis,
+        errors of the pitch that the data ask for.
     """
 
     solution: Solution
@@ -118,16 +142,23 @@ class JointSolution:
 
     @property
     def edge_bias(self):
-        """Where readings flip with a background as far and bright as the board, spot radii outside the edge."""
+        """Where readings flip with a background as far and bright as the board, spot radii
+        outside the edge.
+        """
         return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
 
     def residuals(self, group):
-        """Residuals in the order of the observations: 'face' (n, 1), metres, or 'view' (n, 6), radians and metres."""
-        used, placement = getattr(self.data, group)["used"], getattr(self.observations, f"{group}_placement")
+        """Residuals in the order of the observations: 'face' (n, 1), metres, or 'view' (n, 6),
+        radians and metres.
+        """
+        used = getattr(self.data, group)["used"]
+        placement = getattr(self.observations, f"{group}_placement")
         out = np.zeros((len(placement), {"face": 1, "view": 6}[group]))
         blocks = residuals.named_blocks(self.state, self.data, self.unknowns)
         if group in blocks:
-            out[np.argsort(placement, kind="stable")] = blocks[group].residuals.reshape(used.shape + (-1,))[used]
+            out[np.argsort(placement, kind="stable")] = blocks[group].residuals.reshape(
+                used.shape + (-1,)
+            )[used]
         return out
 
     def columns(self, prefix):
@@ -135,13 +166,18 @@ class JointSolution:
         return [i for i, name in enumerate(self.solution.names) if name.startswith(prefix)]
 
     def covariance(self, *prefixes):
-        """Covariance to rely on of groups of shared unknowns, e.g. 'left_' or 'axis'; see `Solution.trusted`."""
+        """Covariance to rely on of groups of shared unknowns, e.g.
+
+        'left_' or 'axis'; see `Solution.trusted`.
+        """
         index = sum(map(self.columns, prefixes), [])
         return self.solution.trusted[np.ix_(index, index)]
 
     @property
     def corrections(self) -> Corrections:
-        """Errors of what was recorded, as far as they were estimated: range offset, scale and sweeps of the pitch."""
+        """Errors of what was recorded, as far as they were estimated: range offset, scale and
+        sweeps of the pitch.
+        """
         by_direction = self.sensor["pitch_by_direction"]
         sweeps = {}
         for row, (placement, (offset, stretch)) in enumerate(self.sweeps.items()):
@@ -150,20 +186,31 @@ class JointSolution:
         return Corrections(self.sensor["range_offset"], self.sensor["pitch_scale"], sweeps)
 
     def camera_at(self, name, pitch):
-        """``T_camera_platform`` of a camera while the head stands at a pitch (radians), or at several."""
+        """``T_camera_platform`` of a camera while the head stands at a pitch (radians), or at
+        several.
+        """
         mount = self.observations.mounts[self.observations.cameras.index(name)]
         return camera_at(self.transforms[name], mount, self.T_head_lrf, pitch)
 
     def camera(self, name):
         """The pose of one camera as a `Solution` like those of the other methods."""
-        index, whole = self.columns(f"{name}_"), self.solution
+        index = self.columns(f"{name}_")
+        whole = self.solution
         pose = pose_array(self.transforms[name])
         both = {key: getattr(whole, key) for key in ("covariance", "covariance_placements")}
-        spread = {key: None if value is None else value[np.ix_(index, index)] for key, value in both.items()}
+        spread = {
+            key: None if value is None else value[np.ix_(index, index)]
+            for key, value in both.items()
+        }
         return replace(
-            whole, transform=self.transforms[name], parameters=pose_parameters(pose), names=geometry.POSE_NAMES,
-            jacobian=whole.jacobian[..., index], state=pose, **spread,
-        )  # fmt: skip
+            whole,
+            transform=self.transforms[name],
+            parameters=pose_parameters(pose),
+            names=geometry.POSE_NAMES,
+            jacobian=whole.jacobian[..., index],
+            state=pose,
+            **spread,
+        )
 
     def __repr__(self):
         return f"JointSolution({len(self.boards)} placements, {self.solution!r})"
@@ -197,8 +244,19 @@ class Start:
 
 
 def solve_joint(
-    obs, T0=None, *, prior=None, axis=True, sensor=SENSOR[:3], sides=False, sweep="none", sweep_sigma=SWEEP_SIGMA,
-    lapse=0.0, noise="stated", start=None, required=True,
+    obs,
+    T0=None,
+    *,
+    prior=None,
+    axis=True,
+    sensor=SENSOR[:3],
+    sides=False,
+    sweep="none",
+    sweep_sigma=SWEEP_SIGMA,
+    lapse=0.0,
+    noise="stated",
+    start=None,
+    required=True,
 ):
     """Estimate axis, cameras, range offset, edge bias and the pose of every board at once.
 
@@ -208,13 +266,16 @@ def solve_joint(
     T0 : RigidTransform, optional
         Rough ``T_head_lrf``; closed forms are tried in any case.
     prior : PlatformPrior, optional
-        A rough measurement of the axis with its standard deviations. It yields where the data contradict it.
+        A rough measurement of the axis with its standard deviations. It yields where the data
+        contradict it.
     axis : bool
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
-        Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero (softness: 0.2).
+        Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero
+        (softness: 0.2).
     sides : bool
-        Every side of every placement deviates from the sensor's edge bias, because backgrounds are not alike.
+        Every side of every placement deviates from the sensor's edge bias, because backgrounds are
+        not alike.
     sweep : {'none', 'offset', 'offset_stretch'}
         Errors of the recorded pitch that every sweep has of its own.
     sweep_sigma : tuple of float
@@ -222,8 +283,9 @@ def solve_joint(
     lapse : float
         Share of edge beams expected to say nothing.
     noise : {'stated', 'estimate'}
-        Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among neighbours) from the
-        residuals, and leave out placements and images that contradict all others, by name.
+        Estimate the noise levels (ranges, images, pitch, sides, repetition of errors among
+        neighbours) from the residuals, and leave out placements and images that contradict all
+        others, by name.
     start : JointState, optional
         Skips the search for a start value.
     required : bool
@@ -243,7 +305,8 @@ def solve_joint(
     check_settings(obs, sensor, sweep_sigma, noise, lapse)
     obs, excluded = without_blind_cameras(obs, required)
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
-    rivals, settled = (), False
+    rivals = ()
+    settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
         best, rivals = best_start(obs, unknowns, sweep_sigma, T0)
@@ -272,7 +335,8 @@ def solve_joint(
 
 
 def solve_again(obs, like):
-    """Solve for some of the placements of a solution with its settings, noise levels and start value.
+    """Solve for some of the placements of a solution with its settings, noise levels and start
+    value.
 
     Raises DegenerateGeometry when these placements leave a motion open.
     """
@@ -290,8 +354,14 @@ def check_settings(obs, sensor, sweep_sigma, noise, lapse):
     for wrong, words in (
         (unknown is not None, f"sensor unknowns are {', '.join(SENSOR)}; got {unknown!r}"),
         (noise not in ("stated", "estimate"), f"noise is 'stated' or 'estimate', got {noise!r}"),
-        (not 0 <= lapse < 0.5, f"lapse is the share of beams that say nothing, 0 to 0.5, got {lapse}"),
-        (min(sweep_sigma) <= 0, f"sweep_sigma must be positive (radians, fraction), got {sweep_sigma}"),
+        (
+            not 0 <= lapse < 0.5,
+            f"lapse is the share of beams that say nothing, 0 to 0.5, got {lapse}",
+        ),
+        (
+            min(sweep_sigma) <= 0,
+            f"sweep_sigma must be positive (radians, fraction), got {sweep_sigma}",
+        ),
     ):
         if wrong:
             raise ValueError(words)
@@ -300,22 +370,32 @@ def check_settings(obs, sensor, sweep_sigma, noise, lapse):
 
 
 def without_blind_cameras(obs, required):
-    """Leave out cameras that never see a board, by name; refuse them where everything is required."""
+    """Leave out cameras that never see a board, by name.
+
+    Refuse them where everything is required.
+    """
     blind = [name for i, name in enumerate(obs.cameras) if not (obs.view_camera == i).any()]
-    words = {f"camera {name}": f"camera '{name}' never sees the board: its pose stays open" for name in blind}
+    words = {
+        f"camera {name}": f"camera '{name}' never sees the board: its pose stays open"
+        for name in blind
+    }
     if blind and required:
         raise DegenerateGeometry("; ".join(words.values()) + "; leave it out with obs.with_cameras")
     return (obs.with_cameras([n for n in obs.cameras if n not in blind]) if blind else obs), words
 
 
 def without_lost_placements(obs):
-    """Leave out placements that no image shows and whose scans cross fewer than two edges, by name."""
+    """Leave out placements that no image shows and whose scans cross fewer than two edges, by
+    name.
+    """
     count = np.zeros((len(obs.placements), len(obs.edges)), int)
     np.add.at(count, (obs.beam_placement[obs.beam_hit], obs.beam_edge[obs.beam_hit]), 1)
     crossed = np.sum(count >= FEWEST_ANGLE_POINTS, axis=1)
     lost = (crossed < 2) & ~np.isin(np.arange(len(crossed)), obs.view_placement)
     words = {
-        int(p): f"placement {p}: no image shows the board and scans cross {n} edges, two needed; left out"
+        int(
+            p
+        ): f"placement {p}: no image shows the board and scans cross {n} edges, two needed; left out"
         for p, n in zip(obs.placements[lost], crossed[lost], strict=True)
     }
     if lost.all():
@@ -326,19 +406,29 @@ def without_lost_placements(obs):
 def fit(state, data, unknowns, tolerance=ROUGH_STEP, steps=MOST_STEPS):
     """What :func:`lrfcal_lib.fit.least_squares.minimise` makes of a state nearby."""
     return minimise(
-        lambda s: joint_blocks(s, data, unknowns), state, lambda s, step: move_state(s, step, unknowns),
-        shared=unknowns.shared, max_iterations=steps, tolerance=tolerance,
-    )  # fmt: skip
+        lambda s: joint_blocks(s, data, unknowns),
+        state,
+        lambda s, step: move_state(s, step, unknowns),
+        shared=unknowns.shared,
+        max_iterations=steps,
+        tolerance=tolerance,
+    )
 
 
 def converged(*problem, **options):
-    """The state that explains the data best, from one nearby: the first that :func:`fit` returns."""
+    """The state that explains the data best, from one nearby: the first that :func:`fit`
+    returns.
+    """
     return fit(*problem, **options)[0]
 
 
 def coarse(unknowns):
-    """The unknowns without those of the edges: from far away, beams on the wrong side would blow up the softness."""
-    return replace(unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False)
+    """The unknowns without those of the edges: from far away, beams on the wrong side would
+    blow up the softness.
+    """
+    return replace(
+        unknowns, sensor=tuple(n for n in unknowns.sensor if not n.startswith("edge_")), sides=False
+    )
 
 
 def of_placements(state, rows):
@@ -348,29 +438,40 @@ def of_placements(state, rows):
 
 def without(obs, state, views, placements):
     """Observations and state without some views and placements (by index)."""
-    kept = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), views)).select(np.delete(obs.placements, placements))
+    kept = obs.keep(view=~np.isin(np.arange(len(obs.view_camera)), views)).select(
+        np.delete(obs.placements, placements)
+    )
     return kept, of_placements(state, np.delete(np.arange(len(obs.placements)), placements))
 
 
 def image_name(obs, row):
     """A view in words."""
-    pitch, camera = np.degrees(obs.view_pitch[row]), obs.cameras[obs.view_camera[row]]
-    return f"placement {obs.placements[obs.view_placement[row]]}, image of '{camera}' at {pitch:.1f} deg"
+    pitch = np.degrees(obs.view_pitch[row])
+    camera = obs.cameras[obs.view_camera[row]]
+    return (
+        f"placement {obs.placements[obs.view_placement[row]]}, image of '{camera}' at "
+        f"{pitch:.1f} deg"
+    )
 
 
 def best_start(obs, unknowns, sweep_sigma, T0=None):
     """The most promising Start, and in words its rivals.
 
-    More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows which ones are
-    wrong.
+    More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows
+    which ones are wrong.
     """
-    data, tried = gather(obs, sweep_sigma=tuple(sweep_sigma)), []
+    data = gather(obs, sweep_sigma=tuple(sweep_sigma))
+    tried = []
     for number, states in enumerate(start_states(obs, T0)):
         for state in states:
             if not unknowns.axis:
-                known = next(h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None)
+                known = next(
+                    h for h in (T0, obs.T_head_lrf, RigidTransform.identity()) if h is not None
+                )
                 state = replace(state, head=pose_array(known))
-            misses = joint_noise.face_misses(state, data, state.boards, np.arange(len(state.boards)))
+            misses = joint_noise.face_misses(
+                state, data, state.boards, np.arange(len(state.boards))
+            )
             start = agreeing_start(obs, state, data, unknowns)
             tried.append(replace(start, rough_miss=float(np.median(misses))))
         if min(start.badness for start in tried) < GOOD_START and (T0 is None or number):
@@ -381,7 +482,8 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     if max(left_out_shares(obs, best.left_out)) > LARGEST_SHARE:
         bad = list(best.left_out)
         raise DegenerateGeometry(
-            f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the others: images put "
+            f"{len(bad)} placements or images of {len(obs.placements)} placements contradict the "
+            "others: images put "
             f"boards elsewhere than scans ({', '.join(map(str, bad[:8]))}); check that images and "
             "scans carry the right numbers"
         )
@@ -389,12 +491,19 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
 
 
 def refuse_contradiction(state, data, most):
-    """Raise DegenerateGeometry where images put a third of the boards more than `most` metres off where they are."""
+    """Raise DegenerateGeometry where images put a third of the boards more than `most` metres
+    off where they are.
+    """
     seen = data.view["used"].any(axis=1)
-    if seen.any() and (miss := np.quantile(joint_noise.view_misses(state, data)[seen], 2 / 3)) > most:
+    if (
+        seen.any()
+        and (miss := np.quantile(joint_noise.view_misses(state, data)[seen], 2 / 3)) > most
+    ):
         raise DegenerateGeometry(
-            f"images and scans contradict each other: for a third of the placements the board lies {1000 * miss:.0f} "
-            "mm or more off where the images put it; check that images and scans carry the right numbers"
+            "images and scans contradict each other: for a third of the placements the board "
+            f"lies {1000 * miss:.0f} "
+            "mm or more off where the images put it; check that images and scans carry the right "
+            "numbers"
         )
 
 
@@ -417,11 +526,13 @@ def left_out_shares(obs, bad):
 
 
 def agreeing_start(obs, state, data, unknowns):
-    """A few steps without what contradicts a start value; what a rough one leaves out is judged again by the rest.
+    """A few steps without what contradicts a start value; what a rough one leaves out is judged
+    again by the rest.
 
     The better one of both attempts, a Start: what still contradicts may have led the rest astray.
     """
-    few, tried = coarse(unknowns), []
+    few = coarse(unknowns)
+    tried = []
     for _ in range(2):
         kept, fitting, bad = without_contradictions(obs, state, data)
         cut = gather(kept, **data.levels) if bad else data
@@ -431,12 +542,16 @@ def agreeing_start(obs, state, data, unknowns):
         tried.append(Start(kept=kept, state=found, left_out=bad, settled=settled, badness=cost))
         if not bad or share > LARGEST_SHARE:
             break
-        state = state_of(obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras])
+        state = state_of(
+            obs, pose_transform(found.head), [pose_transform(pose) for pose in found.cameras]
+        )
     return min(tried, key=lambda start: start.badness)
 
 
 def without_contradictions(obs, state, data):
-    """Leave out images that put the board far off where it was scanned, and placements of which none is left."""
+    """Leave out images that put the board far off where it was scanned, and placements of which
+    none is left.
+    """
     place = obs.view_placement
     if len(place) == 0:
         return obs, state, {}
@@ -446,24 +561,31 @@ def without_contradictions(obs, state, data):
     if not wrong.any():
         return obs, state, {}
     good, first = np.unique(place[~wrong], return_index=True)
-    out, single = np.setdiff1d(place, good), np.flatnonzero(wrong & np.isin(place, good))
+    out = np.setdiff1d(place, good)
+    single = np.flatnonzero(wrong & np.isin(place, good))
     own = state.boards.copy()
     own[good] = boards[~wrong][first]
     words = {
-        int(obs.placements[i]): f"placement {obs.placements[i]}: the scan is {1000 * misses[place == i].min():.0f} mm "
+        int(
+            obs.placements[i]
+        ): f"placement {obs.placements[i]}: the scan is {1000 * misses[place == i].min():.0f} mm "
         "off where its image puts the board; left out"
         for i in out
     }
     for row in single:
         name = image_name(obs, row)
-        words[name] = f"{name}: it puts the board {1000 * misses[row]:.0f} mm off the scan; the image is left out"
+        words[name] = (
+            f"{name}: it puts the board {1000 * misses[row]:.0f} mm off the scan; the image is "
+            "left out"
+        )
     return *without(obs, replace(state, boards=own), single, out), words
 
 
 def settle(state, data, unknowns):
     """Estimate unknowns and noise levels in turn until they agree."""
     for _ in range(NOISE_ROUNDS):
-        before, data = data, joint_noise.estimate_noise(state, data, unknowns)
+        before = data
+        data = joint_noise.estimate_noise(state, data, unknowns)
         state = converged(state, data, unknowns, steps=ROUND_STEPS)
         if joint_noise.same_levels(before, data):
             break
@@ -471,15 +593,23 @@ def settle(state, data, unknowns):
 
 
 def drop_contradictions(obs, state, data, unknowns):
-    """Leave out placements whose residuals are far larger than the others', or the one image that makes them so."""
+    """Leave out placements whose residuals are far larger than the others', or the one image
+    that makes them so.
+    """
     found, usual = contradictions(state, data, unknowns)
-    limits, views, out, words = CONTRADICTION * usual, [], [], {}
+    limits = CONTRADICTION * usual
+    views = []
+    out = []
+    words = {}
     for i in np.flatnonzero((found > limits).any(axis=1)):
         view, board = wrong_image(obs, state, data, unknowns, i, limits)
         why = f"residuals are {np.sqrt(np.max(found[i] / usual)):.0f} times those of the others"
         if view is not None:
-            views, state.boards[i] = [*views, view], board
-            words[image_name(obs, view)] = f"{image_name(obs, view)}: with it {why}; the image is left out"
+            views = [*views, view]
+            state.boards[i] = board
+            words[image_name(obs, view)] = (
+                f"{image_name(obs, view)}: with it {why}; the image is left out"
+            )
         elif found[i, 0] > limits[0]:
             out.append(i)
             words[int(obs.placements[i])] = f"placement {obs.placements[i]}: its {why}; left out"
@@ -490,31 +620,46 @@ def drop_contradictions(obs, state, data, unknowns):
 
 
 def contradictions(state, data, unknowns):
-    """Misfits of placements, and of their images alone, shape (p, 2), and what is usual of both, shape (2,).
+    """Misfits of placements, and of their images alone, shape (p, 2), and what is usual of both,
+    shape (2,).
 
-    A wrong image raises the noise level of all images until ranges outvote it: images are compared with images.
+    A wrong image raises the noise level of all images until ranges outvote it: images are compared
+    with images.
     """
-    blocks, several = residuals.named_blocks(state, data, unknowns), data.view["used"].sum(axis=1) > 1
-    found = np.stack([joint_noise.misfits(blocks, data, groups) for groups in (("face", "view"), ("view",))], axis=1)
+    blocks = residuals.named_blocks(state, data, unknowns)
+    several = data.view["used"].sum(axis=1) > 1
+    found = np.stack(
+        [joint_noise.misfits(blocks, data, groups) for groups in (("face", "view"), ("view",))],
+        axis=1,
+    )
     images = np.median(found[several, 1]) if several.any() else np.inf
     return found, np.array([max(np.median(found[:, 0]), 1.0), max(images, LEAST_MISFIT)])
 
 
 def wrong_image(obs, state, data, unknowns, i, limits):
-    """The view without which placement i agrees with the others (None where there is none), and its board then.
+    """The view without which placement i agrees with the others (None where there is none), and its
+    board then.
 
-    Every view is left out once, in copies of the placement, with all that the placements share held.
+    Every view is left out once, in copies of the placement, with all that the placements share
+    held.
     """
     rows = np.flatnonzero(obs.view_placement == i)
     if len(rows) < 2:
         return None, None
-    copies, each = np.full(len(rows), i), np.arange(len(rows))
+    copies = np.full(len(rows), i)
+    each = np.arange(len(rows))
     state = replace(
-        of_placements(state, copies), boards=boards_in_images(obs, state.head, state.cameras, np.roll(rows, -1))
+        of_placements(state, copies),
+        boards=boards_in_images(obs, state.head, state.cameras, np.roll(rows, -1)),
     )
-    groups = {name: {key: v[copies] for key, v in getattr(data, name).items()} for name in ("face", "beam", "view")}
+    groups = {
+        name: {key: v[copies] for key, v in getattr(data, name).items()}
+        for name in ("face", "beam", "view")
+    }
     groups["view"]["used"][each, each] = False
-    groups["view"]["whitener"] = groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
+    groups["view"]["whitener"] = (
+        groups["view"]["whitener"] * groups["view"]["used"][..., None, None]
+    )
     data = replace(data, **groups, middle=data.middle[copies], direction=data.direction[copies])
     lone = replace(unknowns, axis=False, sensor=(), poses=False)
     state = converged(state, data, lone, steps=START_STEPS)
@@ -529,12 +674,17 @@ def count_rows(obs):
 
 
 def in_stated_gauge(state, obs):
-    """Turn about the axis and shift along it, which no data show, as the stated platform has them."""
+    """Turn about the axis and shift along it, which no data show, as the stated platform has
+    them.
+    """
     found = pose_transform(state.head)
     head = geometry.head_from_axis(geometry.axis_of(found))
     if obs.T_head_lrf is not None:
-        head = obs.T_head_lrf * geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf)).inv() * head
-    change, cameras = head * found.inv(), state.cameras.copy()
+        head = (
+            obs.T_head_lrf * geometry.head_from_axis(geometry.axis_of(obs.T_head_lrf)).inv() * head
+        )
+    change = head * found.inv()
+    cameras = state.cameras.copy()
     for i in np.flatnonzero(np.array(obs.mounts) == "platform"):
         cameras[i] = pose_array(pose_transform(cameras[i]) * change.inv())
     boards = pose_array(change * pose_transform(state.boards))
@@ -544,12 +694,15 @@ def in_stated_gauge(state, obs):
 def joint_words(direction, names, cameras):
     """A direction of the shared unknowns in words."""
     direction = np.asarray(direction) / np.max(np.abs(direction))
-    large, words = np.abs(direction) > 0.3, []
+    large = np.abs(direction) > 0.3
+    words = []
     for camera in cameras:
         index = [i for i, name in enumerate(names) if name.startswith(f"{camera}_")]
         if large[index].any():
             words.append(geometry.motion_words(direction[index], camera))
-    return " with ".join(words + [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS])
+    return " with ".join(
+        words + [WORDS[name] for name, it in zip(names, large, strict=True) if it and name in WORDS]
+    )
 
 
 def finished(obs, state, data, unknowns, excluded, required):
@@ -558,31 +711,53 @@ def finished(obs, state, data, unknowns, excluded, required):
 
     def read(s):
         poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
-        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[unknowns.mask]
+        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[
+            unknowns.mask
+        ]
 
     found = solve(
-        lambda s: joint_blocks(s, data, unknowns), in_stated_gauge(state, obs),
-        lambda s, step: move_state(s, step, unknowns), names=names, method="joint", read=read,
-        scales=[SCALES.get(name, 1.0) for name in names], words=lambda d: joint_words(d, names, obs.cameras),
-        shared=unknowns.shared, freedom=0, required=required, limit=UNSEEN, max_iterations=MOST_STEPS,
-        tolerance=LAST_STEP, n_observations=count_rows(obs),
-    )  # fmt: skip
+        lambda s: joint_blocks(s, data, unknowns),
+        in_stated_gauge(state, obs),
+        lambda s, step: move_state(s, step, unknowns),
+        names=names,
+        method="joint",
+        read=read,
+        scales=[SCALES.get(name, 1.0) for name in names],
+        words=lambda d: joint_words(d, names, obs.cameras),
+        shared=unknowns.shared,
+        freedom=0,
+        required=required,
+        limit=UNSEEN,
+        max_iterations=MOST_STEPS,
+        tolerance=LAST_STEP,
+        n_observations=count_rows(obs),
+    )
     lens, twice, lens_scale = joint_noise.lens_covariance(obs, found, data, unknowns)
     spread = None if found.covariance_placements is None else found.covariance_placements + lens
     found = replace(found, covariance=found.covariance + lens - twice, covariance_placements=spread)
     wider = replace(unknowns, sensor=tuple(dict.fromkeys((*unknowns.sensor, *joint_noise.TERMS))))
-    state, blocks, numbers = found.state, residuals.named_blocks(found.state, data, wider), obs.placements.tolist()
+    state = found.state
+    blocks = residuals.named_blocks(found.state, data, wider)
+    numbers = obs.placements.tolist()
     levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return JointSolution(
-        found, obs, data, unknowns,
+        found,
+        obs,
+        data,
+        unknowns,
         T_head_lrf=pose_transform(state.head),
-        transforms={name: pose_transform(pose) for name, pose in zip(obs.cameras, state.cameras, strict=True)},
+        transforms={
+            name: pose_transform(pose)
+            for name, pose in zip(obs.cameras, state.cameras, strict=True)
+        },
         boards=dict(zip(numbers, pose_transform(state.boards), strict=True)),
         sensor=dict(zip(SENSOR, state.sensor.tolist(), strict=True)),
         sweeps=dict(zip(numbers, state.sweeps, strict=True)),
         noise={name: float(getattr(data, name)) for name in levels}
         | ({"view_scale": float(data.view_scale[0])} if len(obs.cameras) else {}),
         misfit=dict(zip(numbers, joint_noise.misfits(blocks, data).tolist(), strict=True)),
-        excluded=excluded, lens=lens, lens_scale=lens_scale,
+        excluded=excluded,
+        lens=lens,
+        lens_scale=lens_scale,
         warnings=joint_noise.joint_warnings(blocks, data, wider, found, obs.cameras),
-    )  # fmt: skip
+    )

@@ -1,4 +1,6 @@
-"""Noise levels of the joint estimate, the share of the intrinsics, misfits, and what is suspicious, in words."""
+"""Noise levels of the joint estimate, the share of the intrinsics, misfits, and what is
+suspicious, in words.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -13,24 +15,35 @@ LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 LEAST_CORNERS = 6
 PARTS = 3  # of a board in x and y, and of an edge
 PLANE = 3  # numbers of a plane, that a placement's own pose takes up
-PITCH_LEVELS = np.radians([0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1])
-SCALE_ROUNDS, SCALE_LIMITS = 4, (1e-4, 1e4)
+PITCH_LEVELS = np.radians(
+    [0.0, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1]
+)
+SCALE_ROUNDS = 4
+SCALE_LIMITS = (1e-4, 1e4)
 SIDE_ROUNDS = 20
 SETTLED = 0.02  # change of the logarithm of a noise level
-NOISE_LIMITS = (0.5, 2.0)  # scatter of residuals in stated standard deviations that still agrees with the statement
+# scatter of residuals in stated standard deviations that still agrees with the statement
+NOISE_LIMITS = (0.5, 2.0)
 ASKED = 20.0  # squared score in standard deviations: chance alone exceeds it once in 100 000 times
-WEAK_DIRECTION, WEAK_OFFSET = np.radians(1.0), 0.020  # standard deviations of an axis nobody should rely on
+# standard deviations of an axis nobody should rely on
+WEAK_DIRECTION = np.radians(1.0)
+WEAK_OFFSET = 0.020
 TERMS = {
     "pitch_scale": (0.001, "the scale of the pitch", 100.0, "%"),
-    "pitch_by_direction": (np.radians(0.01), "a pitch offset by sweep direction", np.degrees(1.0), "deg"),
+    "pitch_by_direction": (
+        np.radians(0.01),
+        "a pitch offset by sweep direction",
+        np.degrees(1.0),
+        "deg",
+    ),
 }
 
 
 def pose_by_intrinsics(T_camera_board, corners, model):
     """How the pose of a board that fits given pixels changes with the intrinsics, shape (6, 9).
 
-    Derivative of the increments ``[w, v]`` of T_camera_board, from the pattern's corners (k, 3) that were seen (board
-    frame, metres); zeros with fewer than six.
+    Derivative of the increments ``[w, v]`` of T_camera_board, from the pattern's corners (k, 3)
+    that were seen (board frame, metres); zeros with fewer than six.
     """
     if len(corners) < LEAST_CORNERS:
         return np.zeros((6, LENS))
@@ -41,19 +54,25 @@ def pose_by_intrinsics(T_camera_board, corners, model):
 
 
 def lens_covariance(obs, found, data, unknowns):
-    """Covariance (c, c) of the shared unknowns from those of the intrinsics, and the scatter of views that these cause.
+    """Covariance (c, c) of the shared unknowns from those of the intrinsics, and the scatter of
+    views that these cause.
 
-    The latter in stated standard deviations, like the scale of views: what no unknown can take up of the error that all
-    views of a camera share. Between them comes what this scatter has added to `found.covariance` through the scale of
-    views, as far as that exceeds the stated noise: the intrinsics would count twice. Zeros where they are exact.
+    The latter in stated standard deviations, like the scale of views: what no unknown can take up
+    of the error that all views of a camera share. Between them comes what this scatter has added to
+    `found.covariance` through the scale of views, as far as that exceeds the stated noise: the
+    intrinsics would count twice. Zeros where they are exact.
     """
     c = unknowns.shared
-    total, square = np.zeros((c, c)), 0.0
+    total = np.zeros((c, c))
+    square = 0.0
     if len(obs.view_camera) == 0 or not np.any(obs.lens_covariance):
         return total, total, square
     block = view_block(found.state, data, unknowns)
-    J, used = whiten(block)[1], data.view["used"]
-    lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
+    J = whiten(block)[1]
+    used = data.view["used"]
+    lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))[
+        "lens"
+    ]
     hessian = np.swapaxes(found.jacobian, -1, -2) @ (found.weights[..., None] * found.jacobian)
     own = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
     reduced = J[..., :c] - J[..., c:] @ own @ hessian[:, c:, :c]
@@ -62,13 +81,20 @@ def lens_covariance(obs, found, data, unknowns):
         mine = (used & (data.view["camera"] == camera))[..., None, None]
         shift = block.whitened((lens * mine).reshape(J.shape[:2] + (LENS,)))
         gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
-        left = shift - reduced @ gain - J[..., c:] @ (own @ (np.swapaxes(J[..., c:], -1, -2) @ shift))
-        total, square = total + gain @ spread @ gain.T, square + np.sum(left @ spread * left)
+        left = (
+            shift - reduced @ gain - J[..., c:] @ (own @ (np.swapaxes(J[..., c:], -1, -2) @ shift))
+        )
+        total = total + gain @ spread @ gain.T
+        square = square + np.sum(left @ spread * left)
     level = data.view_scale[0] ** 2
     taken = np.sum((J[..., c:] @ own) * J[..., c:]) + np.sum((reduced @ finite) * reduced)
     square *= level / max(6 * used.sum() - taken, 1.0)  # rows that are left to show it
     share = np.clip(level - 1, 0, square) / level
-    return total, share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite, float(np.sqrt(square))
+    return (
+        total,
+        share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite,
+        float(np.sqrt(square)),
+    )
 
 
 def estimate_noise(state, data, unknowns):
@@ -95,7 +121,9 @@ def estimate_noise(state, data, unknowns):
 
 
 def face_levels(state, data, block):
-    """Scale of the ranges' noise, and the share of independent errors, from means over parts of the boards."""
+    """Scale of the ranges' noise, and the share of independent errors, from means over parts of
+    the boards.
+    """
     used = data.face["used"]
     z = np.where(used, block.residuals / np.where(used, data.face["sigma"], 1.0), 0.0)
     number = used.sum(axis=1)
@@ -103,7 +131,8 @@ def face_levels(state, data, block):
     x = on_board(state, data)
     part = _part(x[..., 0], used) * PARTS + _part(x[..., 1], used)
     rows = np.arange(len(used))[:, None] * PARTS**2 + part
-    total, count = np.bincount(rows[used], z[used]), np.bincount(rows[used])
+    total = np.bincount(rows[used], z[used])
+    count = np.bincount(rows[used])
     full = count > 1
     free = full.sum() - PLANE * np.sum(number > 0)
     ratio = np.sum(total[full] ** 2 / count[full]) / scale**2 / max(free, 1)
@@ -143,7 +172,8 @@ def beam_share(state, data, block, unknowns, spread):
     ray = rays(state, data, data.beam)
     a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
     o, d = ray[:2]
-    normal, origin = state.boards[:, None, :, 2], state.boards[:, None, :, 3]
+    normal = state.boards[:, None, :, 2]
+    origin = state.boards[:, None, :, 3]
     r = np.sum(normal * (origin - o), axis=-1) / np.sum(normal * d, axis=-1)
     along = np.sum((o + r[..., None] * d - origin - a) * t, axis=-1)
     own = block.jacobian[..., unknowns.shared :]
@@ -178,10 +208,12 @@ def view_levels(data, block, hessian, gradient, shared):
     one placement tell the error of the pitch by their differences alone. `hessian` (p, k, k) and
     `gradient` (p, k) are of all blocks, `shared` unknowns first.
 
-    One scale serves all cameras: with one view each, a camera could buy itself perfection at the other's cost.
+    One scale serves all cameras: with one view each, a camera could buy itself perfection at the
+    other's cost.
     """
     views = ViewEvidence.of(block, hessian, gradient, shared)
-    trials, factor = [], 1.0
+    trials = []
+    factor = 1.0
     for sigma in PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]:
         for _ in range(SCALE_ROUNDS):
             cost, factor = views.judged(sigma**2, factor, float(np.min(data.view_scale)))
@@ -190,7 +222,8 @@ def view_levels(data, block, hessian, gradient, shared):
     best = int(np.argmin(costs))
     sigma = PITCH_LEVELS[best]
     if 1 < best < len(costs) - 1:  # between the levels: a parabola through three of them
-        x, y = np.log(PITCH_LEVELS[best - 1 : best + 2]), costs[best - 1 : best + 2]
+        x = np.log(PITCH_LEVELS[best - 1 : best + 2])
+        y = costs[best - 1 : best + 2]
         bend, slope, _ = np.polyfit(x - x[1], y, 2)
         sigma *= np.exp(-slope / (2 * bend)) if bend > 0 else 1.0
     scale = np.clip(data.view_scale * factors[best], *SCALE_LIMITS)
@@ -251,19 +284,22 @@ class ViewEvidence:
         )
 
     def judged(self, variance, factor, scale):
-        """Negative log likelihood of an error of the pitch and a factor on the scale; a better factor.
+        """Negative log likelihood of an error of the pitch and a factor on the scale; a better
+        factor.
 
         `variance` is that of the pitch at the scale that the views are whitened with (a factor
         serves both). Of the factor one row more is believed, as large as stated: where nothing else
         shows the scale, it is the stated one.
         """
-        f2, c = factor**2, self.shared
+        f2 = factor**2
+        c = self.shared
         less = variance / (1 + variance * self.strength)
         weighted = np.swapaxes(self.by_stop * less[..., None], -1, -2)
         hessian = self.hessian - weighted @ self.by_stop
         gradient = self.gradient - (weighted @ self.along[..., None])[..., 0]
         square = self.square - np.sum(less * self.along**2, axis=-1)
-        whole, right = self.other_hessian + hessian / f2, self.other_gradient + gradient / f2
+        whole = self.other_hessian + hessian / f2
+        right = self.other_gradient + gradient / f2
         size = np.trace(whole, axis1=1, axis2=2)[:, None, None]
         whole = whole + 1e-12 * size * np.eye(whole.shape[-1])
         reduced, score, back = eliminate(whole, right, c, rcond=None)
@@ -281,9 +317,12 @@ class ViewEvidence:
         taken = np.sum(inner * hessian[:, c:, c:]) + np.sum((spread @ inverse) * (hessian @ spread))
         weight = np.linalg.slogdet(whole[:, c:, c:])[1].sum() + np.linalg.slogdet(total)[1]
         cost = 0.5 * (
-            np.sum(square) / f2 + np.vecdot(moved, right).sum() + self.rows * np.log(f2)
-            + np.log1p(variance * self.strength).sum() + weight
-        )  # fmt: skip
+            np.sum(square) / f2
+            + np.vecdot(moved, right).sum()
+            + self.rows * np.log(f2)
+            + np.log1p(variance * self.strength).sum()
+            + weight
+        )
         better = (np.sum(left) + scale**-2) / (max(self.rows - taken / f2, 0.0) + 1)
         return cost, float(np.sqrt(better))
 
@@ -297,7 +336,8 @@ def side_level(sides, data, hessian, gradient):
     is usual: where nothing shows the scale, that is it. `hessian` (p, k, k) and `gradient` (p, k)
     are of a placement's own unknowns, the sides last; shared ones are held.
     """
-    edges, sigma2 = sides.shape[1], data.side_sigma**2
+    edges = sides.shape[1]
+    sigma2 = data.side_sigma**2
     shown = np.zeros(sides.shape, bool)
     place, beam = np.nonzero(data.beam["used"])
     shown[place, data.beam["edge"][place, beam]] = True
@@ -305,7 +345,8 @@ def side_level(sides, data, hessian, gradient):
     last = np.arange(hessian.shape[-1])[-edges:]
     weight = prior * sigma2
     for _ in range(SIDE_ROUNDS):
-        whole, right = hessian.copy(), gradient.copy()
+        whole = hessian.copy()
+        right = gradient.copy()
         whole[:, last, last] += weight / sigma2 - prior
         right[:, last] += (weight / sigma2 - prior) * sides
         spread = np.linalg.pinv(whole, rcond=1e-13, hermitian=True)
@@ -319,13 +360,22 @@ def side_level(sides, data, hessian, gradient):
 
 def same_levels(before, after):
     """Whether noise levels have settled within a few per cent."""
-    ratios = [getattr(after, name) / getattr(before, name) for name in ("face_scale", "face_share", "beam_share")]
-    return bool(np.all(np.abs(np.log([*ratios, *(after.view_scale / before.view_scale)])) < SETTLED))
+    ratios = [
+        getattr(after, name) / getattr(before, name)
+        for name in ("face_scale", "face_share", "beam_share")
+    ]
+    return bool(
+        np.all(np.abs(np.log([*ratios, *(after.view_scale / before.view_scale)])) < SETTLED)
+    )
 
 
 def misfits(blocks, data, groups=("face", "view")):
-    """Normalised mean squared residual of ranges and views of each placement; 1 is what the noise explains, (p,)."""
-    total, count = np.zeros(len(data.middle)), np.zeros(len(data.middle))
+    """Normalised mean squared residual of ranges and views of each placement.
+
+    1 is what the noise explains, (p,).
+    """
+    total = np.zeros(len(data.middle))
+    count = np.zeros(len(data.middle))
     for name in set(groups) & set(blocks):
         share, numbers = (data.face_share, 1) if name == "face" else (1.0, 6)
         total += np.sum(whiten(blocks[name], False)[0] ** 2, axis=1) / share
@@ -334,13 +384,18 @@ def misfits(blocks, data, groups=("face", "view")):
 
 
 def face_misses(state, data, boards, placement):
-    """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres, (n,)."""
+    """Median distance of face points from boards (n, 3, 4) of some placements (n,), metres,
+    (n,).
+    """
     x = face_points(state, data)[placement] - boards[:, None, :, 3]
     return medians(np.abs(np.sum(x * boards[:, None, :, 2], axis=-1)), data.face["used"][placement])
 
 
 def view_misses(state, data):
-    """Median distance of every board from where its images put it, metres, (p,); 0 without images."""
+    """Median distance of every board from where its images put it, metres, (p,).
+
+    0 without images.
+    """
     used = data.view["used"]
     if not used.any():
         return np.zeros(len(used))
@@ -352,22 +407,33 @@ def view_misses(state, data):
 def joint_warnings(blocks, data, unknowns, found, names):
     """What is suspicious about a joint estimate with cameras of these names, in words.
 
-    `blocks` hold derivatives by `TERMS` too, which `unknowns` name, whether they were estimated or not.
+    `blocks` hold derivatives by `TERMS` too, which `unknowns` name, whether they were estimated or
+    not.
     """
-    words = [] if found.converged else [f"not converged after {found.iterations} iterations: do not use the result"]
+    words = (
+        []
+        if found.converged
+        else [f"not converged after {found.iterations} iterations: do not use the result"]
+    )
     words += [f"the data do not determine {motion}" for motion in found.unobservable]
     words += noise_words(blocks, data, names)
-    turn, shift = np.linalg.norm(found.sigma[:4].reshape(2, 2), axis=1) if unknowns.axis else (0.0, 0.0)
+    turn, shift = (
+        np.linalg.norm(found.sigma[:4].reshape(2, 2), axis=1) if unknowns.axis else (0.0, 0.0)
+    )
     if turn >= WEAK_DIRECTION or shift >= WEAK_OFFSET:
         words.append(
-            f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): sweep over a larger "
+            f"the tilt axis is weakly known ({np.degrees(turn):.2f} deg, {1000 * shift:.0f} mm): "
+            "sweep over a larger "
             "pitch range, take images at more pitch angles, or state the platform with its accuracy"
         )
     held = [name for name in TERMS if name not in found.names]
     for name, square, value in score_tests(blocks, unknowns, held):
         least, what, factor, unit = TERMS[name]
         if square > ASKED and abs(value) > least:
-            words.append(f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at zero")
+            words.append(
+                f"the data ask for {what}, about {factor * value:+.2f} {unit}, which was held at "
+                "zero"
+            )
     return tuple(words)
 
 
@@ -379,12 +445,14 @@ def noise_words(blocks, data, names):
         groups.append(("ranges", "face_sigma", z))
     for number, name in enumerate(names if "view" in blocks else ()):
         mine = data.view["used"] & (data.view["camera"] == number)
-        if mine.sum() > len(data.middle):  # more views than placements: what a board's own pose takes up is minor
+        # more views than placements: what a board's own pose takes up is minor
+        if mine.sum() > len(data.middle):
             z = whiten(blocks["view"], False)[0].reshape(mine.shape + (6,))[mine]
             groups.append((f"poses of the board in camera '{name}'", "view_covariance", z))
     levels = [(what, field, np.sqrt(np.mean(z**2))) for what, field, z in groups]
     return [
-        f"the {what} scatter {level:.2g} times what is stated ({field}): standard deviations of the result are off "
+        f"the {what} scatter {level:.2g} times what is stated ({field}): standard deviations of "
+        "the result are off "
         "alike; noise='estimate' takes the level from the residuals"
         for what, field, level in levels
         if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]
@@ -392,12 +460,15 @@ def noise_words(blocks, data, names):
 
 
 def score_tests(blocks, unknowns, held):
-    """Names, squared scores (standard deviations) of shared unknowns held at zero, and the values they would take.
+    """Names, squared scores (standard deviations) of shared unknowns held at zero, and the values
+    they would take.
 
     Each one is tested by itself, with all that was estimated free.
     """
     hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
-    whole, score = (np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2])
+    whole, score = (
+        np.sum(part, axis=0) for part in eliminate(hessian, gradient, unknowns.shared)[:2]
+    )
     names = unknowns.names(range(unknowns.cameras))
     others = [i for i, name in enumerate(names) if name not in held]
     for name in held:

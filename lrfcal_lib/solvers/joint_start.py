@@ -1,4 +1,6 @@
-"""Start values of the joint estimate from closed forms: cameras from planes, the axis from how the cameras turn."""
+"""Start values of the joint estimate from closed forms: cameras from planes, the axis from how
+the cameras turn.
+"""
 
 from contextlib import suppress
 
@@ -7,7 +9,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.fit.residuals import JointState
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_platform, polar_to_points, pose_array, pose_transform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    lrf_to_platform,
+    polar_to_points,
+    pose_array,
+    pose_transform,
+)
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.solvers.planes import start_from_planes
 
@@ -21,15 +29,20 @@ FEWEST_ANGLE_POINTS = 6  # on an edge, for its direction
 
 
 def start_states(obs, T0=None):
-    """Start values (JointState) to choose from, made one by one: each with those of the cameras' other minima.
+    """Start values (JointState) to choose from, made one by one: each with those of the cameras'
+    other minima.
 
-    From the closed form of the axis, from T0, from the stated platform, from an axis along x through the mirror; with
-    cameras from scan lines at the pitch of their images, then from whole sweeps. Raises DegenerateGeometry when no
-    placement gives the pose of a board.
+    From the closed form of the axis, from T0, from the stated platform, from an axis along x
+    through the mirror; with cameras from scan lines at the pitch of their images, then from whole
+    sweeps. Raises DegenerateGeometry when no placement gives the pose of a board.
     """
     if len(obs.face_range) == 0:
-        raise DegenerateGeometry("no ranges on the boards' faces: a start value needs them; give one as start=")
-    reasons, made, direct = [], 0, {}
+        raise DegenerateGeometry(
+            "no ranges on the boards' faces: a start value needs them; give one as start="
+        )
+    reasons = []
+    made = 0
+    direct = {}
     for camera, mount in enumerate(obs.mounts):
         with suppress(DegenerateGeometry):
             direct |= {camera: _camera(obs, camera)} if mount == "head" else {}
@@ -37,9 +50,16 @@ def start_states(obs, T0=None):
     for head in (h for h in heads if h is not None):
         for known in [direct, {}] if direct else [{}]:
             try:
-                poses = [known[i] if i in known else _camera(obs, i, head) for i in range(len(obs.cameras))]
+                poses = [
+                    known[i] if i in known else _camera(obs, i, head)
+                    for i in range(len(obs.cameras))
+                ]
                 first = [some[0] for some in poses]
-                others = [first[:i] + [T] + first[i + 1 :] for i, some in enumerate(poses) for T in some[1:]]
+                others = [
+                    first[:i] + [T] + first[i + 1 :]
+                    for i, some in enumerate(poses)
+                    for T in some[1:]
+                ]
                 states = [state_of(obs, head, cameras) for cameras in (first, *others)]
             except (DegenerateGeometry, np.linalg.LinAlgError) as error:
                 reasons.append(str(error))
@@ -47,25 +67,35 @@ def start_states(obs, T0=None):
             made += 1
             yield states
     if not made:
-        raise DegenerateGeometry("no start value for the joint estimate: " + "; ".join(dict.fromkeys(reasons)))
+        raise DegenerateGeometry(
+            "no start value for the joint estimate: " + "; ".join(dict.fromkeys(reasons))
+        )
 
 
 def thin(rows, count):
     """At most `count` of some rows, evenly spread."""
-    return rows if len(rows) <= count else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+    return (
+        rows
+        if len(rows) <= count
+        else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+    )
 
 
 def _camera(obs, camera, head=None):
     """Poses of a camera, the best one first, from its views of boards and points on these.
 
-    From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines at the pitch of its
-    images, which needs no axis.
+    From whole sweeps, joined by a roughly known axis; of a camera on the head also from scan lines
+    at the pitch of its images, which needs no axis.
     """
-    views, points, mine, name = [], [], np.flatnonzero(obs.view_camera == camera), obs.cameras[camera]
+    views = []
+    points = []
+    mine = np.flatnonzero(obs.view_camera == camera)
+    name = obs.cameras[camera]
     if head is not None:
         mine = mine[np.unique(obs.view_placement[mine], return_index=True)[1]]
     for view in thin(mine, VIEWS):
-        rows, pitch = np.flatnonzero(obs.face_placement == obs.view_placement[view]), obs.view_pitch[view]
+        rows = np.flatnonzero(obs.face_placement == obs.view_placement[view])
+        pitch = obs.view_pitch[view]
         if head is None:
             away = np.abs(obs.face_pitch[rows] - pitch)
             rows = rows[away <= min(away.min(initial=SAME_PITCH) + 1e-9, SAME_PITCH)]
@@ -84,18 +114,24 @@ def _camera(obs, camera, head=None):
 
 
 def _axis_from_cameras(obs, poses):
-    """The tilt axis from how a fixed board turns in the images of a camera that pitches, by least squares."""
+    """The tilt axis from how a fixed board turns in the images of a camera that pitches, by
+    least squares.
+    """
     for camera, (T_camera_lrf, *_) in poses.items():
-        turns, motions = [], []
+        turns = []
+        motions = []
         for placement in range(len(obs.placements)):
             mine = np.flatnonzero((obs.view_camera == camera) & (obs.view_placement == placement))
             if len(mine) > 1:
-                first, last = mine[[np.argmin(obs.view_pitch[mine]), np.argmax(obs.view_pitch[mine])]]
+                first, last = mine[
+                    [np.argmin(obs.view_pitch[mine]), np.argmax(obs.view_pitch[mine])]
+                ]
                 turns.append(obs.view_pitch[last] - obs.view_pitch[first])
                 motions.append(obs.view_pose[last] @ np.linalg.inv(obs.view_pose[first]))
         if np.max(turns, initial=0.0) > LEAST_TURN:
             # the motions T_2 T_1^-1 are turns by -angle about one line in the camera
-            motions, lrf = np.array(motions), T_camera_lrf.inv()
+            motions = np.array(motions)
+            lrf = T_camera_lrf.inv()
             rotvec = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
             direction = -np.sum(rotvec * np.array(turns)[:, None], axis=0)
             A = (np.eye(3) - motions[:, :3, :3]).reshape(-1, 3)
@@ -106,33 +142,45 @@ def _axis_from_cameras(obs, poses):
 
 
 def state_of(obs, head, cameras):
-    """All unknowns from an axis and the cameras: boards from their first images, or from the scans alone."""
+    """All unknowns from an axis and the cameras: boards from their first images, or from the
+    scans alone.
+    """
     poses = np.stack([pose_array(T) for T in cameras]) if cameras else np.zeros((0, 3, 4))
     sensor = np.array([0.0, 0.0, np.log(START_SOFTNESS), 0.0, 0.0])
-    count, edges = len(obs.placements), len(obs.edges)
+    count = len(obs.placements)
+    edges = len(obs.edges)
     boards = np.zeros((count, 3, 4))
     seen, first = np.unique(obs.view_placement, return_index=True)
     if len(seen):
         boards[seen] = boards_in_images(obs, pose_array(head), poses, first)
     for placement in np.setdiff1d(np.arange(count), seen):
         boards[placement] = pose_array(board_from_scan(obs, placement, head))
-    return JointState(pose_array(head), poses, sensor, boards, np.zeros((count, 2)), np.zeros((count, edges)))
+    return JointState(
+        pose_array(head), poses, sensor, boards, np.zeros((count, 2)), np.zeros((count, edges))
+    )
 
 
 def boards_in_images(obs, head, cameras, views):
-    """``T_platform_board`` (n, 3, 4) from some views, each by itself; `head` and `cameras` as in JointState."""
+    """``T_platform_board`` (n, 3, 4) from some views, each by itself.
+
+    `head` and `cameras` as in JointState.
+    """
     camera = obs.view_camera[views]
     on_head = np.array([mount == "head" for mount in obs.mounts])[camera]
     pitch = Rotation.from_rotvec(np.outer(obs.view_pitch[views] * on_head, [1.0, 0.0, 0.0]))
     T_head_lrf = pose_transform(np.where(on_head[:, None, None], head, np.eye(3, 4)))
     T_camera_board = RigidTransform.from_matrix(obs.view_pose[views])
     return pose_array(
-        RigidTransform.from_rotation(pitch) * T_head_lrf * pose_transform(cameras[camera]).inv() * T_camera_board
+        RigidTransform.from_rotation(pitch)
+        * T_head_lrf
+        * pose_transform(cameras[camera]).inv()
+        * T_camera_board
     )
 
 
 def board_from_scan(obs, placement, head):
-    """``T_platform_board`` of a placement (by index) from its plane and where scans cross its edges.
+    """``T_platform_board`` of a placement (by index) from its plane and where scans cross its
+    edges.
 
     Raises DegenerateGeometry when fewer than two edges are crossed, or the scans span no plane.
     """
@@ -152,17 +200,23 @@ def board_from_scan(obs, placement, head):
 
 
 def _turn_in_plane(obs, placement, head, axes, centre):
-    """Turn (2, 2) and shift (2,) of the outline in the plane, from points on its edges (last beams on the board)."""
+    """Turn (2, 2) and shift (2,) of the outline in the plane, from points on its edges (last
+    beams on the board).
+    """
     beams = (obs.beam_placement == placement) & obs.beam_hit
     ray = polar_to_points(np.ones(beams.sum()), obs.beam_bearing[beams])
     o = lrf_to_platform(np.zeros_like(ray), obs.beam_pitch[beams], head)
     d = lrf_to_platform(ray, obs.beam_pitch[beams], head) - o
     x = (o + (((centre - o) @ axes[2]) / (d @ axes[2]))[:, None] * d - centre) @ axes[:2].T
-    edge, line = obs.beam_edge[beams], obs.lines()[obs.beam_edge[beams]]
+    edge = obs.beam_edge[beams]
+    line = obs.lines()[obs.beam_edge[beams]]
     crossed = np.sum(np.bincount(edge) >= FEWEST_ANGLE_POINTS)
     if crossed < 2:
-        raise DegenerateGeometry(f"placement {obs.placements[placement]}: scans cross {crossed} edges, two needed")
-    # n . (R^T x + t) + c = 0, linear in cosine and sine of the turn and in t; then the shift for that turn alone
+        raise DegenerateGeometry(
+            f"placement {obs.placements[placement]}: scans cross {crossed} edges, two needed"
+        )
+    # n . (R^T x + t) + c = 0, linear in cosine and sine of the turn and in t; then the shift for
+    # that turn alone
     sine = line[:, 0] * x[:, 1] - line[:, 1] * x[:, 0]
     A = np.column_stack([np.sum(line[:, :2] * x, axis=1), sine, line[:, :2]])
     c, s = np.linalg.lstsq(A, -line[:, 2], rcond=None)[0][:2]
