@@ -519,13 +519,10 @@ def _asked(joint):
     """Statements that the data contradict (Doubts), and one that stands for a range offset,
     which may be of them.
     """
-    # many backgrounds of different distance tell of the spot, others where a wrong one does harm
-    many = len(joint.solution.boards) >= MANY and np.any(
-        joint.solution.observations.beam_background
-    )
     stated = alternatives_of(joint.prepared)
     admitted = joint.prepared.session.lrf.admitted_offset
-    asked = doubtful(joint.solution, admitted, stated, faint=() if many else ("spot",))
+    # a spot that is no evenly lit disc looks like one of another size, which does no harm
+    asked = doubtful(joint.solution, admitted, stated, faint=("spot",))
     instead = not_an_offset(joint.solution, stated)
     return [instead] if instead and (not asked or asked[0].kind == instead.kind) else asked, instead
 

@@ -501,21 +501,34 @@ def name_words(direction, names, share=0.05):
 
 
 def placement_covariance(hessians, scores):
-    """First-order jackknife over g placements (CR3), from what each adds to the normal equations.
+    """First-order jackknife over g placements, from what each adds to the normal equations.
 
     `scores` are ``J^T r`` of each placement at the solution. Returned are the covariance and the
     changes (..., g, k) of the estimate when that placement is left out; None with fewer than three
     placements, or where the others do not determine the estimate.
+
+    Notes
+    -----
+    The sum of squared changes (CR3) is too large in the mean where placements carry unequal weight:
+    noise alone gives ``(g - 1) / g sum_g (inv(H - H_g) - inv(H))`` instead of ``inv(H)``. That
+    factor is taken off every unknown, so that scatter and noise can be compared.
     """
     groups = hessians.shape[-3]
     total = np.sum(hessians, axis=-3, keepdims=True)
     diagonal = np.sqrt(np.maximum(np.diagonal(total, axis1=-2, axis2=-1), 1e-300))
-    scaled = (total - hessians) / (diagonal[..., :, None] * diagonal[..., None, :])
+    outer = diagonal[..., :, None] * diagonal[..., None, :]
+    scaled = (total - hessians) / outer
     try:  # squared pivots: what the others say about one unknown more
         pivots = np.linalg.cholesky(scaled).diagonal(axis1=-2, axis2=-1)
     except np.linalg.LinAlgError:
         return None, None
     if groups < 3 or pivots.min() < 1e-6:
         return None, None
-    shifts = np.linalg.solve(scaled, (scores / diagonal)[..., None])[..., 0] / diagonal
-    return (groups - 1) / groups * np.swapaxes(shifts, -1, -2) @ shifts, shifts
+    without = np.linalg.inv(scaled)
+    shifts = (without @ (scores / diagonal)[..., None])[..., 0] / diagonal
+    share = (groups - 1) / groups
+    squares = share * np.swapaxes(shifts, -1, -2) @ shifts
+    whole = np.diagonal(np.linalg.inv(total / outer), axis1=-2, axis2=-1)
+    gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
+    factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
+    return factor[..., :, None] * squares * factor[..., None, :], shifts

@@ -60,8 +60,9 @@ class Solution:
         stated noise is too small, and the covariance is multiplied by `inflation`, chi-square per
         degree of freedom; never shrunk below 1.
     covariance_placements : ndarray, shape (..., k, k), or None
-        Clustered by placement: the jackknife to first order (CR3), ``(G - 1)/G sum_g d_g d_g^T``
-        where ``d_g`` is the change of the estimate when placement g is left out. Model errors are
+        Clustered by placement: the jackknife to first order, ``(G - 1)/G sum_g d_g d_g^T`` where
+        ``d_g`` is the change of the estimate when placement g is left out, scaled so that noise
+        alone gives the variances of `covariance` in the mean. Model errors are
         common to one placement, which the first covariance cannot know. None where one placement
         alone carries an unknown, or with fewer than three placements.
     n_placements : int
