@@ -1,5 +1,7 @@
 """The printed chessboard in an image: its inner corners at sub-pixel level, and the orders that they may have."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
@@ -8,11 +10,9 @@ SEARCH_PIXELS = 1.5e6  # larger images are searched at a reduced size: the detec
 REACH = 0.5  # half window around a corner, squares; the outermost squares of some boards are cut to 0.65
 WIDEST_WINDOW_PX = 15.0  # half window where squares are large, but for
 LEAST_REACH = 0.25  # of a square: large images are soft
-SAMPLES = 17  # across a window
-BLURS = 0.3, 0.1  # of the half window, one after the other: rough corners, then noise (0.25 to 0.20 px in lms400_zed)
+MARGIN = 2.0  # half windows around the corners: what a turned window and its blur reach
 REFINE_ROUNDS = 20
-FARTHEST_MOVE = 0.25  # of a square, in each round
-SETTLED_PX = 1e-3  # no corner moves by more: done
+FARTHEST_MOVE = 0.25  # of a square, in each look
 SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no second start
 BEYOND = 0.3  # where to look outside the outermost corners, squares
 LEAST_BEYOND = 0.25  # contrast there, a share of that inside
@@ -24,6 +24,21 @@ SCALE_ERROR = 0.001
 SCALE_ERROR_AT_PX = 6.0
 SCALE_ERROR_POWER = 6
 LARGEST_SCALE_ERROR = 0.01
+
+
+@dataclass(frozen=True)
+class Look:
+    """How windows around corners are compared with themselves."""
+
+    blur: float  # of the half window
+    samples: int  # across a window
+    order: int  # of the splines between pixels
+    settled_px: float  # no corner moves by more: done
+
+
+# rough corners need the wide blur; the narrow one then has less noise (0.20 px in lms400_zed, not 0.25)
+ROUGHLY = Look(blur=0.3, samples=9, order=1, settled_px=0.05)
+FINELY = Look(blur=0.1, samples=17, order=3, settled_px=1e-3)
 
 
 class PatternNotFound(ValueError):
@@ -195,57 +210,59 @@ def refine_corners(picture, corners, size):
     side = np.linalg.norm(square_axes(start, size), axis=1)  # (n, 2), pixels
     longest = side.max(axis=1)
     reach = np.clip(WIDEST_WINDOW_PX / longest, LEAST_REACH, REACH)  # (n,), squares
-    around = int(3 * np.max(reach * longest)) + 3
+    around = int(MARGIN * np.max(reach * longest)) + 3
     low = np.maximum(start.min(axis=0).astype(int) - around, 0)
     high = np.minimum(start.max(axis=0).astype(int) + around, picture.shape[::-1])
     if np.any(high - low < 3):
         return start
     part = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    half_window = np.median(reach[:, None] * side)
     kept = start - low
-    for blur in BLURS:
-        smooth = cv2.GaussianBlur(part, (0, 0), blur * np.median(reach[:, None] * side))
-        refined = symmetric_points(smooth, kept, size, reach)
-        moved = np.linalg.norm(refined - kept, axis=1)
-        kept = np.where((moved < FARTHEST_MOVE * longest)[:, None], refined, kept)
+    for look in (ROUGHLY, FINELY):
+        smooth = cv2.GaussianBlur(part, (0, 0), look.blur * half_window)
+        refined = symmetric_points(smooth, kept, size, reach, look)
+        near = np.linalg.norm(refined - kept, axis=1) < FARTHEST_MOVE * longest
+        kept = np.where(near[:, None], refined, kept)
     return kept + low
 
 
-def symmetric_points(picture, points, size, reach):
-    """Points (n, 2) of a grid about which windows of `reach` squares (n,) are symmetric, from near ones."""
-    place = np.linspace(-1, 1, SAMPLES)
-    u, v = np.meshgrid(place[SAMPLES // 2 + 1 :], place)  # the other half is what it is compared with
-    offsets = np.stack([u.ravel(), v.ravel()])
+def symmetric_points(picture, points, size, reach, look):
+    """Points (n, 2) of a grid about which windows of `reach` squares (n,) are symmetric."""
+    place = np.linspace(-1, 1, look.samples)
+    half = place[look.samples // 2 + 1 :]  # the other half is what it is compared with
+    offsets = np.stack(np.meshgrid(half, place)).reshape(2, -1)
     weight = np.prod((1 - offsets**2) ** 2, axis=0)
-    spline = spline_filter(picture, output=np.float32)
-    slopes = [cv2.Sobel(picture, cv2.CV_32F, *by, ksize=1, scale=0.5) for by in ((1, 0), (0, 1))]
+    spline = spline_filter(picture, look.order, np.float32) if look.order > 1 else picture
+    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
     last = np.array(picture.shape[::-1]) - 1
-
-    def values(source, places, order):
-        """Of a picture or its splines at places (n, m, 2)."""
-        at = places[..., ::-1].reshape(-1, 2).T
-        return map_coordinates(source, at, order=order, prefilter=False, mode="nearest").reshape(places.shape[:2])
-
-    def slope(places):
-        return np.stack([values(by, places, 1) for by in slopes], axis=2)
-
     for _ in range(REFINE_ROUNDS):
-        arms = (square_axes(points, size) @ offsets * reach[:, None, None]).swapaxes(1, 2)  # (n, m, 2)
-        there = points[:, None] + arms
-        opposite = points[:, None] - arms
-        inside = np.all((there >= 0) & (there <= last) & (opposite >= 0) & (opposite <= last), axis=2)
-        differs = values(spline, there, 3) - values(spline, opposite, 3)
-        jacobian = slope(there) - slope(opposite)
+        axes = square_axes(points, size) * reach[:, None, None]
+        arms = np.swapaxes(axes @ offsets, 1, 2)  # (n, m, 2)
+        pairs = np.stack([points[:, None] + arms, points[:, None] - arms])
+        inside = np.all((pairs >= 0) & (pairs <= last), axis=(0, 3))
+        there, opposite = sample(spline, pairs, look.order)
+        differs = there - opposite
+        by_u = np.subtract(*sample(slope_u, pairs))
+        by_v = np.subtract(*sample(slope_v, pairs))
+        jacobian = np.stack([by_u, by_v], axis=2)
         weighted = (inside * weight)[..., None] * jacobian
         normal = weighted.swapaxes(1, 2) @ jacobian
         right = weighted.swapaxes(1, 2) @ differs[..., None]
         step = -(np.linalg.pinv(normal, hermitian=True) @ right)[..., 0]
         length = np.linalg.norm(step, axis=1)
         # a third of the window at most: farther away other corners begin
-        most = reach * np.linalg.norm(square_axes(points, size), axis=1).min(axis=1) / 3
+        most = np.linalg.norm(axes, axis=1).min(axis=1) / 3
         points = points + step * np.minimum(1, most / np.maximum(length, most))[:, None]
-        if length.max() < SETTLED_PX:
+        if length.max() < look.settled_px:
             break
     return points
+
+
+def sample(picture, places, order=1):
+    """A picture, or its splines of an order, at places (..., 2), pixels."""
+    rows_first = np.moveaxis(places, -1, 0)[::-1]
+    return map_coordinates(picture, rows_first, order=order, prefilter=False, mode="nearest")
 
 
 def square_axes(corners, size):

@@ -14,6 +14,7 @@ from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_image import BoardView, order_scores, view_board
 from lrfcal_lib.preprocess.edges_in_image import OutlineNotSeen, board_line, common_lines, edge_votes, outward_line
 from lrfcal_lib.preprocess.intrinsics import board_pose, estimate_intrinsics, estimate_relief, first_pose
+from lrfcal_lib.preprocess.kept_images import KeptImages
 from lrfcal_lib.preprocess.pattern_in_image import (
     SMALL_SQUARE_PX,
     PatternFinder,
@@ -30,8 +31,6 @@ UPRIGHT = 0.05  # weight of the turn between two cameras where few placements te
 CLEARLY = 0.95  # a board frame whose z points into the board is believed when the other explains less than this share
 LEAST_VIEWS_FOR_RELIEF = 8
 VIEWS_FOR_INTRINSICS = 25  # of a camera with images taken for the intrinsics; more cost time and tell little
-# of images that are looked at again: 40 of a megapixel; with more, prepare takes above 500 MB
-REMEMBERED_BYTES = 100_000_000
 SAME_PLANE = 0.9999  # cosine between the normals of poses of which one is the other turned in its plane
 
 
@@ -112,31 +111,40 @@ def survey(records, read, board, models, picks=(), *, one_per_placement=False):
         If a camera has no intrinsics and the board no pattern, or too few images show it; if a pick names an edge that
         the board does not have.
     """
-    read = _remembering(read)
     marks = _marks(picks, board)
     plain, unknown = board.pattern is None, [c for c, m in models.items() if m is None]
     if plain and unknown:
         lost = f"camera '{unknown[0]}' has no intrinsics and board '{board.name}' no pattern to find them with"
         raise ValueError(f"{lost}: state them")
     finder = None if plain else PatternFinder(board.pattern)
+    kept = None if plain else KeptImages(read, board)
 
     def look(r, view, models, **options):
         """The board in one image, with what was picked in it by hand."""
-        return view_board(read(r), board, models[r.camera], view, marks.get((r.camera, r.file)), **options)
+        image = read(r) if plain else kept.around_board(r)
+        return view_board(image, board, models[r.camera], view, marks.get((r.camera, r.file)), **options)
 
     def begin(r):
         """The corners of the pattern in one image, in any order; all of a board that has none."""
-        return look(r, _view(r), models) if plain else _corners(_view(r), read(r), finder)
+        if plain:
+            return look(r, _view(r), models)
+        image = read(r)
+        view = _corners(_view(r), image, finder)
+        if not view.reason:
+            kept.keep(r, image, view.pixels)
+        return view
 
     usable = [r for r in records if not plain or r.purpose != "intrinsics"]
     groups = [group for c in models for group in _choices(usable, c, one_per_placement)]
+    if kept is not None and groups:
+        kept.make_room([r for group in groups for r in group], read(groups[0][0]))
     images = [_first(group, begin) for group in groups[:1]]  # tells the finder what to look for
     images += spread(lambda group: _first(group, begin), groups[1:])
     if plain:
         return Survey(_by_camera(models, _turned_alike([view for _, view in images])), dict(models), None, board)
     flat = spread(lambda c: models[c] or _intrinsics(c, images, board, read), models)
     flat = dict(zip(models, flat, strict=True))
-    images, lines, unseen = _ordered(images, read, board, flat)
+    images, lines, unseen = _ordered(images, kept.around_board, board, flat)
     models, relief = _with_relief(images, board, models, flat)
     images = [(r, view) for r, view in images if r.purpose != "intrinsics"]
     known, outline = board.corners is not None or unseen, None
@@ -204,22 +212,6 @@ def small_squares(views, pattern):
             "print larger squares"
         )
     return words
-
-
-def _remembering(read):
-    """The same function; the images that it read first are kept, as many as there is room for."""
-    kept = {}
-
-    def read_once(record):
-        """The image of a record."""
-        if record in kept:
-            return kept[record]
-        image = read(record)
-        if sum(other.nbytes for other in kept.values()) + image.nbytes <= REMEMBERED_BYTES:
-            kept[record] = image
-        return image
-
-    return read_once
 
 
 def _marks(picks, board):
