@@ -127,9 +127,12 @@ def check_image(image, board, model=None, name="image"):
     except PatternNotFound as error:
         why = "; too dark, more light or a longer exposure" if dark_image(image) else ""
         return Light(name, "bad", f"{error}{why}")
-    picture, grid = grey(image), corners.reshape(board.pattern.rows, board.pattern.columns, 2)
-    rise, centres = edge_rise(picture, grid), (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    squares, odd = _at(picture, centres), np.indices(centres.shape[:2]).sum(axis=0) % 2
+    picture = grey(image)
+    grid = corners.reshape(board.pattern.rows, board.pattern.columns, 2)
+    rise = edge_rise(picture, grid)
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    squares = _at(picture, centres)
+    odd = np.indices(centres.shape[:2]).sum(axis=0) % 2
     dark, white = sorted(np.median(squares[odd == i]) for i in (0, 1))
     faults = {
         "blurred, hold the board still and focus": rise > BLURRED_PX,
@@ -149,11 +152,13 @@ def edge_rise(picture, grid):
     """
     pairs = [(grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])]
     ends = np.stack([np.concatenate([pair[i].reshape(-1, 2) for pair in pairs]) for i in (0, 1)])
-    along, middle = ends[1] - ends[0], ends.mean(axis=0)
+    along = ends[1] - ends[0]
+    middle = ends.mean(axis=0)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     share = np.linspace(-0.35, 0.35, 57)
     values = _at(picture, middle[:, None] + share[:, None] * across[:, None])
-    low, high = values[:, :12].mean(axis=1), values[:, -12:].mean(axis=1)
+    low = values[:, :12].mean(axis=1)
+    high = values[:, -12:].mean(axis=1)
     height = (values - low[:, None]) / np.where(high == low, np.nan, high - low)[:, None]
     between = np.mean((height > 0.1) & (height < 0.9), axis=1)
     return float(np.median(between * np.ptp(share) * np.linalg.norm(along, axis=1)))

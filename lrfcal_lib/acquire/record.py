@@ -19,7 +19,8 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder, not_written
 
-FAILED, INTERRUPTED = 2, 130  # exit codes
+FAILED = 2
+INTERRUPTED = 130  # exit codes
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
 HOW = {  # a session was recorded, by the mode of the plan
     "stop-and-go": (

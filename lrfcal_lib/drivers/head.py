@@ -37,16 +37,26 @@ class Motion:
     """
 
     def __init__(self, line, settings):
-        self.line, self.settings, self._now = line, settings, line.host.now
-        self.abort, self.feedback, self.rows, self._misses = line.host.event(), False, [], 0
+        self.line = line
+        self.settings = settings
+        self._now = line.host.now
+        self.abort = line.host.event()
+        self.feedback = False
+        self.rows = []
+        self._misses = 0
         self.calibrated = settings.degrees_per_second is not None
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
         self._speeds = {settings.tilt_speed: {1: up, -1: down}}
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
         self._obeys = False if settings.absolute is False else None  # set-tilt; None until it was tried
-        self._dead, self._going, self._frame, self._repeated = set(), None, b"", 0.0
-        self._pitch, self._seen = None, 0.0
-        self._tolerance, self._arrival = math.radians(settings.tolerance_deg), math.radians(settings.arrival_deg)
+        self._dead = set()
+        self._going = None
+        self._frame = b""
+        self._repeated = 0.0
+        self._pitch = None
+        self._seen = 0.0
+        self._tolerance = math.radians(settings.tolerance_deg)
+        self._arrival = math.radians(settings.arrival_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
     # ------------------------------------------------------------------------------------------- what is known
@@ -121,7 +131,8 @@ class Motion:
 
     def pause(self, seconds):
         """Wait, repeating the motion for heads that want it; raises Stopped if it was ended meanwhile."""
-        end, every = self._now() + seconds, self.settings.repeat_s
+        end = self._now() + seconds
+        every = self.settings.repeat_s
         while True:
             due = math.inf if every is None or self._going is None else self._repeated + every
             if self._now() >= due:
@@ -136,7 +147,8 @@ class Motion:
 
         ``look()`` is called again and again; by default the head is asked where it is if there is time for that.
         """
-        way, reconnects = 1 if goal > self.estimate() else -1, self.line.counts["reconnects"]
+        way = 1 if goal > self.estimate() else -1
+        reconnects = self.line.counts["reconnects"]
         bit = UP if (way > 0) != self.settings.invert else DOWN
         self._frame = encode_frame(self.settings.address, command2=bit, data2=step)
 
@@ -171,15 +183,18 @@ class Motion:
         Rest elsewhere than at the target of a set-tilt counts after `stall_s` only, because it may not have begun.
         Raises NoReply if it stays silent, Refused if it does not come to rest.
         """
-        first, since = None, 0.0
+        first = None
+        since = 0.0
         while True:
-            reading, now = self.read(), self._now()
+            reading = self.read()
+            now = self._now()
             if reading is None:
                 first = None
             elif first is None or abs(reading[1] - first) > self._tolerance:
                 if first is not None and target is None:
                     self.stop()  # the one before was lost
-                first, since = reading[1], now
+                first = reading[1]
+                since = now
             else:
                 on_the_way = target is not None and abs(first - target) > self._arrival
                 if now - since >= max(self.settings.settle_s, self.settings.stall_s * on_the_way):
@@ -225,7 +240,8 @@ class Motion:
 
         Raises Refused if the head does not move, moves the other way, or gets no nearer.
         """
-        pitch, full = self.settle(deadline), self.settings.tilt_speed
+        pitch = self.settle(deadline)
+        full = self.settings.tilt_speed
         for _ in range(BURSTS):
             error = target - pitch
             steps = sorted({full, full // 4, full // 16} - self._dead, reverse=True)
@@ -234,7 +250,8 @@ class Motion:
                 return pitch
             step = next((step for step in steps if abs(error) >= 2 * ways[step]), steps[-1])
             took = self.run(pitch + SHORT_OF * error, step, GROWTH * self._longest)
-            before, pitch = pitch, self.settle(deadline)
+            before = pitch
+            pitch = self.settle(deadline)
             moved = (pitch - before) * math.copysign(1, error)
             if moved < -max(5 * self._tolerance, math.radians(1)):
                 raise Refused(OTHER_WAY)
@@ -250,15 +267,12 @@ class Motion:
             self._longest = max(self._longest, took)
         raise self._short_of(pitch, target)
 
-    def timed(self, target, seconds, deadline):
+    def timed(self, target, seconds):
         """Move by time, unless the shortest motion would lead further away; the pitch that results is dead reckoning.
 
-        Raises LineLost if the port vanished: the pitch is unknown then; Refused if there is not enough time.
+        Raises LineLost if the port vanished: the pitch is unknown then.
         """
-        needed_s = seconds + self.settings.start_delay_s
         if seconds >= self._shortest_s / 2:
-            if self._now() + needed_s > deadline:
-                raise Refused(f"the move takes {needed_s:.1f} s: give it a longer timeout")
             self.run(target, self.settings.tilt_speed)
             self.pause(self.settings.settle_s)
         return self.estimate()
@@ -295,9 +309,11 @@ class Motion:
 
 def drawn_to_readings(rows):
     """Track of a sweep out of its rows: what lies between two readings is stretched to both, what is outside is not."""
-    track, told = [row[:3] for row in rows], [i for i, row in enumerate(rows) if row[2]]
+    track = [row[:3] for row in rows]
+    told = [i for i, row in enumerate(rows) if row[2]]
     for first, last in itertools.pairwise(told):
-        start, way = rows[first][1], rows[last][3] - rows[first][1]
+        start = rows[first][1]
+        way = rows[last][3] - rows[first][1]
         stretch = (rows[last][1] - start) / way if way else 1.0
         for i in range(first + 1, last):
             track[i] = (rows[i][0], start + stretch * (rows[i][1] - start), False)
@@ -329,8 +345,11 @@ class PanTilt(port.Closed):
     """
 
     def __init__(self, path, settings, *, host=REAL):
-        self.settings, self._lock = settings, threading.Lock()
-        self._line, self._thread, self._error = HeadLine(path, settings, host), None, None
+        self.settings = settings
+        self._lock = threading.Lock()
+        self._line = HeadLine(path, settings, host)
+        self._thread = None
+        self._error = None
         self.motion = Motion(self._line, settings)
         try:
             self._probe()
@@ -341,7 +360,9 @@ class PanTilt(port.Closed):
 
     def _probe(self):
         """Stop the head, ask whether it tells its tilt, and see who answers."""
-        settings, line, start = self.settings, self._line, math.radians(self.settings.start_pitch_deg)
+        settings = self.settings
+        line = self._line
+        start = math.radians(self.settings.start_pitch_deg)
         line.stop()
         reading = self.motion.read(settings.retries) if settings.feedback is not False else None
         if reading is None and line.counts["skipped"] > pelco_d.FRAME * line.counts["frames"]:
@@ -379,7 +400,8 @@ class PanTilt(port.Closed):
             LOG.error("the head could not be stopped (%s): cut its power if it moves", error)
         finally:
             port.release(self)
-            line, self._line = self._line, None
+            line = self._line
+            self._line = None
             line.close()
 
     def emergency_stop(self):
@@ -439,10 +461,10 @@ class PanTilt(port.Closed):
             raise DeviceError("the head is moving already: stop it, or wait for it")
         self.motion.abort.clear()
 
-    def move_to(self, pitch, timeout=None):
+    def move_to(self, pitch):
         """Move and wait until the head rests.
 
-        By default it may take twice the time that the way takes, and 10 s; a lost line adds `reconnect_s`.
+        It may take twice the time that the way takes, and 10 s; a lost line adds `reconnect_s`.
 
         Returns
         -------
@@ -463,13 +485,14 @@ class PanTilt(port.Closed):
             If it was stopped meanwhile.
         """
         self._begin(pitch)
-        motion, now = self.motion, self._line.host.now
+        motion = self.motion
+        now = self._line.host.now
         try:
             if self.has_feedback and motion.read(self.settings.retries) is None:
                 raise NoReply(self._silence())
             way = pitch - motion.estimate()
             seconds = abs(way) / motion.speed(way, self.settings.tilt_speed)
-            deadline = now() + (2 * seconds + 10 if timeout is None else timeout)
+            deadline = now() + 2 * seconds + 10
             while self.has_feedback:
                 try:
                     return motion.move(pitch, deadline)
@@ -477,7 +500,7 @@ class PanTilt(port.Closed):
                     if now() >= deadline:
                         raise
                     self._line.opened()
-            return motion.timed(pitch, seconds, deadline)
+            return motion.timed(pitch, seconds)
         except BaseException:
             self.emergency_stop()
             raise
@@ -507,7 +530,8 @@ class PanTilt(port.Closed):
             finally:
                 self._lock.release()
 
-        self.motion.rows, self._error = [], None
+        self.motion.rows = []
+        self._error = None
         self._thread = self._line.host.thread(run, "sweep")
         self._thread.start()
 

@@ -123,7 +123,10 @@ class LMS2xx(Closed):
             self._link.close()
             self._link = None
 
-    baudrate = property(lambda self: self._opened().baudrate, doc="Of both ends of the line.")
+    @property
+    def baudrate(self):
+        """Of both ends of the line."""
+        return self._opened().baudrate
 
     @property
     def counts(self):
@@ -362,8 +365,10 @@ class LMS2xx(Closed):
         self._thread = self._host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
-    interval_s = property(lambda self: (4 if self._interlaced else 1) * self._assembler.interval_s,
-                          doc="Seconds between two scans of the stream.")  # fmt: skip
+    @property
+    def interval_s(self):
+        """Seconds between two scans of the stream."""
+        return (4 if self._interlaced else 1) * self._assembler.interval_s
 
     def _stream(self):
         self._prepare(self._interlaced)

@@ -16,7 +16,6 @@ NAK = 0x15
 MODE = 0x20
 VALUES = 0x30
 STATUS = 0x31
-ERRORS = 0x32
 TYPE = 0x3A
 VARIANT = 0x3B
 CONFIGURATION = 0x74
@@ -45,7 +44,11 @@ class Arrival(NamedTuple):
 
     raw: bytes
     time_s: float
-    code = property(lambda self: self.raw[4], doc="Of the reply.")
+
+    @property
+    def code(self):
+        """Of the reply."""
+        return self.raw[4]
 
 
 def transfer_s(size, baudrate):
@@ -79,13 +82,20 @@ class Link:
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
 
-    baudrate = property(lambda self: self._port.baudrate, doc="Of this end of the line.")
-    silent_s = property(
-        lambda self: self.host.now() - self._last, doc="Seconds since the last byte, or request."
-    )
-    acknowledged = property(
-        lambda self: self._stray == ACK, doc="Whether the last stray byte is ACK."
-    )
+    @property
+    def baudrate(self):
+        """Of this end of the line."""
+        return self._port.baudrate
+
+    @property
+    def silent_s(self):
+        """Seconds since the last byte, or request."""
+        return self.host.now() - self._last
+
+    @property
+    def acknowledged(self):
+        """Whether the last stray byte is ACK."""
+        return self._stray == ACK
 
     @property
     def declined(self):

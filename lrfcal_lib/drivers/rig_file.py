@@ -10,12 +10,15 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, StrictBool, StrictStr, model_validator
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionStated, parse_session, refused
 
-PURPOSES = ("board", "scene")
-MOST_STOPS, FINEST_DEG, MOST_BYTES, MOST_PLACEMENTS = 5000, 1e-3, 10_000_000, 1000
+MOST_STOPS = 5000
+FINEST_DEG = 1e-3
+MOST_BYTES = 10_000_000
+MOST_PLACEMENTS = 1000
 STOPS = f"first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops are needed"
 
 
@@ -55,11 +58,12 @@ def several(kind, count):
 Text = Annotated[StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")]
 Angle = number(-180, 180, "deg")
 Perhaps = Literal["auto", True, False]
-Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01, 360, "deg/s")
+Near = number(1e-4, 45, "deg")
+Seconds = number(0, 60, "s")
+Speed = number(0.01, 360, "deg/s")
 ORDER = "the lower one comes first"
 
 
-RATES = (9600, 19200, 38400, 500000)  # of an LMS2xx
 OTHER_RATE = (
     "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range finder is driven here; "
     "record it by a program of your own that writes a session (lrfcal_lib.session.write.SessionWriter)"
@@ -238,7 +242,8 @@ class Plan(Stated):
             images = self.image_pitch_deg if one.image_pitch_deg is None else one.image_pitch_deg
             stops = stops if self.placements or i % 2 else stops[::-1]
             number = i if one.number is None else one.number
-            found.append(Placement(number, stops, tuple(map(math.radians, images)), PURPOSES[not one.board]))
+            purpose = "board" if one.board else "scene"
+            found.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
         return found
 
 
@@ -315,7 +320,8 @@ def rig_of(data, path=Path("rig.json")):
             raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
         given = {"name": "rig", "licence": "", "source": "", "simulated": False} | data | {"placements": ()}
         stated = parse_session({k: v for k, v in given.items() if v is not None}, RigFileStated)
-        devices, cameras = stated["devices"].cameras, stated["cameras"]
+        devices = stated["devices"].cameras
+        cameras = stated["cameras"]
         if set(devices) != set(cameras):
             raise ValueError(f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
                              f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip

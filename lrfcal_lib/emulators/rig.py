@@ -52,14 +52,18 @@ class EmulatedRig:
     """
 
     def __init__(self, setup, *, folder=None, seed=0, placements=None, head_options=None, rest_s=0.5, host=REAL):
-        self.setup, self.host, self._closing = setup, host, contextlib.ExitStack()
+        self.setup = setup
+        self.host = host
+        self._closing = contextlib.ExitStack()
         own = None if folder else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
         self.folder = Path(folder or self._closing.enter_context(own))
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.world, shared = EmulatedWorld(setup, host, seed, placements), {"host": host, "seed": seed}
+        self.world = EmulatedWorld(setup, host, seed, placements)
+        shared = {"host": host, "seed": seed}
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared)
         self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
-        self.scans, self.camera_server = self.lrf.scans, CameraServer(self.world, seed=seed, rest_s=rest_s)
+        self.scans = self.lrf.scans
+        self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
         self.camera_urls = {name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras}
         self._parts = self.lrf, self.pan_tilt, self.camera_server
         for part in self._parts:
@@ -75,7 +79,8 @@ class EmulatedRig:
         """Remove all devices, and the folder where it was made here."""
         self._closing.close()
 
-    __enter__, __exit__ = start, close
+    __enter__ = start
+    __exit__ = close
 
     def error(self):
         """What ended a device by itself, None while all live."""
@@ -83,7 +88,8 @@ class EmulatedRig:
 
     def plan(self):
         """What a recording of this rig can do: the sweep that holds all placements, and each of them."""
-        setup, each = self.setup, []
+        setup = self.setup
+        each = []
         for p in self.world.placements.values():
             board = p.T_platform_board is not None
             step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
@@ -102,7 +108,9 @@ class EmulatedRig:
 
     def rig_file(self):
         """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
-        rig, setup, head = self.setup.rig, self.setup, self.pan_tilt
+        rig = self.setup.rig
+        setup = self.setup
+        head = self.pan_tilt
         cameras = {c.name: c for c in rig.camera_infos()}
         return {
             "schema": stated.SCHEMA, "name": f"{setup.name}_emulated", "licence": "CC-BY-4.0", "simulated": True,
@@ -221,7 +229,8 @@ def written_rig_file(rig, file):
 
 def summary(rig, file):
     """What other programs need to know of an emulated rig, as text."""
-    head, control = rig.pan_tilt, rig.camera_server.control
+    head = rig.pan_tilt
+    control = rig.camera_server.control
     places = ", ".join(map(str, rig.world.placements))
     lines = [
         f"emulated rig '{rig.setup.name}' ({rig.setup.rig.beam.name}); Ctrl-C ends it",

@@ -117,7 +117,8 @@ def table(df, name, digits=3, caption=""):
         words = str if column == "source" else in_words  # a session is called as it is
         shown[column] = [v if v is None or isinstance(v, Number) else escape(words(v)) for v in shown[column]]
     styler = shown.style.format(shapes, na_rep="–").format_index(lambda c: escape(in_words(c, True)), axis=1)
-    styler, caption = styler.hide(axis="index").set_uuid(name), caption or in_words(name).capitalize()
+    styler = styler.hide(axis="index").set_uuid(name)
+    caption = caption or in_words(name).capitalize()
     made = styler.set_caption(escape(caption)).to_html()
     _record("tables", name, {"name": name, "caption": caption, "html": made})
     return HTML(made)

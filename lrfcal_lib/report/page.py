@@ -57,7 +57,8 @@ def render(notebook, found, number, folder):
     figures = {entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
                for n, entry in enumerate(found["figures"], start=1)}  # fmt: skip
     tables = {e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)}
-    body, color = [], Highlight2HTML(pygments_lexer="ipython3")
+    body = []
+    color = Highlight2HTML(pygments_lexer="ipython3")
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             renderer = Renderer(escape=False, attachments=cell.get("attachments", {}), exclude_anchor_links=True)
@@ -93,7 +94,8 @@ def _figure(folder, entry, label):
     """A figure that holds its picture, as large as it was drawn; '' where its notebook failed before drawing it."""
     if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
         return ""
-    data, caption = file.read_bytes(), html.escape(entry["caption"])
+    data = file.read_bytes()
+    caption = html.escape(entry["caption"])
     width = round(int.from_bytes(data[16:20]) * PIXELS_PER_INCH)
     picture = f'<img alt="{caption}" width="{width}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
     return (f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
@@ -104,7 +106,8 @@ def _table(entry, label):
     """A table, folded where it is long."""
     made = turned(entry["html"])
     rows = made.count("<tr>") - 1
-    file, caption = f"tables/{entry['name']}.csv", html.escape(entry["caption"])
+    file = f"tables/{entry['name']}.csv"
+    caption = html.escape(entry["caption"])
     return (f'<details class="table" id="T-{entry["name"]}"{" open" if rows <= SHORT else ""}><summary>'
             f'<b>{label}.</b> {caption} <span class="soft">({rows} rows, <a href="{file}">CSV</a>)</span></summary>'
             f"{made}</details>")  # fmt: skip

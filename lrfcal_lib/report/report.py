@@ -34,7 +34,8 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import RECORDINGS
 
-NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
+NOTEBOOKS = ROOT / "notebooks"
+NUMBERED = "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
 OWN_FILES = (  # folders, files to link to, the page itself
     "figures", "tables", "parts", "calibration.json", "scene.html", "cloud.ply", "scene.ply", "scene.pcd",
@@ -121,7 +122,8 @@ def execute(path, environment):
 
     Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback of that cell or ''.
     """
-    notebook, error = nbformat.read(path, as_version=4), ""
+    notebook = nbformat.read(path, as_version=4)
+    error = ""
     place = {"metadata": {"path": str(Path(path).parent)}}
     options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
@@ -191,12 +193,14 @@ def _stop(number, frame):
 
 
 def _report(session, out, jobs):
-    begin, out = time.monotonic(), Path(out or ROOT / "reports" / session.resolve().name).resolve()
+    begin = time.monotonic()
+    out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
         print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
-    good, seconds = len(runs) - len(failed), time.monotonic() - begin
+    good = len(runs) - len(failed)
+    seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
     return int(bool(failed))
 
@@ -230,8 +234,8 @@ def _take_place(new, out):
     """Exchange two folders; files in the old one that are no report's come along.
 
     At every moment, also that of a kill, there is a report: the old one or the new one. Where the
-    system cannot exchange folders (file systems over a network, macOS), each file of the new one
-    takes the place of an old one.
+    system cannot exchange folders (file systems over a network, macOS), there is none for the
+    moment between two renames, and a kill in that moment leaves the old one beside it.
     """
 
     def ours(folder, names):
@@ -240,7 +244,13 @@ def _take_place(new, out):
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
     if not _exchanged(new, out):
-        _move_files(new, out)
+        old = new.with_name("old")
+        try:
+            out.replace(old)
+            new.replace(out)
+        finally:
+            if not out.exists():  # interrupted in between
+                old.replace(out)
 
 
 def _is_ours(name):
@@ -255,17 +265,6 @@ def _exchanged(one, other):
         return False
     here = AT_WORKING_FOLDER
     return rename(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0
-
-
-def _move_files(new, out):
-    """Move every file of a folder into another one, first page last; then remove a report's old files."""
-    files = sorted(file.relative_to(new) for file in new.rglob("*") if not file.is_dir())
-    for file in sorted(files, key=lambda file: file == Path("index.html")):
-        (out / file.parent).mkdir(parents=True, exist_ok=True)
-        (new / file).replace(out / file)
-    for file in (file.relative_to(out) for file in out.rglob("*") if not file.is_dir()):
-        if _is_ours(file.parts[0]) and file not in files:
-            (out / file).unlink(missing_ok=True)
 
 
 def _execute_all(paths, environment, jobs):

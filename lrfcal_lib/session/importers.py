@@ -32,7 +32,10 @@ LASERSETERO_HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])
 LASERSETERO_CLOUD = RigidTransform.from_translation([0.0, 0.0, 0.2])  # T_cloud_platform
 # The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of bolted plates.
 LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
-STEP_DEG, FIRST, LAST = 0.1, 550, 1250  # the LMS400 sees 70 deg: from the first to the last of these steps
+# the LMS400 sees 70 deg: from the first to the last of these steps
+STEP_DEG = 0.1
+FIRST = 550
+LAST = 1250
 COUNT = 0.001  # metres, one count of the LMS400
 LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
 # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5

@@ -6,7 +6,9 @@ from functools import lru_cache
 import numpy as np
 
 STX = 0x02
-HOST, DEVICE = 0x00, 0x80  # address byte of telegrams to and from a device with the factory's address
+# address byte of telegrams to and from a device with the factory's address
+HOST = 0x00
+DEVICE = 0x80
 LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices
 OVERHEAD = 6  # start, address, length, CRC
 CHUNK = 512  # telegrams worked on at once: what fits into the cache of a processor
@@ -107,7 +109,8 @@ def parse_telegram(raw):
     stated = int.from_bytes(raw[2:4], "little") + OVERHEAD
     if stated != len(raw):
         raise TelegramError(f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream")
-    sent, computed = int.from_bytes(raw[-2:], "little"), crc16(raw[:-2])
+    sent = int.from_bytes(raw[-2:], "little")
+    computed = crc16(raw[:-2])
     if sent != computed:
         raise TelegramError(f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again")
     reply = raw[1] >= DEVICE and len(raw) > OVERHEAD + 1
@@ -137,7 +140,8 @@ def split_stream(data, *, replies=True):
     offset = offset[(data[offset + 1] >= DEVICE) == replies]
     length = word(data, offset + 2) + OVERHEAD
     plausible = (length > OVERHEAD) & (length <= LONGEST)
-    offset, length = offset[plausible], length[plausible]
+    offset = offset[plausible]
+    length = length[plausible]
     ends = offset + length
     whole = ends <= len(data)
     good = np.zeros(len(offset), bool)
@@ -147,7 +151,8 @@ def split_stream(data, *, replies=True):
         for row in np.flatnonzero(good):
             good[row] = offset[row] >= free
             free = ends[row] if good[row] else free
-    used, before = ends[good].max(initial=0), np.searchsorted(offset[good], offset, side="right") - 1
+    used = ends[good].max(initial=0)
+    before = np.searchsorted(offset[good], offset, side="right") - 1
     inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
     begun = offset[~whole & (offset >= used)]
     tail = max(len(data) - 3, int(used))  # too few bytes to state a length
@@ -205,8 +210,16 @@ class Mode:
     """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper ones flags."""
 
     bits: int
-    top = property(lambda self: (1 << self.bits) - 1, doc="Largest number the range bits hold: 'not valid'.")
-    largest = property(lambda self: self.top - 9, doc="Largest number that is a range; the nine above are special.")
+
+    @property
+    def top(self):
+        """Largest number the range bits hold: 'not valid'."""
+        return (1 << self.bits) - 1
+
+    @property
+    def largest(self):
+        """Largest number that is a range; the nine above are special."""
+        return self.top - 9
 
 
 # flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others: level of a reflector
@@ -229,7 +242,6 @@ class Scans:
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
         Real-time indices, modulo 256; -1 where the device does not send them.
-    status, address : ndarray of uint8, shape (n,)
     """
 
     rows: np.ndarray
@@ -240,8 +252,6 @@ class Scans:
     partial: np.ndarray
     scan_index: np.ndarray
     telegram_index: np.ndarray
-    status: np.ndarray
-    address: np.ndarray
 
     @property
     def reasons(self):
@@ -273,7 +283,8 @@ def encode_values(ranges, *, unit="mm", mode=0, reasons=None):
     reasons : array_like of int, optional
         Index into `REASONS` for each value; where it is not 0 the range does not count.
     """
-    ranges, mode = np.asarray(ranges, float), MODES[mode]
+    ranges = np.asarray(ranges, float)
+    mode = MODES[mode]
     reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons, int)
     counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[unit])
     reasons = np.where(reasons > 0, reasons, np.where(np.isnan(ranges), 1, BEYOND * (counts > mode.largest)))
@@ -296,17 +307,6 @@ def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, add
     tail = b"" if indices is None else bytes(i % 256 for i in indices)
     data = head + count.to_bytes(2, "little") + np.asarray(words, "<u2").tobytes() + tail
     return encode_telegram(code, data, status=status, address=address)
-
-
-def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, **options):
-    """Telegram 0xB0 of a scan: :func:`encode_values`, then :func:`encode_words` with the other options.
-
-    Examples
-    --------
-    >>> encode_scan([4.0, np.inf, np.nan], unit="cm").hex(" ")
-    '02 80 0a 00 b0 03 00 90 01 f7 1f ff 1f 10 a2 f5'
-    """
-    return encode_words(encode_values(ranges, unit=unit, mode=mode, reasons=reasons), unit=unit, **options)
 
 
 def decode_scan(raw, mode=0):
@@ -342,17 +342,25 @@ def decode_scans(data, offset, length, mode=0):
     """
     if mode not in MODES:  # others send no range with special values
         raise ValueError(f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)")
-    data, length = np.frombuffer(data, np.uint8), np.asarray(length)
+    data = np.frombuffer(data, np.uint8)
+    length = np.asarray(length)
     rows = np.flatnonzero(length >= 10)
     rows = rows[data[offset[rows] + 4] == SCAN]
     head = word(data, offset[rows] + 5)
     extra = length[rows] - 10 - 2 * (head & 0x3FF)
     sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
-    rows, head, extra, out = rows[sound], head[sound], extra[sound], []
+    rows = rows[sound]
+    head = head[sound]
+    extra = extra[sound]
+    out = []
     for group in alike(head & 0xE3FF, extra):
-        at, head_of, indexed = offset[rows[group]], head[group], extra[group[0]] > 0
-        values, unit = int(head_of[0] & 0x3FF), UNITS[head_of[0] >> 14]
-        words, ranges = np.empty((len(at), values), np.uint16), np.empty((len(at), values))
+        at = offset[rows[group]]
+        head_of = head[group]
+        indexed = extra[group[0]] > 0
+        values = int(head_of[0] & 0x3FF)
+        unit = UNITS[head_of[0] >> 14]
+        words = np.empty((len(at), values), np.uint16)
+        ranges = np.empty((len(at), values))
         for first in range(0, len(at), CHUNK):
             some = slice(first, first + CHUNK)
             words[some] = cut(data, at[some] + 7, 2 * values).view("<u2")
@@ -362,7 +370,7 @@ def decode_scans(data, offset, length, mode=0):
         last = at + 7 + 2 * values + 2 * indexed
         indices = (data[last - k].astype(int) if indexed else np.full(len(at), -1) for k in (2, 1))
         partial = np.where(head_of >> 13 & 1, head_of >> 11 & 3, -1)
-        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices, data[last], data[at + 1]))
+        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices))
     return out
 
 
@@ -384,7 +392,11 @@ def scan_quarters(values, partial=-1):
     return first + step * np.arange(values)
 
 
-STATUS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xBA, 0xBB, 0xF4, 0xF7
+STATUS = 0xB1
+TYPE = 0xBA
+VARIANT = 0xBB
+CONFIGURATION = 0xF4
+CONFIGURED = 0xF7
 CONFIGURATION_BYTES = 34
 
 
@@ -410,8 +422,6 @@ class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
     firmware: str
-    serial: str
-    fault: int  # 0 for a sound device
     measuring_mode: int
     scan_angle_deg: float
     resolution_deg: float
@@ -425,9 +435,20 @@ class Configuration:
 
     block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
 
-    realtime_indices = property(lambda self: bool(self.block[4] & 2), doc="Whether scans carry their indices.")
-    measuring_mode = property(lambda self: self.block[5], doc="Key of `MODES`.")
-    unit = property(lambda self: unit_of(self.block[6:]), doc="'cm' or 'mm'.")
+    @property
+    def realtime_indices(self):
+        """Whether scans carry their indices."""
+        return bool(self.block[4] & 2)
+
+    @property
+    def measuring_mode(self):
+        """Key of `MODES`."""
+        return self.block[5]
+
+    @property
+    def unit(self):
+        """'cm' or 'mm'."""
+        return unit_of(self.block[6:])
 
     def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
         """The same Configuration with other values; what is None stays."""
@@ -439,9 +460,9 @@ class Configuration:
         return Configuration(bytes(block))
 
 
-def encode_configuration(configuration, status=0x10):
+def encode_configuration(configuration):
     """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring mode)."""
-    return encode_telegram(CONFIGURATION, configuration.block, status=status)
+    return encode_telegram(CONFIGURATION, configuration.block, status=0x10)
 
 
 def reply_data(raw, code, shortest):
@@ -457,9 +478,14 @@ def reply_data(raw, code, shortest):
 def parse_status(raw):
     """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or too short."""
     data = bytes([STATUS]) + reply_data(raw, STATUS, 123)  # counted as in the manual, which calls the code 0
-    variant = float(whole(data[107:109])), whole(data[109:111]) / 100
-    words = text(data[1:8]), text(data[10:18])
-    return DeviceStatus(*words, data[9], data[102], *variant, data[120], unit_of(data[122:]))
+    return DeviceStatus(
+        firmware=text(data[1:8]),
+        measuring_mode=data[102],
+        scan_angle_deg=float(whole(data[107:109])),
+        resolution_deg=whole(data[109:111]) / 100,
+        address=data[120],
+        unit=unit_of(data[122:]),
+    )
 
 
 def parse_type(raw):

@@ -199,7 +199,8 @@ def missing_parts(placements, scans, records, cameras, unfinished=None):
 
 def inside(path, name, where):
     """The file a session names; it must lie inside the session's folder (no ``..`` or absolute path)."""
-    windows, posix = PureWindowsPath(name), PurePosixPath(name)
+    windows = PureWindowsPath(name)
+    posix = PurePosixPath(name)
     if windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts:
         raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
     if not name.isprintable():
@@ -212,7 +213,8 @@ def read_images(path, facts, unfinished=None):
 
     Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
     """
-    file, cameras = path / "images.csv", facts["cameras"]
+    file = path / "images.csv"
+    cameras = facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
     out = []
@@ -323,7 +325,9 @@ SMALLEST_MOVE = 1e-4
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
-SCAN, REMARK = b"\xff\xda", b"\xff\xe1"  # markers, which do not occur within coded pixels
+# markers, which do not occur within coded pixels
+SCAN = b"\xff\xda"
+REMARK = b"\xff\xe1"
 MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write about ten
 # of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
 MOST_SEGMENTS = 10_000

@@ -159,7 +159,10 @@ def _still_there(file, stream):
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
-LARGEST_TEXT, DEEPEST_JSON, MOST_ROWS = 8_000_000, 30, 200_000  # bytes of a JSON or CSV file, levels
+# bytes of a JSON or CSV file, levels
+LARGEST_TEXT = 8_000_000
+DEEPEST_JSON = 30
+MOST_ROWS = 200_000
 
 
 @contextmanager
@@ -288,7 +291,9 @@ ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobo
 def in_words(error):
     """The first mistake that pydantic found: where, value, what is needed."""
     first = error.errors(include_url=False)[0]
-    where, kind, value = ".".join(map(str, first["loc"])) or "it", first["type"], ascii(first["input"])
+    where = ".".join(map(str, first["loc"])) or "it"
+    kind = first["type"]
+    value = ascii(first["input"])
     if kind == "missing":
         return f"{where} is missing"
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
@@ -329,7 +334,8 @@ Name = Annotated[str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z
 EdgeName = Annotated[str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)]
 Whole = Annotated[int, Field(ge=0, le=1_000_000)]
 Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
-Positive, Length = Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0, le=1)]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Length = Annotated[FiniteFloat, Field(gt=0, le=1)]
 Angle = Annotated[FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))]
 Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
 Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
@@ -350,13 +356,9 @@ def transform_to_json(transform):
     """A RigidTransform (or None) as rotation vector and translation."""
     if transform is None:
         return None
-    turn, shift = transform.rotation.as_rotvec().tolist(), transform.translation.tolist()
+    turn = transform.rotation.as_rotvec().tolist()
+    shift = transform.translation.tolist()
     return {"rotation_vector_rad": turn, "translation_m": shift}
-
-
-def transform_from_json(data):
-    """Inverse of :func:`transform_to_json`; ValueError for a wrong one."""
-    return None if data is None else from_json(TransformStated, data).made()
 
 
 Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None

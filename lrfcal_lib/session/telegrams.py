@@ -48,8 +48,8 @@ class TelegramLog:
     values: np.ndarray
     problems: tuple[str, ...]
 
-    def report(self, placement=None):
-        """What became of the recorded telegrams, of a placement or (by default) of all.
+    def report(self):
+        """What became of the recorded telegrams.
 
         Returns
         -------
@@ -57,13 +57,12 @@ class TelegramLog:
             'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
             'wrong_crc_offsets' : tuple of int.
         """
-        rows = np.ones(len(self.offset), bool) if placement is None else self.placement == placement
-        outcomes = np.bincount(self.outcome[rows], minlength=len(OUTCOMES)).tolist()
+        outcomes = np.bincount(self.outcome, minlength=len(OUTCOMES)).tolist()
         return {
-            "telegrams": int(rows.sum()),
+            "telegrams": len(self.offset),
             "outcomes": dict(zip(OUTCOMES, outcomes, strict=True)),
-            "values": dict(zip(codec.REASONS, self.values[rows].sum(axis=0).tolist(), strict=True)),
-            "wrong_crc_offsets": tuple(self.offset[rows & (self.outcome == WRONG)].tolist()),
+            "values": dict(zip(codec.REASONS, self.values.sum(axis=0).tolist(), strict=True)),
+            "wrong_crc_offsets": tuple(self.offset[self.outcome == WRONG].tolist()),
         }
 
 

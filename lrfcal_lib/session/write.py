@@ -361,7 +361,8 @@ def append_file(file, content, within):
     """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
     left = memoryview(content.encode() if isinstance(content, str) else content)
     with stated.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
-        handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
+        handle = stream.fileno()
+        begin = os.fstat(stream.fileno()).st_size
         try:
             while left:
                 left = left[os.write(handle, left) :]
@@ -383,7 +384,10 @@ class SessionRecorder(SessionWriter):
     or one that states another board or rig, where it goes on.
     """
 
-    finished = property(lambda self: tuple(self.data["placements"]), doc="Numbers of the finished placements.")
+    @property
+    def finished(self):
+        """Numbers of the finished placements."""
+        return tuple(self.data["placements"])
 
     def __init__(self, *rig, resume=False, **about):
         self._resume = resume
