@@ -1,4 +1,6 @@
-"""Is what was just recorded any good? Lights for one placement of the board, from what is on the disk."""
+"""Is what was just recorded any good? Lights for one placement of the board, from what is on the
+disk.
+"""
 
 from dataclasses import dataclass
 
@@ -23,7 +25,9 @@ LOW_CONTRAST = 25  # grey levels between white and dark squares
 
 @dataclass(frozen=True)
 class Light:
-    """One check; its text says what was seen, and what to do where the state is not 'ok' but 'warn' or 'bad'."""
+    """One check; its text says what was seen, and what to do where the state is not 'ok' but 'warn'
+    or 'bad'.
+    """
 
     name: str
     state: str
@@ -39,13 +43,14 @@ def check_placement(session, placement, advice=None):
         Opened after the placement was finished.
     placement : int
     advice : callable, optional
-        ``advice(session)`` says in a sentence what the next placement should add; '' if all is known well enough.
+        ``advice(session)`` says in a sentence what the next placement should add; '' if all is
+        known well enough.
 
     Returns
     -------
     list of Light
-        'scan', 'edges', one for each camera, and 'information' where there is advice. Nothing is raised for data that
-        cannot be used: that is what the lights are for.
+        'scan', 'edges', one for each camera, and 'information' where there is advice. Nothing is
+        raised for data that cannot be used: that is what the lights are for.
     """
     try:
         sweep = session.sweep(placement)
@@ -63,13 +68,23 @@ def check_placement(session, placement, advice=None):
         images = [session.read_image(record) for record in session.images(name, placement)]
         found = [check_image(image, session.board, camera.model) for image in images]
         good = [light for light in found if light.state != "bad"]
-        worst = max(good or found, key=lambda light: STATES.index(light.state), default=Light("", "bad", "no image"))
+        worst = max(
+            good or found,
+            key=lambda light: STATES.index(light.state),
+            default=Light("", "bad", "no image"),
+        )
         state = "warn" if 0 < len(good) < len(found) else worst.state
         text = f"{len(good)} of {len(found)} images: {worst.text}" if found else worst.text
         lights.append(Light(f"camera {name}", state, text))
     if advice is not None:
         text = advice(session)
-        lights.append(Light("information", "warn" if text else "ok", text or "every direction is well determined"))
+        lights.append(
+            Light(
+                "information",
+                "warn" if text else "ok",
+                text or "every direction is well determined",
+            )
+        )
     return lights
 
 
@@ -80,21 +95,36 @@ def check_repetition(session, placement):
 
 
 def check_scan(sweep, board, T_head_lrf=None, lrf=None):
-    """Lights of a Sweep (None where there is no range at all): 'scan' and, where the board was found, 'edges'."""
+    """Lights of a Sweep (None where there is no range at all): 'scan' and, where the board was
+    found, 'edges'.
+    """
     if sweep is None:
-        return [Light("scan", "bad", "no scan line with a range: is something close before the window?")]
+        return [
+            Light("scan", "bad", "no scan line with a range: is something close before the window?")
+        ]
     try:
         found = board_in_scan.find_board(sweep, board, T_head_lrf, lrf)
     except board_in_scan.BoardNotFound as error:
-        return [Light("scan", "bad", f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls")]
+        return [
+            Light(
+                "scan",
+                "bad",
+                f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls",
+            )
+        ]
     rows = np.flatnonzero(found.mask.any(axis=1))
-    text = f"board on {len(rows)} scan lines at {abs(found.distance):.2f} m, {1000 * found.sigma_range:.1f} mm rms"
+    text = (
+        f"board on {len(rows)} scan lines at {abs(found.distance):.2f} m, "
+        f"{1000 * found.sigma_range:.1f} mm rms"
+    )
     cut = [end for end, row in (("first", 0), ("last", len(sweep.pitch) - 1)) if row in rows]
     light = Light("scan", "ok", text)
     if len(rows) < FEWEST_LINES:
         light = Light("scan", "warn", f"{text}: take a smaller step, or go nearer")
     elif cut and np.ptp(sweep.pitch) > 0:
-        light = Light("scan", "warn", f"{text}; the {' and '.join(cut)} line hits it: sweep farther")
+        light = Light(
+            "scan", "warn", f"{text}; the {' and '.join(cut)} line hits it: sweep farther"
+        )
     return [light, _edges(found)]
 
 
@@ -102,12 +132,16 @@ def _edges(found):
     """How many straight sides of the board the scans cross, and how."""
     along, known = crossings(found)
     sides = {side.side: side for side in along["half_step"].sides}
-    for side in crossings(found, True, known)[0]["half_step"].sides if np.ptp(found.sweep.pitch) > 0 else ():
+    for side in (
+        crossings(found, True, known)[0]["half_step"].sides if np.ptp(found.sweep.pitch) > 0 else ()
+    ):
         sides.setdefault(side.side, side)
     good = [side for side in sides.values() if side.n_points >= FEWEST_CROSSINGS]
     told = ", ".join(f"{s.n_points} crossings at {np.degrees(s.angle):.0f} deg" for s in good)
     if not good:
-        return Light("edges", "bad", "no straight side: turn the board so that scan lines cross its edges")
+        return Light(
+            "edges", "bad", "no straight side: turn the board so that scan lines cross its edges"
+        )
     ways = np.array([np.subtract(*side.ends) for side in good])
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     if np.abs(ways @ ways.T).min() < PARALLEL:
@@ -116,12 +150,22 @@ def _edges(found):
 
 
 def check_image(image, board, model=None, name="image"):
-    """The Light, of this name, of an image of the Board; one without a pattern needs a CameraModel."""
+    """The Light, of this name, of an image of the Board; one without a pattern needs a
+    CameraModel.
+    """
     if board.pattern is None:
         if model is None:
-            return Light(name, "warn", "not checked: the board has no pattern, and the camera no intrinsics yet")
+            return Light(
+                name,
+                "warn",
+                "not checked: the board has no pattern, and the camera no intrinsics yet",
+            )
         view = view_board(image, board, model)
-        return Light(name, "bad", view.reason) if view.reason else Light(name, "ok", f"{len(view.edges)} edges")
+        return (
+            Light(name, "bad", view.reason)
+            if view.reason
+            else Light(name, "ok", f"{len(view.edges)} edges")
+        )
     try:
         corners = PatternFinder(board.pattern)(image)
     except PatternNotFound as error:
@@ -146,9 +190,11 @@ def check_image(image, board, model=None, name="image"):
 
 
 def edge_rise(picture, grid):
-    """Median distance in which the edges between squares rise from 10 to 90 %, pixels: 2.6 sigma of a Gaussian blur.
+    """Median distance in which the edges between squares rise from 10 to 90 %, pixels: 2.6 sigma of
+    a Gaussian blur.
 
-    `grid` (rows, columns, 2) has the inner corners of the chessboard in a picture (h, w); at most 0.7 of a square.
+    `grid` (rows, columns, 2) has the inner corners of the chessboard in a picture (h, w); at most
+    0.7 of a square.
     """
     pairs = [(grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])]
     ends = np.stack([np.concatenate([pair[i].reshape(-1, 2) for pair in pairs]) for i in (0, 1)])

@@ -27,8 +27,7 @@ HOW = {  # a session was recorded, by the mode of the plan
         "stop-and-go: the head rests at every pitch step, scans and images are taken at rest"
     ),
     "continuous": (
-        "continuous: scans are taken while the head moves, "
-        "each with the pitch at its middle beam"
+        "continuous: scans are taken while the head moves, each with the pitch at its middle beam"
     ),
 }
 
@@ -156,7 +155,9 @@ class Recording(Closed):
         return light
 
     def check(self, number, advice=None):
-        """Lights of a finished placement, see :func:`~lrfcal_lib.acquire.checks.check_placement`."""
+        """Lights of a finished placement, see
+        :func:`~lrfcal_lib.acquire.checks.check_placement`.
+        """
         return check_placement(open_session(self.path), number, advice)
 
     def drop(self, number):

@@ -6,8 +6,24 @@ import math
 import threading
 
 from lrfcal_lib.drivers import pelco_d, port
-from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, SET_TILT, UP, HeadLine, encode_extended, encode_frame
-from lrfcal_lib.drivers.port import REAL, DeviceError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
+from lrfcal_lib.drivers.pelco_d import (
+    DOWN,
+    FASTEST,
+    SET_TILT,
+    UP,
+    HeadLine,
+    encode_extended,
+    encode_frame,
+)
+from lrfcal_lib.drivers.port import (
+    REAL,
+    DeviceError,
+    LineLost,
+    NoReply,
+    OutOfRange,
+    Refused,
+    WrongDevice,
+)
 
 LOG = logging.getLogger(__name__)
 ASSUMED = 4.0, 4.0  # deg/s
@@ -15,13 +31,17 @@ BURSTS = 25  # of up and down, to reach one pitch
 FIRST_BURST_S = 0.1  # of a head whose speed is unknown
 GROWTH = 4  # of bursts while the speed is being learnt
 SURPRISE = math.radians(3)  # from dead reckoning: then a reading is not believed at once
-SHORT_OF = 0.9  # part of the way that a burst is meant to make, so that the last ones come from one side
+# part of the way that a burst is meant to make, so that the last ones come from one side
+SHORT_OF = 0.9
 LEAST_S = 1e-4  # of a wait worth its while
 MISSES = 3  # queries without a reply, after which a head that is swept is not asked any more
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
 STOPPED = "the head was stopped before it arrived"
-INTERRUPTED = ("the head's line was lost, and the head stopped when it came back: move or sweep again; where it tells "
-               "nothing look where it stands, and call set_pitch")  # fmt: skip
+INTERRUPTED = (
+    "the head's line was lost, and the head stopped when it came back: move or sweep again; "
+    "where it tells "
+    "nothing look where it stands, and call set_pitch"
+)
 
 
 class Stopped(DeviceError):
@@ -29,11 +49,12 @@ class Stopped(DeviceError):
 
 
 class Motion:
-    """Motions of one axis, its speeds, and where it must be by now; rad, rad/s, instants of the host.
+    """Motions of one axis, its speeds, and where it must be by now; rad, rad/s, instants of the
+    host.
 
-    While the event `abort` is set nothing moves the head. `feedback`: it tells its tilt, if maybe not while it moves;
-    `calibrated`: its speed was stated or measured, not assumed; `rows` are of a sweep: host time, pitch, whether it was
-    measured, and dead reckoning before that was known.
+    While the event `abort` is set nothing moves the head. `feedback`: it tells its tilt, if maybe
+    not while it moves; `calibrated`: its speed was stated or measured, not assumed; `rows` are of a
+    sweep: host time, pitch, whether it was measured, and dead reckoning before that was known.
     """
 
     def __init__(self, line, settings):
@@ -48,7 +69,8 @@ class Motion:
         up, down = map(math.radians, settings.degrees_per_second or ASSUMED)
         self._speeds = {settings.tilt_speed: {1: up, -1: down}}
         self._longest = math.inf if self.calibrated else FIRST_BURST_S / GROWTH
-        self._obeys = False if settings.absolute is False else None  # set-tilt; None until it was tried
+        # set-tilt; None until it was tried
+        self._obeys = False if settings.absolute is False else None
         self._dead = set()
         self._going = None
         self._frame = b""
@@ -59,10 +81,13 @@ class Motion:
         self._arrival = math.radians(settings.arrival_deg)
         self._shortest_s = 2 * line.wire_s() + settings.gap_s  # of a motion and its stop
 
-    # ------------------------------------------------------------------------------------------- what is known
+    # -------------------------------------------------------------------------------------------
+    # what is known
 
     def speed(self, way, step):
-        """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they were used."""
+        """Speed upwards (`way` > 0) or downwards; of other speed bytes in proportion, until they
+        were used.
+        """
         nearest = min(self._speeds, key=lambda other: abs(other - step))
         return self._speeds[nearest][1 if way > 0 else -1] * max(step, 1) / max(nearest, 1)
 
@@ -72,17 +97,23 @@ class Motion:
         self.calibrated = True
 
     def know(self, pitch, instant=None):
-        """The head was at a pitch (None: nobody knows where it is) at an instant, by default now."""
+        """The head was at a pitch (None: nobody knows where it is) at an instant, by
+        default now.
+        """
         self._pitch, self._seen = pitch, self._now() if instant is None else instant
 
     def estimate(self, instant=None):
         """Dead reckoning at an instant, by default now; DeviceError if nothing is known."""
         if self._pitch is None:
-            raise DeviceError("where the head stands is unknown since its line was lost: look, and call set_pitch")
+            raise DeviceError(
+                "where the head stands is unknown since its line was lost: look, and call set_pitch"
+            )
         if self._going is None:
             return self._pitch
         way, step, begun = self._going
-        seconds = (self._now() if instant is None else instant) - max(self._seen, begun + self.settings.start_delay_s)
+        seconds = (self._now() if instant is None else instant) - max(
+            self._seen, begun + self.settings.start_delay_s
+        )
         return self._pitch + way * self.speed(way, step) * max(0.0, seconds)
 
     def read(self, retries=0):
@@ -110,9 +141,12 @@ class Motion:
             self._misses = 0 if reading else self._misses + 1
         now = self._now()
         instant, pitch, reckoned = reading or (now, self.estimate(now), self.estimate(now))
-        self.rows.append((self.line.host.time() - (now - instant), pitch, reading is not None, reckoned))
+        self.rows.append(
+            (self.line.host.time() - (now - instant), pitch, reading is not None, reckoned)
+        )
 
-    # ------------------------------------------------------------------------------------------ start and stop
+    # ------------------------------------------------------------------------------------------
+    # start and stop
 
     def _send(self, frame):
         """Send what moves the head, but never after the last stop; its instant."""
@@ -130,7 +164,9 @@ class Motion:
         return ended
 
     def pause(self, seconds):
-        """Wait, repeating the motion for heads that want it; raises Stopped if it was ended meanwhile."""
+        """Wait, repeating the motion for heads that want it; raises Stopped if it was ended
+        meanwhile.
+        """
         end = self._now() + seconds
         every = self.settings.repeat_s
         while True:
@@ -143,9 +179,11 @@ class Motion:
                 return
 
     def run(self, goal, step, longest_s=math.inf, look=None):
-        """Move towards a pitch until the head must be there, at most for so long; the seconds it took.
+        """Move towards a pitch until the head must be there, at most for so long; the seconds it
+        took.
 
-        ``look()`` is called again and again; by default the head is asked where it is if there is time for that.
+        ``look()`` is called again and again; by default the head is asked where it is if there is
+        time for that.
         """
         way = 1 if goal > self.estimate() else -1
         reconnects = self.line.counts["reconnects"]
@@ -165,7 +203,10 @@ class Motion:
                 while left() > LEAST_S and self.line.counts["reconnects"] == reconnects:
                     if look is not None:
                         look()
-                    elif self.feedback and left() > self._shortest_s + self.settings.reply_s + pelco_d.READ_S:
+                    elif (
+                        self.feedback
+                        and left() > self._shortest_s + self.settings.reply_s + pelco_d.READ_S
+                    ):
                         self.read()
                     self.pause(min(left(), self.settings.poll_s))
             finally:
@@ -180,8 +221,8 @@ class Motion:
     def settle(self, deadline, target=None):
         """Wait until the head rests; its pitch.
 
-        Rest elsewhere than at the target of a set-tilt counts after `stall_s` only, because it may not have begun.
-        Raises NoReply if it stays silent, Refused if it does not come to rest.
+        Rest elsewhere than at the target of a set-tilt counts after `stall_s` only, because it may
+        not have begun. Raises NoReply if it stays silent, Refused if it does not come to rest.
         """
         first = None
         since = 0.0
@@ -203,11 +244,18 @@ class Motion:
                 break
             self.pause(self.settings.poll_s)
         if first is None:
-            raise NoReply(f"the head at {self.line.path} stopped telling its tilt: check its power and the wires")
-        raise Refused(f"the head does not come to rest, {math.degrees(first):.2f} deg by now: give it more time, a "
-                      "higher tolerance_deg, or look whether it can get there")  # fmt: skip
+            raise NoReply(
+                f"the head at {self.line.path} stopped telling its tilt: check its power and the "
+                "wires"
+            )
+        raise Refused(
+            f"the head does not come to rest, {math.degrees(first):.2f} deg by now: give it more "
+            "time, a "
+            "higher tolerance_deg, or look whether it can get there"
+        )
 
-    # --------------------------------------------------------------------------------------------------- moves
+    # ---------------------------------------------------------------------------------------------
+    # moves
 
     def move(self, target, deadline):
         """Reach a pitch by set-tilt where the head obeys, else by up and down.
@@ -215,7 +263,8 @@ class Motion:
         Raises Refused if it obeys, but does not get there.
         """
         value = pelco_d.encode_tilt(self.settings.elevation(target))
-        for _ in range(2 if self._obeys is not False else 0):  # the first may be lost, or come while it was still busy
+        # the first may be lost, or come while it was still busy
+        for _ in range(2 if self._obeys is not False else 0):
             self._send(encode_extended(self.settings.address, SET_TILT, value))
             pitch = self.settle(deadline, target)
             if abs(pitch - target) <= self._arrival:
@@ -226,14 +275,19 @@ class Motion:
         if self._obeys is None:
             self._obeys = False
             if self.settings.absolute is True:
-                raise Refused("the head does not obey set-tilt (4D): state absolute false to use up and down")
+                raise Refused(
+                    "the head does not obey set-tilt (4D): state absolute false to use up and down"
+                )
             LOG.warning("the head does not obey set-tilt (4D): it is moved by up and down")
         return self.steer(target, deadline)
 
     @staticmethod
     def _short_of(pitch, target):
-        return Refused(f"the head stays at {math.degrees(pitch):.2f} deg on its way to {math.degrees(target):.2f}: "
-                       "look for an end stop, or narrow pitch_limits_deg")  # fmt: skip
+        return Refused(
+            f"the head stays at {math.degrees(pitch):.2f} deg on its way to "
+            f"{math.degrees(target):.2f}: "
+            "look for an end stop, or narrow pitch_limits_deg"
+        )
 
     def steer(self, target, deadline):
         """Reach a pitch by up and down, each time as long as the way that is left takes.
@@ -245,7 +299,8 @@ class Motion:
         for _ in range(BURSTS):
             error = target - pitch
             steps = sorted({full, full // 4, full // 16} - self._dead, reverse=True)
-            ways = {step: self._shortest_s * self.speed(error, step) for step in steps}  # of the shortest bursts
+            # of the shortest bursts
+            ways = {step: self._shortest_s * self.speed(error, step) for step in steps}
             if abs(error) <= max(self._arrival, ways[steps[-1]]):
                 return pitch
             step = next((step for step in steps if abs(error) >= 2 * ways[step]), steps[-1])
@@ -261,14 +316,18 @@ class Motion:
                 self._dead.add(step)
                 if step == full:
                     self._dead.clear()
-                    raise Refused("the head does not move: look for an end stop, its power, and whether tilt_speed "
-                                  "suffices")  # fmt: skip
+                    raise Refused(
+                        "the head does not move: look for an end stop, its power, and whether "
+                        "tilt_speed "
+                        "suffices"
+                    )
                 continue
             self._longest = max(self._longest, took)
         raise self._short_of(pitch, target)
 
     def timed(self, target, seconds):
-        """Move by time, unless the shortest motion would lead further away; the pitch that results is dead reckoning.
+        """Move by time, unless the shortest motion would lead further away; the pitch that results
+        is dead reckoning.
 
         Raises LineLost if the port vanished: the pitch is unknown then.
         """
@@ -278,7 +337,9 @@ class Motion:
         return self.estimate()
 
     def sweep(self, goal, step):
-        """Move to a pitch at a speed byte and note where the head is on the way, and where it rests."""
+        """Move to a pitch at a speed byte and note where the head is on the way, and where it
+        rests.
+        """
         self._misses = 0
         self.note()
         first = self.estimate()
@@ -289,11 +350,17 @@ class Motion:
             """Note where the head is; what goes wrong in a sweep ends it."""
             self.note(brief=True)
             if self._now() > deadline:
-                raise Refused("the sweep does not get to its end: look for an end stop, or state degrees_per_second")
+                raise Refused(
+                    "the sweep does not get to its end: look for an end stop, or state "
+                    "degrees_per_second"
+                )
             if (self.rows[-1][1] - first) * way < -math.radians(2):
                 raise Refused(OTHER_WAY)
             if self.feedback and self._misses >= MISSES and not self.calibrated:
-                raise NoReply("the head is silent while it moves and its speed is unknown: state degrees_per_second")
+                raise NoReply(
+                    "the head is silent while it moves and its speed is unknown: state "
+                    "degrees_per_second"
+                )
             told = [row for row in self.rows[1:] if row[2]]
             if told and abs(told[-1][1] - told[0][1]) >= 10 * self._tolerance:
                 self.learn(way, step, abs(told[-1][1] - told[0][1]) / (told[-1][0] - told[0][0]))
@@ -308,7 +375,9 @@ class Motion:
 
 
 def drawn_to_readings(rows):
-    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what is outside is not."""
+    """Track of a sweep out of its rows: what lies between two readings is stretched to both, what
+    is outside is not.
+    """
     track = [row[:3] for row in rows]
     told = [i for i, row in enumerate(rows) if row[2]]
     for first, last in itertools.pairwise(told):
@@ -321,7 +390,8 @@ def drawn_to_readings(rows):
 
 
 class PanTilt(port.Closed):
-    """A head on a serial line; a context manager. It is stopped on every way out, Ctrl-C and SIGTERM included.
+    """A head on a serial line; a context manager. It is stopped on every way out, Ctrl-C and
+    SIGTERM included.
 
     Parameters
     ----------
@@ -366,28 +436,43 @@ class PanTilt(port.Closed):
         line.stop()
         reading = self.motion.read(settings.retries) if settings.feedback is not False else None
         if reading is None and line.counts["skipped"] > pelco_d.FRAME * line.counts["frames"]:
-            raise WrongDevice(f"{line.path} sends {line.counts['skipped']} bytes that are no Pelco-D at "
-                              f"{settings.baudrate} Bd: another device, another rate, or Pelco-P")  # fmt: skip
+            raise WrongDevice(
+                f"{line.path} sends {line.counts['skipped']} bytes that are no Pelco-D at "
+                f"{settings.baudrate} Bd: another device, another rate, or Pelco-P"
+            )
         if settings.echo is True and not line.counts["echoed"]:
-            raise NoReply(f"{line.path} does not echo what is sent: check the adapter and its power")
+            raise NoReply(
+                f"{line.path} does not echo what is sent: check the adapter and its power"
+            )
         if settings.echo is False and line.counts["echoed"]:
-            LOG.warning("%s echoes what is sent, which was not expected: echoes are removed", line.path)
+            LOG.warning(
+                "%s echoes what is sent, which was not expected: echoes are removed", line.path
+            )
         if reading is None and settings.feedback is True:
             raise NoReply(self._silence())
         self.has_feedback = self.motion.feedback = reading is not None
         if not self.has_feedback:
             self.motion.know(start)
             how = "stated" if self.motion.calibrated else "assumed, state degrees_per_second"
-            LOG.warning("the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
-                              "its pitch is not measured", *(settings.degrees_per_second or ASSUMED),
-                              how, settings.start_pitch_deg)  # fmt: skip
+            LOG.warning(
+                "the head does not tell its tilt: timed moves at %g/%g deg/s (%s), from %.2f deg; "
+                "its pitch is not measured",
+                *(settings.degrees_per_second or ASSUMED),
+                how,
+                settings.start_pitch_deg,
+            )
 
     def _silence(self):
-        echo = "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
+        echo = (
+            "what was sent came back, so the adapter works: " if self._line.counts["echoed"] else ""
+        )
         return (
-            f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the wires A and B, "
-            f"address {self.settings.address} and {self.settings.baudrate} Bd; state a longer reply_s than "
-            f"{self.settings.reply_s:g} s if it answers late, or feedback \"auto\" to go on without its tilt"
+            f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the "
+            "wires A and B, "
+            f"address {self.settings.address} and {self.settings.baudrate} Bd; state a longer "
+            "reply_s than "
+            f'{self.settings.reply_s:g} s if it answers late, or feedback "auto" to go on '
+            "without its tilt"
         )
 
     def close(self):
@@ -414,13 +499,16 @@ class PanTilt(port.Closed):
         if self._line is None:
             raise DeviceError("the head is closed: open it again")
 
-    # ---------------------------------------------------------------------------------------------------- pitch
+    # ---------------------------------------------------------------------------------------------
+    # pitch
 
     def pitch(self):
-        """Where the head points now, rad, up positive, and whether it was measured (else it is dead reckoning).
+        """Where the head points now, rad, up positive, and whether it was measured (else it is dead
+        reckoning).
 
-        NoReply if it rests and does not answer, LineLost if the port did not come back, DeviceError if the head was
-        closed, or the pitch of one without feedback is unknown after its line was lost.
+        NoReply if it rests and does not answer, LineLost if the port did not come back, DeviceError
+        if the head was closed, or the pitch of one without feedback is unknown after its line was
+        lost.
         """
         self._need_open()
         if self.has_feedback:
@@ -440,10 +528,13 @@ class PanTilt(port.Closed):
         """Whether a move or sweep of this object is under way."""
         return self._lock.locked()
 
-    # ---------------------------------------------------------------------------------------------------- moves
+    # ---------------------------------------------------------------------------------------------
+    # moves
 
     def stop(self):
-        """End every motion; the move that another thread waits for raises. LineLost if the port stays away."""
+        """End every motion; the move that another thread waits for raises. LineLost if the port
+        stays away.
+        """
         self._need_open()
         self.motion.abort.set()
         self.motion.stop()
@@ -455,8 +546,11 @@ class PanTilt(port.Closed):
         self._need_open()
         low, high = self.settings.pitch_limits_deg
         if not low - 1e-6 <= math.degrees(pitch) <= high + 1e-6:
-            raise OutOfRange(f"pitch {math.degrees(pitch):.2f} deg is beyond the head's limits of {low:g} to {high:g} "
-                             "deg: ask for less, or widen pitch_limits_deg if the head can do it")  # fmt: skip
+            raise OutOfRange(
+                f"pitch {math.degrees(pitch):.2f} deg is beyond the head's limits of {low:g} to "
+                f"{high:g} "
+                "deg: ask for less, or widen pitch_limits_deg if the head can do it"
+            )
         if not self._lock.acquire(blocking=False):
             raise DeviceError("the head is moving already: stop it, or wait for it")
         self.motion.abort.clear()
@@ -508,11 +602,12 @@ class PanTilt(port.Closed):
             self._lock.release()
 
     def start_sweep(self, stop_at, speed=None):
-        """Start a thread that moves the head to a pitch, rad, notes where it is, and stops it there.
+        """Start a thread that moves the head to a pitch, rad, notes where it is, and stops it
+        there.
 
-        The speed byte is 0 (very slow) to 0x3F, by default ``settings.tilt_speed``; one that was not calibrated is
-        taken to be in proportion. Raises OutOfRange beyond the limits, ValueError for a speed that does not exist; what
-        goes wrong later is raised by :meth:`finish_sweep`.
+        The speed byte is 0 (very slow) to 0x3F, by default ``settings.tilt_speed``; one that was
+        not calibrated is taken to be in proportion. Raises OutOfRange beyond the limits, ValueError
+        for a speed that does not exist; what goes wrong later is raised by :meth:`finish_sweep`.
         """
         step = self.settings.tilt_speed if speed is None else speed
         if step not in range(FASTEST + 1):
@@ -546,7 +641,8 @@ class PanTilt(port.Closed):
 
     @property
     def track(self):
-        """List of host time, pitch in rad and whether it was measured, of the sweep that runs or ran last.
+        """List of host time, pitch in rad and whether it was measured, of the sweep that runs or
+        ran last.
 
         Between readings the pitch is dead reckoning, which is drawn to the readings.
         """

@@ -1,4 +1,6 @@
-"""A whole emulated rig: its devices in one world, rigs for practice, ``python -m lrfcal_lib emulate``."""
+"""A whole emulated rig: its devices in one world, rigs for practice, ``python -m lrfcal_lib
+emulate``.
+"""
 
 import contextlib
 import json
@@ -19,7 +21,8 @@ from lrfcal_lib.emulators.world import CameraServer, EmulatedWorld, scaled
 from lrfcal_lib.session import stated
 from lrfcal_lib.simulate.rig import PLACES, load_setup, pairs, random
 
-SILENCE_S = 600.0  # that says nothing about an emulated camera: it sends no image while the head moves
+# that says nothing about an emulated camera: it sends no image while the head moves
+SILENCE_S = 600.0
 LOOK_S = 0.5
 PRACTICE = "practice"
 SMALL = 400  # pixels of an image's width of the practice rig: its chessboard is still found at 2 m
@@ -27,7 +30,8 @@ MARGIN = np.radians(1.0)  # of a sweep beyond the board
 
 
 class EmulatedRig:
-    """The devices of a simulated setup, as files and addresses that any program can open; a context manager.
+    """The devices of a simulated setup, as files and addresses that any program can open; a context
+    manager.
 
     Parameters
     ----------
@@ -51,20 +55,38 @@ class EmulatedRig:
     ...     rig.world.put(1)
     """
 
-    def __init__(self, setup, *, folder=None, seed=0, placements=None, head_options=None, rest_s=0.5, host=REAL):
+    def __init__(
+        self,
+        setup,
+        *,
+        folder=None,
+        seed=0,
+        placements=None,
+        head_options=None,
+        rest_s=0.5,
+        host=REAL,
+    ):
         self.setup = setup
         self.host = host
         self._closing = contextlib.ExitStack()
-        own = None if folder else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
+        own = (
+            None
+            if folder
+            else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
+        )
         self.folder = Path(folder or self._closing.enter_context(own))
         self.folder.mkdir(parents=True, exist_ok=True)
         self.world = EmulatedWorld(setup, host, seed, placements)
         shared = {"host": host, "seed": seed}
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared)
-        self.pan_tilt = EmulatedHead(self.world.head, path=self.folder / "head", **shared, **(head_options or {}))
+        self.pan_tilt = EmulatedHead(
+            self.world.head, path=self.folder / "head", **shared, **(head_options or {})
+        )
         self.scans = self.lrf.scans
         self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
-        self.camera_urls = {name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras}
+        self.camera_urls = {
+            name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras
+        }
         self._parts = self.lrf, self.pan_tilt, self.camera_server
         for part in self._parts:
             self._closing.callback(part.close)
@@ -87,14 +109,27 @@ class EmulatedRig:
         return self.lrf.error or self.pan_tilt.error
 
     def plan(self):
-        """What a recording of this rig can do: the sweep that holds all placements, and each of them."""
+        """What a recording of this rig can do: the sweep that holds all placements, and each of
+        them.
+        """
         setup = self.setup
         each = []
         for p in self.world.placements.values():
             board = p.T_platform_board is not None
-            step = math.degrees(setup.step if board or not setup.room_sweep else setup.room_sweep[2])
-            sweep, images = (np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch))
-            each.append({"number": p.number, "board": board, "pitch_deg": [*sweep, step], "image_pitch_deg": images})
+            step = math.degrees(
+                setup.step if board or not setup.room_sweep else setup.room_sweep[2]
+            )
+            sweep, images = (
+                np.degrees(angles).round(4).tolist() for angles in (p.sweep, p.image_pitch)
+            )
+            each.append(
+                {
+                    "number": p.number,
+                    "board": board,
+                    "pitch_deg": [*sweep, step],
+                    "image_pitch_deg": images,
+                }
+            )
         boards = [p for p in each if p["board"]] or each
         ends = np.array([p["pitch_deg"][:2] for p in boards])
         return {
@@ -102,39 +137,64 @@ class EmulatedRig:
             "scans_per_stop": 1,
             "intrinsics_images": setup.intrinsics_views,
             "pitch_deg": [math.floor(ends.min()), math.ceil(ends.max()), math.degrees(setup.step)],
-            "image_pitch_deg": np.unique(np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))).tolist(),
+            "image_pitch_deg": np.unique(
+                np.round(np.concatenate([p["image_pitch_deg"] for p in boards]))
+            ).tolist(),
             "placements": each,
         }
 
     def rig_file(self):
-        """Statement of the rig for recording, as JSON: board and rig as in session.json, devices, plan."""
+        """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
+        plan.
+        """
         rig = self.setup.rig
         setup = self.setup
         head = self.pan_tilt
         cameras = {c.name: c for c in rig.camera_infos()}
         return {
-            "schema": stated.SCHEMA, "name": f"{setup.name}_emulated", "licence": "CC-BY-4.0", "simulated": True,
+            "schema": stated.SCHEMA,
+            "name": f"{setup.name}_emulated",
+            "licence": "CC-BY-4.0",
+            "simulated": True,
             "source": f"emulated rig of the setup '{setup.name}', seed {setup.seed}",
             "board": stated.board_to_json(rig.board),
-            "rig": {"lrf": stated.lrf_to_json(rig.beam.info("emulated")),
-                    "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
-                    "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()}},
+            "rig": {
+                "lrf": stated.lrf_to_json(rig.beam.info("emulated")),
+                "platform": {"T_head_lrf": stated.transform_to_json(rig.T_head_lrf_stated)},
+                "cameras": {name: stated.camera_to_json(c) for name, c in cameras.items()},
+            },
             "devices": {
-                "lrf": {"port": self.lrf.path, "baudrate": 500000, "interlaced": False, "unit": rig.beam.unit_name,
-                        "variant": [rig.beam.field_of_view, rig.beam.resolution / 100]},
-                "head": {"port": head.path, "address": head.address, "baudrate": head.baudrate,
-                         "feedback": head.feedback != "none",
-                         "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist()},
-                "cameras": {name: {"source": self.camera_urls[name], "silence_s": SILENCE_S,
-                                   "size": [c.width, c.height]} for name, c in cameras.items()},
+                "lrf": {
+                    "port": self.lrf.path,
+                    "baudrate": 500000,
+                    "interlaced": False,
+                    "unit": rig.beam.unit_name,
+                    "variant": [rig.beam.field_of_view, rig.beam.resolution / 100],
+                },
+                "head": {
+                    "port": head.path,
+                    "address": head.address,
+                    "baudrate": head.baudrate,
+                    "feedback": head.feedback != "none",
+                    "pitch_limits_deg": np.degrees(rig.platform.limits).round(6).tolist(),
+                },
+                "cameras": {
+                    name: {
+                        "source": self.camera_urls[name],
+                        "silence_s": SILENCE_S,
+                        "size": [c.width, c.height],
+                    }
+                    for name, c in cameras.items()
+                },
                 "control": self.camera_server.control,
             },
             "plan": self.plan(),
-        }  # fmt: skip
+        }
 
 
 def practice_setup():
-    """A rig and placements that are recorded in a minute: coarse sweeps, small images, intrinsics stated.
+    """A rig and placements that are recorded in a minute: coarse sweeps, small images, intrinsics
+    stated.
 
     Returns
     -------
@@ -143,16 +203,29 @@ def practice_setup():
     """
     quick = load_setup("sim_quick")
     rig = scaled(quick.rig, SMALL)
-    rig = replace(rig, cameras=tuple(replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras),
-                  platform=replace(rig.platform, settle=0.0))  # fmt: skip
-    setup = replace(quick, name=PRACTICE, rig=rig, pairs=3, distances=(1.3, 1.7), step=np.radians(1.0),
-                    intrinsics_views=0, room_sweep=(), room_images=())  # fmt: skip
+    rig = replace(
+        rig,
+        cameras=tuple(replace(c, exposure=replace(c.exposure, samples=2)) for c in rig.cameras),
+        platform=replace(rig.platform, settle=0.0),
+    )
+    setup = replace(
+        quick,
+        name=PRACTICE,
+        rig=rig,
+        pairs=3,
+        distances=(1.3, 1.7),
+        step=np.radians(1.0),
+        intrinsics_views=0,
+        room_sweep=(),
+        room_images=(),
+    )
     found = pairs(setup.rig, setup.pairs, setup.distances, random(setup, PLACES), MARGIN)
     return setup, [replace(p, image_pitch=(p.image_pitch[0], p.image_pitch[-1])) for p in found]
 
 
 def emulated(name):
-    """An emulated rig ('practice', or a set-up), not started yet, and what makes its rig file (parsed) once it is.
+    """An emulated rig ('practice', or a set-up), not started yet, and what makes its rig file
+    (parsed) once it is.
 
     ValueError for another name.
     """
@@ -160,7 +233,9 @@ def emulated(name):
         rig = EmulatedRig(load_setup(name))
         return rig, rig.rig_file
     setup, placements = practice_setup()
-    rig = EmulatedRig(setup, placements=placements, head_options={"baudrate": 38400, "go_speed": 60.0})
+    rig = EmulatedRig(
+        setup, placements=placements, head_options={"baudrate": 38400, "go_speed": 60.0}
+    )
     return rig, lambda: quick_file(rig)
 
 
@@ -176,15 +251,18 @@ def quick_file(rig):
 def main(name, rig_file=None, *, seed=0, feedback="full"):
     """Emulate a set-up until Ctrl-C, SIGTERM or SIGHUP; 0, or 1 when a device ended by itself.
 
-    Its rig file is written where it is asked for, see :func:`written_rig_file`. ValueError for a set-up that there is
-    not, and for a rig file that cannot be written.
+    Its rig file is written where it is asked for, see :func:`written_rig_file`. ValueError for a
+    set-up that there is not, and for a rig file that cannot be written.
     """
     quit_ = threading.Event()
     with contextlib.ExitStack() as stack:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
+            # as nohup leaves it
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 stack.callback(signal.signal, number, signal.signal(number, lambda *_: quit_.set()))
-        rig = stack.enter_context(EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback}))
+        rig = stack.enter_context(
+            EmulatedRig(load_setup(name), seed=seed, head_options={"feedback": feedback})
+        )
         if rig_file is not None:
             stack.enter_context(written_rig_file(rig, Path(rig_file)))
         print(summary(rig, rig_file), flush=True)
@@ -197,9 +275,11 @@ def main(name, rig_file=None, *, seed=0, feedback="full"):
 
 @contextlib.contextmanager
 def written_rig_file(rig, file):
-    """The rig file of a running rig, for as long as the rig lives; a file that was there before is never touched.
+    """The rig file of a running rig, for as long as the rig lives; a file that was there before is
+    never touched.
 
-    It is removed at the end, unless somebody changed or replaced it. ValueError where it cannot be written.
+    It is removed at the end, unless somebody changed or replaced it. ValueError where it cannot be
+    written.
     """
     text = json.dumps(rig.rig_file(), indent=1) + "\n"
     try:
@@ -216,7 +296,9 @@ def written_rig_file(rig, file):
         ours = file.stat()
     except OSError as error:
         file.unlink()
-        raise ValueError(f"{file}: cannot be written ({error.strerror}): name another file with --rig-file") from error
+        raise ValueError(
+            f"{file}: cannot be written ({error.strerror}): name another file with --rig-file"
+        ) from error
     try:
         yield
     finally:

@@ -1,10 +1,11 @@
 """Stages that several notebooks begin with, worked out once; loops that several processes share.
 
-Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there for
-whoever asks for the same again. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs.
-Results are pickles: they hold nested dataclasses with arrays and transforms of SciPy, for which no plain format is as
-short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root), or
-may put another one in the place of; so is a file in it, and a link.
+Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is
+kept there for whoever asks for the same again. A report and a test run use a fresh folder each,
+``make lab`` one for the time it runs. Results are pickles: they hold nested dataclasses with arrays
+and transforms of SciPy, for which no plain format is as short. A pickle can run code when it is
+read, so a folder is refused that others may write to, or own (but for root), or may put another one
+in the place of; so is a file in it, and a link.
 """
 
 import fcntl
@@ -38,15 +39,15 @@ def cached(stage):
     Parameters
     ----------
     stage : callable
-        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments always give the same
-        result, and nobody changes it in place.
+        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments
+        always give the same result, and nobody changes it in place.
 
     Returns
     -------
     callable
-        Looks in the folder first. The same session are the same statements, scans and images; results of another
-        version of this library or of numpy, scipy or OpenCV do not count. It raises ValueError for a folder that others
-        may write to.
+        Looks in the folder first. The same session are the same statements, scans and images;
+        results of another version of this library or of numpy, scipy or OpenCV do not count. It
+        raises ValueError for a folder that others may write to.
     """
 
     @wraps(stage)
@@ -65,7 +66,8 @@ def cached(stage):
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
+                # of two notebooks at the same time the second waits
+                fcntl.flock(lock, fcntl.LOCK_EX)
                 if not file.is_file():
                     result = pickle.dumps(stage(of, *args, **options))
                     with NamedTemporaryFile(dir=folder, delete=False) as part:
@@ -108,7 +110,9 @@ def library():
 
 @contextmanager
 def all_processors():
-    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays alone."""
+    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays
+    alone.
+    """
     global _processes
     alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
     before = _processes
@@ -123,7 +127,8 @@ def all_processors():
 
 
 def spread(work, items):
-    """``[work(item) for item in items]``, shared with forked processes within :func:`all_processors`.
+    """``[work(item) for item in items]``, shared with forked processes within
+    :func:`all_processors`.
 
     Whoever is free takes the next item; what another process could not do (it died, or `work`
     raised) is done here. Every result is a copy, as a pickle makes it: sums over arrays of another

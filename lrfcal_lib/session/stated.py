@@ -1,4 +1,6 @@
-"""session.json and how files of a session are opened: within its folder, bounded, by one writer at a time."""
+"""session.json and how files of a session are opened: within its folder, bounded, by one writer at
+a time.
+"""
 
 import csv
 import fcntl
@@ -26,9 +28,11 @@ from lrfcal_lib.model.camera import CameraModel
 
 
 def escape(text):
-    """Anything as HTML that shows it as text: no tags, entities, or formulas (MathJax finds no pair of signs).
+    """Anything as HTML that shows it as text: no tags, entities, or formulas (MathJax finds no pair
+    of signs).
 
-    All that becomes HTML comes through here, see also the report's template: names in a session may be somebody else's.
+    All that becomes HTML comes through here, see also the report's template: names in a session may
+    be somebody else's.
     """
     return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
 
@@ -37,10 +41,23 @@ LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
 LOCK = "writer.lock"
 FILES = (  # of any session, besides its images
-    "session.json", "lrf/scans.npz", "lrf/telegrams.bin", "lrf/index.csv", "images.csv", "edges.csv", "platform.csv",
+    "session.json",
+    "lrf/scans.npz",
+    "lrf/telegrams.bin",
+    "lrf/index.csv",
+    "images.csv",
+    "edges.csv",
+    "platform.csv",
     "truth.json",
-)  # fmt: skip
-KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "b": "a device", "c": "a device"}
+)
+KINDS = {
+    "l": "a link",
+    "d": "a folder",
+    "p": "a named pipe",
+    "s": "a socket",
+    "b": "a device",
+    "c": "a device",
+}
 
 
 def printable(text):
@@ -49,7 +66,9 @@ def printable(text):
 
 
 class SessionError(ValueError):
-    """A session on disk that cannot be used: the message names the file, the value and what to do about it."""
+    """A session on disk that cannot be used: the message names the file, the value and what to do
+    about it.
+    """
 
     def __init__(self, text):
         text = printable(text)
@@ -98,7 +117,9 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
         found = os.stat(file, follow_symlinks=within is None)
         _refuse_other(file, found, "-", "a file")
         if not writes and found.st_size > most:
-            raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
+            raise SessionError(
+                f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
+            )
     inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     mode = "rb"
     if writes:
@@ -115,12 +136,17 @@ def _refuse_other(file, status, kind, wanted):
     """Refuse what is no plain file (or folder), such as a link."""
     if (found := stat.filemode(status.st_mode)[0]) != kind:
         what = KINDS.get(found, "a file")
-        raise SessionError(f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its place")
+        raise SessionError(
+            f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its "
+            "place"
+        )
 
 
 @contextmanager
 def alone(path):
-    """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
+    """Keep other writers out of a session as long as this lasts; a process that is killed lets go
+    of it as well.
+    """
     file = Path(path) / LOCK
     with ExitStack() as stack:
         stream = stack.enter_context(_locked(file, path))
@@ -128,7 +154,10 @@ def alone(path):
             stack.close()
             stream = stack.enter_context(_locked(file, path))
         stream.truncate()
-        stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
+        stream.write(
+            f"process {os.getpid()} on {socket.gethostname()} since "
+            f"{datetime.now():%Y-%m-%d %H:%M}".encode()
+        )
         stream.flush()
         try:
             yield
@@ -169,19 +198,24 @@ MOST_ROWS = 200_000
 def reading(file, remedy):
     """Turn whatever other people's code says about the content of a file into a SessionError.
 
-    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to show its mistakes.
+    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to
+    show its mistakes.
     """
     try:
         yield
     except SessionError:
         raise
     except Exception as error:
-        raise SessionError(f"{file}: {remedy.format(str(error) or type(error).__name__)}") from error
+        raise SessionError(
+            f"{file}: {remedy.format(str(error) or type(error).__name__)}"
+        ) from error
 
 
 @contextmanager
 def naming(file):
-    """Turn whatever goes wrong with values of a file into a SessionError that begins with the file's name."""
+    """Turn whatever goes wrong with values of a file into a SessionError that begins with the
+    file's name.
+    """
     try:
         yield
     except SessionError:
@@ -193,7 +227,9 @@ def naming(file):
 
 
 def read_bytes(file, within=None, most=LARGEST_FILE):
-    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
+    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot
+    be read.
+    """
     try:
         with opened(file, within, most=most) as stream:
             data = stream.read(most + 1)
@@ -210,17 +246,27 @@ def read_json(file, within):
     with reading(file, "not JSON ({}); truncated, or edited by hand?"):
         data = json.loads(text.decode())
     if not isinstance(data, dict):
-        raise SessionError(f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'")
+        raise SessionError(
+            f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'"
+        )
     inner = [data]
     for _ in range(DEEPEST_JSON):
-        inner = [v for x in inner if isinstance(x, dict | list) for v in (x.values() if isinstance(x, dict) else x)]
+        inner = [
+            v
+            for x in inner
+            if isinstance(x, dict | list)
+            for v in (x.values() if isinstance(x, dict) else x)
+        ]
     if inner:
-        raise SessionError(f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?")
+        raise SessionError(
+            f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?"
+        )
     return data
 
 
 def read_table(file, columns, within, torn=False):
-    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly `columns`.
+    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly
+    `columns`.
 
     With `torn`, a last row without its line end (cut off by a crash) is left out.
     """
@@ -235,11 +281,16 @@ def read_table(file, columns, within, torn=False):
     if not rows or tuple(rows[0]) != columns:
         got = ", ".join(rows[0]) if rows else "an empty file"
         if rows and tuple(rows[0]) == ("", *columns):
-            got = "a first column without a name: write the table without row numbers (index=False in pandas)"
+            got = (
+                "a first column without a name: write the table without row numbers (index=False "
+                "in pandas)"
+            )
         raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(columns):
-            raise SessionError(f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?")
+            raise SessionError(
+                f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
+            )
     whole = [key in WHOLE_COLUMNS for key in columns]
     rows = [map(_without_point, row, whole) for row in rows[1:]]
     return [dict(zip(columns, row, strict=True)) for row in rows], cut
@@ -279,11 +330,20 @@ MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
 MOST_CAMERAS = 100
 MILLIMETRES = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
-# metres, by part of the model's name: systematic error of a range up to 10 m according to SICK (technical description
-# of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors LMSxxx"; data sheet of TiM55x and TiM56x)
-SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS5": 0.025, "TiM5": 0.060}
-# of other models (no sheet of the LMS291 and LMS400 was at hand), and of those that count centimetres: so many standard
-# deviations or steps of a range; the sheets above admit 2 to 4.2, and 4 to 5 steps of a centimetre
+# metres, by part of the model's name: systematic error of a range up to 10 m according to SICK
+# (technical description of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors
+# LMSxxx"; data sheet of TiM55x and TiM56x)
+SYSTEMATIC_ERROR = {
+    "LMS1": 0.040,
+    "LMS200": 0.015,
+    "LMS211": 0.035,
+    "LMS221": 0.035,
+    "LMS5": 0.025,
+    "TiM5": 0.060,
+}
+# of other models (no sheet of the LMS291 and LMS400 was at hand), and of those that count
+# centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
+# 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
@@ -300,7 +360,11 @@ def in_words(error):
     found = where if isinstance(first["input"], dict) else found
     if kind == "value_error":
         return f"{found}: {first['ctx']['error']}"
-    needed = "an object" if kind in ("model_type", "dataclass_type") else first["msg"].removeprefix("Input should be ")
+    needed = (
+        "an object"
+        if kind in ("model_type", "dataclass_type")
+        else first["msg"].removeprefix("Input should be ")
+    )
     large = kind.startswith("less_than") and re.search(r"_m\b", where)  # the key tells the unit
     return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
 
@@ -330,13 +394,17 @@ def refused(wrong, words):
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
 TWICE = "placements are different numbers"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
-Name = Annotated[str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)]
+Name = Annotated[
+    str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)
+]
 EdgeName = Annotated[str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)]
 Whole = Annotated[int, Field(ge=0, le=1_000_000)]
 Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Length = Annotated[FiniteFloat, Field(gt=0, le=1)]
-Angle = Annotated[FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))]
+Angle = Annotated[
+    FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))
+]
 Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
 Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
 
@@ -349,7 +417,9 @@ class TransformStated(BaseModel):
 
     def made(self):
         """As a RigidTransform."""
-        return RigidTransform.from_components(self.translation_m, Rotation.from_rotvec(self.rotation_vector_rad))
+        return RigidTransform.from_components(
+            self.translation_m, Rotation.from_rotvec(self.rotation_vector_rad)
+        )
 
 
 def transform_to_json(transform):
@@ -384,7 +454,9 @@ class LensStated(BaseModel):
         """As a CameraModel."""
         covariance = None if self.covariance is None else np.array(self.covariance)
         pinhole = self.fx, self.fy, self.cx, self.cy
-        return CameraModel(width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px)
+        return CameraModel(
+            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
+        )
 
 
 def model_to_json(model):
@@ -412,7 +484,9 @@ class BoardStated(BaseModel):
     """A board as it stands in a file."""
 
     name: str
-    edges: Annotated[tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)]
+    edges: Annotated[
+        tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
+    ]
     features: tuple[str, str]
     corners_m: Annotated[tuple[Pair, ...], Field(fail_fast=True)] | None
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
@@ -424,12 +498,19 @@ class BoardStated(BaseModel):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             given = "none" if not any(self.features) else short(map(repr, self.features))
-            needed = f"features must be two different edges of {short(self.edges)}, at a right angle"
+            needed = (
+                f"features must be two different edges of {short(self.edges)}, at a right angle"
+            )
             raise ValueError(f"{needed}; got {given}")
         if corners is not None and len(corners) != len(self.edges):
-            raise ValueError(f"corners_m must be one corner for each of {len(self.edges)} edges, got {len(corners)}")
+            raise ValueError(
+                f"corners_m must be one corner for each of {len(self.edges)} edges, got "
+                f"{len(corners)}"
+            )
         if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:
-            raise ValueError(f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}")
+            raise ValueError(
+                f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}"
+            )
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
@@ -437,7 +518,12 @@ def board_to_json(board):
     """A board as it stands in session.json."""
     p = board.pattern
     grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
-    named = {"name": board.name, "edges": board.edges, "features": board.features, "corners_m": board.corners}
+    named = {
+        "name": board.name,
+        "edges": board.edges,
+        "features": board.features,
+        "corners_m": board.corners,
+    }
     return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
 
 
@@ -451,7 +537,10 @@ StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
 
 View = Annotated[
     tuple[Angle, Angle],
-    refused(lambda v: not v[0] < v[1] <= v[0] + 2 * math.pi + 1e-9, "two ascending bearings within a turn are needed"),
+    refused(
+        lambda v: not v[0] < v[1] <= v[0] + 2 * math.pi + 1e-9,
+        "two ascending bearings within a turn are needed",
+    ),
 ]
 Endless = Annotated[
     float,  # null in the file where there is no limit
@@ -463,7 +552,8 @@ Endless = Annotated[
 
 @dataclass(frozen=True)
 class LrfInfo:
-    """What is known about the laser range finder, read from the device or its data, never from the model's name.
+    """What is known about the laser range finder, read from the device or its data, never from the
+    model's name.
 
     Attributes
     ----------
@@ -479,7 +569,8 @@ class LrfInfo:
     max_range : float
         Metres.
     spot_exit, spot_divergence : float or None
-        Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet.
+        Diameter of the spot at the window (metres) and its growth with distance (radians), from the
+        maker's data sheet.
     systematic_error : float or None
         Largest offset of all ranges that the maker admits, metres.
     """
@@ -493,18 +584,24 @@ class LrfInfo:
     max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
     systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
     spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = None
-    spot_divergence: Annotated[FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)] = None
+    spot_divergence: Annotated[
+        FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)
+    ] = None
 
     @property
     def admitted_offset(self):
-        """The largest range offset that the maker admits, metres: stated, or known of the model, or assumed."""
+        """The largest range offset that the maker admits, metres: stated, or known of the model, or
+        assumed.
+        """
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
         if not known or self.range_resolution > 0.005:
             known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
         return self.systematic_error or known[0]
 
     def spot_radius(self, distance):
-        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not stated."""
+        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not
+        stated.
+        """
         if self.spot_exit is None:
             return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
         return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
@@ -539,7 +636,8 @@ class CameraInfo:
     model : CameraModel or None
         None where the intrinsics have to be estimated from the session's own images.
     guess : RigidTransform or None
-        Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+        Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount
+        'platform').
     """
 
     name: Annotated[Name, Field(exclude=True)]  # the key of the object in the file
@@ -547,7 +645,10 @@ class CameraInfo:
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
     model: Annotated[
-        LensStated | None, AfterValidator(_lens), PlainSerializer(model_to_json), Field(alias="intrinsics")
+        LensStated | None,
+        AfterValidator(_lens),
+        PlainSerializer(model_to_json),
+        Field(alias="intrinsics"),
     ] = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
@@ -560,7 +661,10 @@ def camera_to_json(camera):
 def _with_names(cameras):
     if not isinstance(cameras, dict) or len(cameras) > MOST_CAMERAS:
         raise ValueError(f"an object of at most {MOST_CAMERAS} cameras is needed")
-    return {name: camera | {"name": name} if isinstance(camera, dict) else camera for name, camera in cameras.items()}
+    return {
+        name: camera | {"name": name} if isinstance(camera, dict) else camera
+        for name, camera in cameras.items()
+    }
 
 
 class PlatformStated(BaseModel):
@@ -588,13 +692,17 @@ class SessionStated(BaseModel):
     simulated: bool
     board: StatedBoard
     rig: RigStated
-    placements: Annotated[tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)]
+    placements: Annotated[
+        tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)
+    ]
     reference: dict = {}
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
 
 
 def parse_session(data, kind=SessionStated):
-    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for a wrong one."""
+    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for
+    a wrong one.
+    """
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")
