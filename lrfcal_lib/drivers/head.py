@@ -38,9 +38,8 @@ MISSES = 3  # queries without a reply, after which a head that is swept is not a
 OTHER_WAY = "the head moves the other way: set invert to the contrary"
 STOPPED = "the head was stopped before it arrived"
 INTERRUPTED = (
-    "the head's line was lost, and the head stopped when it came back: move or sweep again; "
-    "where it tells "
-    "nothing look where it stands, and call set_pitch"
+    "the head's line was lost, and the head stopped when it came back: move or sweep again; where "
+    "it tells nothing look where it stands, and call set_pitch"
 )
 
 
@@ -250,8 +249,7 @@ class Motion:
             )
         raise Refused(
             f"the head does not come to rest, {math.degrees(first):.2f} deg by now: give it more "
-            "time, a "
-            "higher tolerance_deg, or look whether it can get there"
+            "time, a higher tolerance_deg, or look whether it can get there"
         )
 
     # ---------------------------------------------------------------------------------------------
@@ -285,8 +283,7 @@ class Motion:
     def _short_of(pitch, target):
         return Refused(
             f"the head stays at {math.degrees(pitch):.2f} deg on its way to "
-            f"{math.degrees(target):.2f}: "
-            "look for an end stop, or narrow pitch_limits_deg"
+            f"{math.degrees(target):.2f}: look for an end stop, or narrow pitch_limits_deg"
         )
 
     def steer(self, target, deadline):
@@ -318,8 +315,7 @@ class Motion:
                     self._dead.clear()
                     raise Refused(
                         "the head does not move: look for an end stop, its power, and whether "
-                        "tilt_speed "
-                        "suffices"
+                        "tilt_speed suffices"
                     )
                 continue
             self._longest = max(self._longest, took)
@@ -468,9 +464,8 @@ class PanTilt(port.Closed):
         )
         return (
             f"the head at {self._line.path} does not tell its tilt: {echo}check its power, the "
-            "wires A and B, "
-            f"address {self.settings.address} and {self.settings.baudrate} Bd; state a longer "
-            "reply_s than "
+            f"wires A and B, address {self.settings.address} and {self.settings.baudrate} Bd; "
+            "state a longer reply_s than "
             f'{self.settings.reply_s:g} s if it answers late, or feedback "auto" to go on '
             "without its tilt"
         )
@@ -548,8 +543,7 @@ class PanTilt(port.Closed):
         if not low - 1e-6 <= math.degrees(pitch) <= high + 1e-6:
             raise OutOfRange(
                 f"pitch {math.degrees(pitch):.2f} deg is beyond the head's limits of {low:g} to "
-                f"{high:g} "
-                "deg: ask for less, or widen pitch_limits_deg if the head can do it"
+                f"{high:g} deg: ask for less, or widen pitch_limits_deg if the head can do it"
             )
         if not self._lock.acquire(blocking=False):
             raise DeviceError("the head is moving already: stop it, or wait for it")

@@ -162,9 +162,8 @@ def set_rate(port, baudrate):
             if set(termios.tcgetattr(port.fd)[4:6]) == {getattr(termios, f"B{baudrate}", None)}:
                 return
         reason = (
-            f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an "
-            "RS-422 interface "
-            "whose clock divides to it, else use 38400"
+            f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 "
+            "interface whose clock divides to it, else use 38400"
         )
     except ValueError as error:
         reason = f"cannot do {baudrate} Bd: {error}"

@@ -406,7 +406,6 @@ def _camera(stated, name):
         camera.close()
         raise ValueError(
             f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x "
-            f"{size[1]}: "
-            "state a size that it can do"
+            f"{size[1]}: state a size that it can do"
         )
     return camera

@@ -87,8 +87,7 @@ ORDER = "the lower one comes first"
 
 OTHER_RATE = (
     "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range "
-    "finder is driven here; "
-    "record it by a program of your own that writes a session "
+    "finder is driven here; record it by a program of your own that writes a session "
     "(lrfcal_lib.session.write.SessionWriter)"
 )
 
@@ -320,15 +319,13 @@ class RigFile:
             if asked.min() < low - 1e-6 or asked.max() > high + 1e-6:
                 raise RigFileError(
                     f"{self.path}: plan: placement {placement.number} asks for a pitch of "
-                    f"{asked.min():g} to "
-                    f"{asked.max():g} deg, devices.head.pitch_limits_deg are {low:g} to "
-                    f"{high:g}: ask for less"
+                    f"{asked.min():g} to {asked.max():g} deg, devices.head.pitch_limits_deg are "
+                    f"{low:g} to {high:g}: ask for less"
                 )
         if self.plan.mode == "continuous" and self.devices.lrf.interlaced:
             raise RigFileError(
                 f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the "
-                "head at rest, "
-                "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
+                "head at rest, use the mode stop-and-go, or a variant of 0.5 or 1 deg"
             )
 
     def with_mode(self, mode):
@@ -396,8 +393,7 @@ def rig_of(data, path=Path("rig.json")):
             if devices[name].size not in (None, (info.width, info.height)):
                 raise ValueError(
                     f"devices.cameras.{name}.size is {list(devices[name].size)}, "
-                    f"rig.cameras.{name} "
-                    f"states {[info.width, info.height]}: leave it out"
+                    f"rig.cameras.{name} states {[info.width, info.height]}: leave it out"
                 )
     except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error

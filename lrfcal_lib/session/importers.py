@@ -106,9 +106,8 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
     reference = {
         "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, "
-        "their bearing b is "
-        "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' "
-        "planes).",
+        "their bearing b is 90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms "
+        "over the boards' planes).",
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
         "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
         "cameras": {name: result["reference"] for name, result in published.items()},
