@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.session.read import image_size
+from lrfcal_lib.session.images import image_size
 from lrfcal_lib.session.stated import (
     LARGEST_TEXT,
     CameraInfo,

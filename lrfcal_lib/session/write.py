@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.session import read, stated
+from lrfcal_lib.session.images import JPEG, check_image_size
 from lrfcal_lib.session.stated import SessionError, naming, short
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
@@ -250,9 +251,9 @@ class SessionWriter:
         else:
             what = image
             content = stated.read_bytes(image)
-        read.check_image_size(what, content, self.cameras[camera])
+        check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
-        kind = "jpg" if content.startswith(read.JPEG) else "png"
+        kind = "jpg" if content.startswith(JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
