@@ -24,8 +24,8 @@ from lrfcal_lib.session.stated import (
     opened,
     reading,
     short,
-    whole_number,
 )
+from lrfcal_lib.session.tables import read_table, whole_number
 from lrfcal_lib.session.telegrams import (
     INDEX_COLUMNS,
     TelegramLog,
@@ -252,7 +252,7 @@ def read_images(path, facts, unfinished=None):
     out = []
     lines = {}  # in which each file stands
     skipped = {str(placement) for placement in unfinished or ()}
-    rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
@@ -289,7 +289,7 @@ def read_edges(path, facts, records):
     out = []
     known = {(record.camera, record.file) for record in records}
     edges = facts["board"].edges
-    rows = stated.read_table(file, EDGE_COLUMNS, path)[0]
+    rows = read_table(file, EDGE_COLUMNS, path)[0]
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -545,7 +545,7 @@ def _disorder(session):
     for name, (columns, group, once) in ORDERED.items():
         file = session.path / name
         if os.path.lexists(file):
-            rows = stated.read_table(file, columns, session.path, torn=True)[0]
+            rows = read_table(file, columns, session.path, torn=True)[0]
             yield from _rows_twice(file, rows, once)
             yield from _times_back(file, rows, group)
 

@@ -2,18 +2,14 @@
 a time.
 """
 
-import csv
-import fcntl
 import html
 import json
 import math
 import os
 import re
-import socket
 import stat
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
@@ -39,7 +35,6 @@ def escape(text):
 
 LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
-LOCK = "writer.lock"
 FILES = (  # of any session, besides its images
     "session.json",
     "lrf/scans.npz",
@@ -142,56 +137,10 @@ def _refuse_other(file, status, kind, wanted):
         )
 
 
-@contextmanager
-def alone(path):
-    """Keep other writers out of a session as long as this lasts; a process that is killed lets go
-    of it as well.
-    """
-    file = Path(path) / LOCK
-    with ExitStack() as stack:
-        stream = stack.enter_context(_locked(file, path))
-        while not _still_there(file, stream):  # its holder removed the file after we had opened it
-            stack.close()
-            stream = stack.enter_context(_locked(file, path))
-        stream.truncate()
-        stream.write(
-            f"process {os.getpid()} on {socket.gethostname()} since "
-            f"{datetime.now():%Y-%m-%d %H:%M}".encode()
-        )
-        stream.flush()
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # gone with its session?
-                os.unlink(file)
-
-
-def _locked(file, path):
-    """The open lock of a session, which nobody else holds."""
-    stream = opened(file, path, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        with stream:
-            holder = stream.read(200).decode(errors="replace") or "another process"
-        remedy = "end that first, or choose another one"
-        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
-    return stream
-
-
-def _still_there(file, stream):
-    """Whether an open file is the one that has this name now."""
-    try:
-        return os.path.samestat(os.fstat(stream.fileno()), os.lstat(file))
-    except FileNotFoundError:
-        return False
-
-
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
 # bytes of a JSON or CSV file, levels
 LARGEST_TEXT = 8_000_000
 DEEPEST_JSON = 30
-MOST_ROWS = 200_000
 
 
 @contextmanager
@@ -262,54 +211,6 @@ def read_json(file, within):
             f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?"
         )
     return data
-
-
-def read_table(file, columns, within, torn=False):
-    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly
-    `columns`.
-
-    With `torn`, a last row without its line end (cut off by a crash) is left out.
-    """
-    data = read_bytes(file, within, LARGEST_TEXT)
-    with reading(file, "not a CSV file in UTF-8 ({})"):
-        text = data.decode()
-        cut = torn and not text.endswith("\n")
-        lines = (text.rpartition("\n")[0] if cut else text).splitlines()
-        if len(lines) > MOST_ROWS:
-            raise SessionError(f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}")
-        rows = list(csv.reader(lines))
-    if not rows or tuple(rows[0]) != columns:
-        got = ", ".join(rows[0]) if rows else "an empty file"
-        if rows and tuple(rows[0]) == ("", *columns):
-            got = (
-                "a first column without a name: write the table without row numbers (index=False "
-                "in pandas)"
-            )
-        raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(columns):
-            raise SessionError(
-                f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
-            )
-    whole = [key in WHOLE_COLUMNS for key in columns]
-    rows = [map(_without_point, row, whole) for row in rows[1:]]
-    return [dict(zip(columns, row, strict=True)) for row in rows], cut
-
-
-def _without_point(cell, whole):
-    """A cell of a table: 1.0, as programs write whole numbers beside empty cells, is 1."""
-    return cell.removesuffix(".0") if whole else cell
-
-
-def whole_number(text, name):
-    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text."""
-    try:
-        return int(text or -1)
-    except ValueError:
-        raise ValueError(f"{name} is '{text}': a whole number is needed") from None
-
-
-WHOLE_COLUMNS = ("placement", "offset", "length")  # of tables, which hold whole numbers
 
 
 def check_amount(values):

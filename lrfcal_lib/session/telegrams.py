@@ -15,10 +15,9 @@ from lrfcal_lib.session.stated import (
     check_amount,
     naming,
     read_bytes,
-    read_table,
     short,
-    whole_number,
 )
+from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")

@@ -13,7 +13,9 @@ import numpy as np
 
 from lrfcal_lib.session import read, stated
 from lrfcal_lib.session.images import JPEG, check_image_size
+from lrfcal_lib.session.lock import LOCK, alone
 from lrfcal_lib.session.stated import SessionError, naming, short
+from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
@@ -102,12 +104,12 @@ class SessionWriter:
             )
         self.path.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            stack.enter_context(stated.alone(self.path))
+            stack.enter_context(alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
     def _create(self):
-        if set(os.listdir(self.path)) - {stated.LOCK}:
+        if set(os.listdir(self.path)) - {LOCK}:
             raise SessionError(
                 f"{self.path}: exists already; choose another name or remove it first"
             )
@@ -269,7 +271,7 @@ def finish(path):
     SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
-        with stated.alone(path):
+        with alone(path):
             complete(Path(path))
     except FileNotFoundError as error:
         raise SessionError(
@@ -428,7 +430,7 @@ class SessionRecorder(SessionWriter):
     def _create(self):
         if self._resume and os.path.lexists(self.path / "session.json"):
             self._go_on()
-        elif set(os.listdir(self.path)) - {"session.json.draft", stated.LOCK}:
+        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
             hint = (
                 "choose another name"
                 if self._resume
@@ -528,7 +530,7 @@ class SessionRecorder(SessionWriter):
         counts = dict.fromkeys(self.cameras, 0)
         if not counts:
             return counts
-        for row in stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
+        for row in read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
             if row["camera"] in counts and row["purpose"] == purpose:
                 counts[row["camera"]] += 1
         return counts
@@ -545,7 +547,7 @@ class SessionRecorder(SessionWriter):
         """Write other values into the rows of a placement in a table, if there is one."""
         if not os.path.lexists(self.path / name):
             return
-        rows = stated.read_table(self.path / name, columns, self.path)[0]
+        rows = read_table(self.path / name, columns, self.path)[0]
         for row in rows:
             if row["placement"] == str(placement):
                 row.update(mark)
