@@ -17,7 +17,7 @@ from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interru
 from lrfcal_lib.acquire.pictures import PICTURE, jpeg, png, scan_picture, sweep_picture
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import Closed, DeviceError
-from lrfcal_lib.session.stated import escape
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
 
 HERE = Path(__file__).parent

@@ -19,7 +19,7 @@ from IPython import get_ipython
 from IPython.display import HTML, display
 
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import escape
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.solvers import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]

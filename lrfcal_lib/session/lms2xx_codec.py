@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 STX = 0x02
-# address byte of telegrams to and from a device with the factory's address
+# address bytes of telegrams to and from a device with the address of the factory
 HOST = 0x00
 DEVICE = 0x80
 LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices

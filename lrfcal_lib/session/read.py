@@ -16,6 +16,7 @@ from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.faults import dark_image, faults_of_files, too_dark
 from lrfcal_lib.session.images import check_image_size
+from lrfcal_lib.session.shown import printable
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -526,7 +527,7 @@ def validate(path):
                 dark.append(record)
         except SessionError as error:
             found.append(str(error))
-    return [stated.printable(problem) for problem in found + _too_dark(session, dark)]
+    return [printable(problem) for problem in found + _too_dark(session, dark)]
 
 
 def _too_dark(session, dark):

@@ -1,8 +1,5 @@
-"""session.json and how files of a session are opened: within its folder, bounded, by one writer at
-a time.
-"""
+"""session.json, and how files of a session are opened: within its folder, and bounded."""
 
-import html
 import json
 import math
 import os
@@ -21,17 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
-
-
-def escape(text):
-    """Anything as HTML that shows it as text: no tags, entities, or formulas (MathJax finds no pair
-    of signs).
-
-    All that becomes HTML comes through here, see also the report's template: names in a session may
-    be somebody else's.
-    """
-    return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
-
+from lrfcal_lib.session.shown import printable
 
 LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
@@ -53,11 +40,6 @@ KINDS = {
     "b": "a device",
     "c": "a device",
 }
-
-
-def printable(text):
-    """Text as a terminal may show it: what steers it, or cannot be encoded, stands in letters."""
-    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
 class SessionError(ValueError):
@@ -138,9 +120,8 @@ def _refuse_other(file, status, kind, wanted):
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
-# bytes of a JSON or CSV file, levels
-LARGEST_TEXT = 8_000_000
-DEEPEST_JSON = 30
+LARGEST_TEXT = 8_000_000  # bytes of a JSON or CSV file
+DEEPEST_JSON = 30  # levels
 
 
 @contextmanager
