@@ -52,7 +52,7 @@ def import_recording(args):
 def check(args):
     """Say what is wrong with a session: 0 where nothing is, else 1."""
     from lrfcal_lib.session.read import open_session, validate
-    from lrfcal_lib.session.stated import printable
+    from lrfcal_lib.session.shown import printable
 
     problems = validate(args.session)
     if problems:

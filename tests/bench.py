@@ -25,13 +25,14 @@ from joint_draws import draw, none
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
+from telegrams import encode_scan
 
 from lrfcal_lib.calibrate.reconstruct import Painter, View
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
-from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, encode_scan, split_stream
+from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import converged, of_placements, solve_joint

@@ -50,7 +50,7 @@ class Head:
         self.at, self.stops, self.track, self.sweep, self.fail = 0.0, 0, [], None, None
         self.speed = math.radians(20)
 
-    def move_to(self, pitch, timeout=None):
+    def move_to(self, pitch):
         if self.fail is not None:
             raise self.fail
         self.clock.now += abs(pitch - self.at) / self.speed + 0.3

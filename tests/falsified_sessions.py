@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.session.read import IMAGE_COLUMNS, open_session
-from lrfcal_lib.session.stated import read_table
+from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.write import as_lines
 
 INCH = 0.0254  # metres

@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 from fake_rig import rig_data
 from scipy.spatial.transform import RigidTransform, Rotation
+from telegrams import encode_scan
 from tiny_import import write_source
 
 from lrfcal_lib.drivers.port import PortError, open_port
@@ -37,7 +38,6 @@ from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.preprocess.survey import views_of
 from lrfcal_lib.session.importers import import_lasersetero
-from lrfcal_lib.session.lms2xx_codec import encode_scan
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionError, transform_to_json
 from lrfcal_lib.session.write import SessionRecorder, SessionWriter, finish

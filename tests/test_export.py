@@ -9,7 +9,7 @@ from test_session import CAMERAS, HEAD, LRF, pixels, wall
 from lrfcal_lib import __main__ as command_line
 from lrfcal_lib.calibrate import pipeline
 from lrfcal_lib.calibrate.reconstruct import write_ply
-from lrfcal_lib.evaluate.export import write_calibration, write_clouds, write_mesh, write_pcd
+from lrfcal_lib.evaluate.export import write_calibration, write_clouds, write_pcd
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.session import cache
 from lrfcal_lib.session.read import open_session
@@ -36,7 +36,6 @@ WRITERS = {  # by the name of the file
     "calibration.json": lambda path, cloud, ply: write_calibration(path, {"numbers": [0.5] * LITTLE}),
     "cloud.ply": lambda path, cloud, ply: write_ply(path, cloud),
     "scene.pcd": lambda path, cloud, ply: write_pcd(path, ply),
-    "mesh.ply": lambda path, cloud, ply: write_mesh(path, ply, 0.005),
 }
 
 

@@ -19,8 +19,9 @@ from shared import DATA, campaign
 
 from lrfcal_lib.__main__ import main
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose
+from lrfcal_lib.session.lock import alone
 from lrfcal_lib.session.read import open_session, validate
-from lrfcal_lib.session.stated import SessionError, alone
+from lrfcal_lib.session.stated import SessionError
 
 SCANS = ["session.json", "lrf/scans.npz", "images.csv", "edges.csv", "images/left/0001.png", "truth.json"]
 FILES = [f"scans/{name}" for name in SCANS]

@@ -13,7 +13,7 @@ from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
 from lrfcal_lib.session import importers
 from lrfcal_lib.session.importers import import_lasersetero, read_bouguet, read_pcd, recover_polar
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import SessionError, transform_from_json
+from lrfcal_lib.session.stated import SessionError, TransformStated, from_json
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_import_makes_a_sound_session(source, tmp_path, capsys):
     model = session.cameras["left"].model
     assert (model.fx, model.fy, model.cx, model.cy) == (700.5, 701.5, 15.25, 11.75)
     np.testing.assert_allclose(np.sqrt(np.diag(model.covariance))[:5], [1, 2, 0.1, 0.2, 0.001])
-    pose = transform_from_json(session.reference["cameras"]["left"]["T_camera_board"]["1"])
+    pose = from_json(TransformStated, session.reference["cameras"]["left"]["T_camera_board"]["1"]).made()
     np.testing.assert_allclose(pose.translation, [-0.1428, 0.098, 1.3])
     np.testing.assert_allclose(pose.rotation.as_matrix(), Rotation.from_rotvec([-0.74, -0.3, 1.4]).as_matrix())
 

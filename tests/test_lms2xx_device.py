@@ -9,6 +9,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import serial
+from telegrams import encode_scan
 from virtual import INDEXED, Bench, Source, VirtualHost
 from virtual import lms as lms_on
 
@@ -18,7 +19,7 @@ from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, t
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
-from lrfcal_lib.session.lms2xx_codec import Configuration, encode_scan, encode_telegram
+from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram
 
 
 def emulated(**options):

@@ -4,9 +4,10 @@ from contextlib import suppress
 
 import numpy as np
 from shared import STRINGS
+from telegrams import encode_scan
 
 from lrfcal_lib.session import lms2xx_codec as codec
-from lrfcal_lib.session.lms2xx_codec import MODES, encode_scan, encode_telegram
+from lrfcal_lib.session.lms2xx_codec import MODES, encode_telegram
 
 PARSERS = {0xB0: codec.decode_scan, 0xB1: codec.parse_status, 0xBA: codec.parse_type,
            0xF4: codec.parse_configuration, 0xF7: codec.parse_configuration}  # fmt: skip

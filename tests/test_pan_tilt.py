@@ -156,8 +156,8 @@ def test_limits_are_named_and_nothing_moves(opened):
     assert head.move_to(60 * DEGREE) == near(60)
 
 
-def to(degrees, **options):
-    return lambda head: head.move_to(degrees * DEGREE, **options)
+def to(degrees):
+    return lambda head: head.move_to(degrees * DEGREE)
 
 
 def swept(degrees):
@@ -173,8 +173,7 @@ FAILURES = [  # settings, habits, fault that lasts, call, what it raises
     (FAST, PARTIAL | {"head": Contrary}, None, to(30), Refused, "the other way: set invert"),
     (replace(FAST, absolute=True), PARTIAL, None, to(10), Refused, "does not obey set-tilt"),
     (FAST, {}, "deaf", PanTilt.pitch, NoReply, "address 1 and 38400 Bd"),
-    (FAST, {}, "deaf", to(10, timeout=0.3), NoReply, "address 1 and 38400 Bd"),
-    (TIMED, NONE, None, to(50, timeout=0.2), Refused, "takes 2.5 s: give it a longer timeout"),
+    (FAST, {}, "deaf", TEN, NoReply, "address 1 and 38400 Bd"),
     (FAST, PARTIAL, None, swept(50), NoReply, "speed is unknown: state degrees_per_second"),
     (FAST, {"head": Contrary}, None, swept(50), Refused, "the other way"),
     (SLOW, {}, "stall", swept(20), Refused, "the sweep does not get to its end"),
@@ -325,7 +324,7 @@ def test_head_that_falls_silent_in_a_move(opened):
     device, head = opened()
     later(device, lambda: device.faults.inject("mute", seconds=1e6), degrees=4)
     with pytest.raises(NoReply, match="stopped telling its tilt"):
-        head.move_to(40 * DEGREE, timeout=1.5)
+        head.move_to(40 * DEGREE)
     assert halted(device)
 
 
@@ -368,11 +367,11 @@ def test_no_fault_ends_in_a_wrong_pitch(opened, kind):
         device.faults.inject(kind, 1 if kind == "unplug" else 2)
         begun, pitch = device.host.now(), None
         with contextlib.suppress(DeviceError):
-            pitch = head.move_to(goal * DEGREE, timeout=6)
+            pitch = head.move_to(goal * DEGREE)
         assert device.host.now() - begun < 10
         device.faults.clear()
         if pitch is None:
-            pitch = head.move_to(goal * DEGREE, timeout=6)
+            pitch = head.move_to(goal * DEGREE)
             assert pitch == near(goal)
         device.host.sleep(0.06)
         assert device.pitch() == pytest.approx(pitch, abs=0.1 * DEGREE)

@@ -9,7 +9,7 @@ import pytest
 
 from lrfcal_lib.calibrate import pipeline
 from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
-from lrfcal_lib.session.stated import transform_from_json
+from lrfcal_lib.session.stated import TransformStated, from_json
 
 # what the stored tables of this recording (tests/golden, compared where its notebooks run) must go on to show
 PROMISES = [
@@ -63,7 +63,7 @@ def test_axis_and_cameras_are_close_to_the_authors(lms400):
     assert angle < np.deg2rad(1.5) and offset < 0.03
     (data, its), (stated, known) = (lms400.platform.parameters()[name] for name in ("line_3d", "stated"))
     assert (np.abs(data - stated) < 3 * np.sqrt(np.diag(its + known))).all()
-    authors = transform_from_json(lms400.prepared.session.reference["T_left_platform"])
+    authors = from_json(TransformStated, lms400.prepared.session.reference["T_left_platform"]).made()
     angle, shift = transform_difference(lms400.solutions["left", "zhang_pless"].transform, authors)
     assert np.rad2deg(angle) < 2.0 and shift < 0.05
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import DATA
 
 from lrfcal_lib.calibrate import reconstruct as rec
-from lrfcal_lib.evaluate.export import write_mesh, write_pcd
+from lrfcal_lib.evaluate.export import write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, fold, project
 from lrfcal_lib.model.kinematics import AS_RECORDED
@@ -267,19 +267,6 @@ def test_files_hold_everything_and_say_frame_and_units(tmp_path):
     back = o3d.t.io.read_point_cloud(str(tmp_path / "deep" / "c.ply")).point
     for name in ("seen", "placement", "image", "pitch", "bearing", "range", "sigma"):
         np.testing.assert_allclose(back[name].numpy().ravel(), getattr(cloud, name), rtol=1e-6, err_msg=name)
-
-
-def test_a_mesh_of_a_wall_is_flat(tmp_path):
-    cloud = whole(scan(wall(2.0))[1], [view(plain_image(), pose=AHEAD)])
-    rec.write_ply(tmp_path / "wall.ply", cloud)
-    assert write_mesh(tmp_path / "mesh.ply", tmp_path / "wall.ply", 0.03) > 500
-    import open3d as o3d
-
-    corners = np.asarray(o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
-    assert np.median(np.abs(corners[:, 1] - 2.0)) < 0.005 and np.ptp(corners[:, 0]) > 2.0
-    rec.write_ply(tmp_path / "bare.ply", replace(cloud, normals=cloud.normals * np.nan))
-    with pytest.raises(ValueError, match="no point has a normal"):
-        write_mesh(tmp_path / "mesh.ply", tmp_path / "bare.ply")
 
 
 @pytest.mark.parametrize("number", range(3))

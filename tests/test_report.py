@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import nbformat
@@ -261,10 +262,8 @@ def replace(out, until):
             (new / "tables" / "errors.csv").write_text("new")
 
 
-@pytest.mark.parametrize("exchange", [report.EXCHANGE, 1 << 20], ids=["exchange", "not known here"])
 @pytest.mark.parametrize("looks", [1000, pytest.param(20_000, marks=campaign)])
-def test_a_report_that_is_replaced_is_never_missing(tmp_path, monkeypatch, looks, exchange):
-    monkeypatch.setattr(report, "EXCHANGE", exchange)  # another flag is refused
+def test_a_report_that_is_replaced_is_never_missing(tmp_path, looks):
     (out := tmp_path / "wall").mkdir()
     for name in ("index.html", "notes.txt", "00_old.html"):
         (out / name).write_text("old")
@@ -285,6 +284,33 @@ def test_a_report_that_is_replaced_is_never_missing(tmp_path, monkeypatch, looks
     found = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
     assert found == ["wall/index.html", "wall/notes.txt", "wall/tables/errors.csv"]
     assert (out / "notes.txt").read_text() == "old"
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_where_folders_cannot_be_exchanged_they_are_renamed(tmp_path, monkeypatch, broken):
+    monkeypatch.setattr(report, "EXCHANGE", 1 << 20)  # another flag is refused
+    (out := tmp_path / "wall").mkdir()
+    for name in ("index.html", "notes.txt", "00_old.html"):
+        (out / name).write_text("old")
+    before = sorted(tmp_path.rglob("*"))
+    rename = Path.replace
+
+    def stopped(file, target):
+        """Ctrl-C between the two renames."""
+        if target == out and file.name == "report":
+            raise KeyboardInterrupt
+        return rename(file, target)
+
+    if broken:
+        monkeypatch.setattr(Path, "replace", stopped)
+        with pytest.raises(KeyboardInterrupt), report.in_place_of(out) as new:
+            (new / "index.html").write_text("new")
+        assert sorted(tmp_path.rglob("*")) == before and (out / "index.html").read_text() == "old"
+    else:
+        with report.in_place_of(out) as new:
+            (new / "index.html").write_text("new")
+        assert {file.name: file.read_text() for file in out.glob("*.*")} == {"index.html": "new", "notes.txt": "old"}
+        assert list(tmp_path.iterdir()) == [out]
 
 
 def test_main_returns_what_a_shell_needs(session, tmp_path, monkeypatch, capsys):

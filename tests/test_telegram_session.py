@@ -5,12 +5,12 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from telegrams import encode_scan
 
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.session.lms2xx_codec import (
     Configuration,
     encode_configuration,
-    encode_scan,
     encode_telegram,
     encode_values,
     encode_words,
@@ -139,7 +139,7 @@ def test_wrong_crcs_are_left_out_counted_and_named(path):
     session = open_session(path)
     assert session.sweep(1).ranges.shape == (3, 401) and session.sweep(2).ranges.shape == (3, 401)
     assert session.telegrams.report()["wrong_crc_offsets"] == (854, 3290)
-    assert session.telegrams.report(1)["outcomes"] == {"scan": 3, "other": 0, "wrong CRC": 1, "truncated": 0}
+    assert session.telegrams.report()["outcomes"] == {"scan": 6, "other": 1, "wrong CRC": 2, "truncated": 0}
     wrong, behind = session.problems
     assert "2 of 9 telegrams have a wrong CRC, left out, at 854, 3290" in wrong
     assert "9 bytes after the last telegram in index.csv are not used" in behind
@@ -150,7 +150,7 @@ def test_a_truncated_last_telegram_is_left_out_and_told(path, cut):
     data = telegrams(path).read_bytes()
     telegrams(path).write_bytes(data[:-cut])
     session = open_session(path)
-    assert len(session.sweep(2).ranges) == 3 and session.telegrams.report(2)["outcomes"]["truncated"] == 1
+    assert len(session.sweep(2).ranges) == 3 and session.telegrams.report()["outcomes"]["truncated"] == 1
     assert any(f"at {len(data) - 812}, is cut off after {812 - cut} bytes" in text for text in session.problems)
 
 

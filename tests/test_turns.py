@@ -13,7 +13,7 @@ from tiny_sessions import CAMERAS, MODEL, record, rectangle
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.preprocess import survey
 from lrfcal_lib.session.read import ImageRecord, open_session
-from lrfcal_lib.session.stated import transform_from_json
+from lrfcal_lib.session.stated import TransformStated, from_json
 
 HALF = Rotation.from_rotvec([0, 0, np.pi])
 
@@ -32,7 +32,7 @@ def test_a_centred_chessboard_is_turned_alike_in_all_images_of_a_placement(centr
     found = survey.survey(centred.images(), centred.read_image, board, models)
     truth, turns = json.loads((centred.path / "truth.json").read_text())["images"], {}
     for view in (v for views in found.views.values() for v in views if not v.reason):
-        true = transform_from_json(truth[f"images/{view.camera}/{view.file}"]["T_camera_board"])
+        true = from_json(TransformStated, truth[f"images/{view.camera}/{view.file}"]["T_camera_board"]).made()
         turns.setdefault(view.placement, []).append(true.rotation.inv() * view.T_camera_board.rotation)
     for number, own in turns.items():
         assert len(own) >= 3

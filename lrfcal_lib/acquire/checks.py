@@ -1,5 +1,5 @@
-"""Is what was just recorded any good? Lights for one placement of the board, from what is on
-the disk.
+"""Is what was just recorded any good? Lights for one placement of the board, from what is on the
+disk.
 """
 
 from dataclasses import dataclass
@@ -25,9 +25,8 @@ LOW_CONTRAST = 25  # grey levels between white and dark squares
 
 @dataclass(frozen=True)
 class Light:
-    """One check.
-
-    Its text says what was seen, and what to do where the state is not 'ok' but 'warn' or 'bad'.
+    """One check; its text says what was seen, and what to do where the state is not 'ok' but 'warn'
+    or 'bad'.
     """
 
     name: str
@@ -151,9 +150,8 @@ def _edges(found):
 
 
 def check_image(image, board, model=None, name="image"):
-    """The Light, of this name, of an image of the Board.
-
-    One without a pattern needs a CameraModel.
+    """The Light, of this name, of an image of the Board; one without a pattern needs a
+    CameraModel.
     """
     if board.pattern is None:
         if model is None:

@@ -17,7 +17,7 @@ from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interru
 from lrfcal_lib.acquire.pictures import PICTURE, jpeg, png, scan_picture, sweep_picture
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import Closed, DeviceError
-from lrfcal_lib.session.stated import escape
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
 
 HERE = Path(__file__).parent
@@ -86,7 +86,8 @@ class Picture:
 
     def show(self, data, remark):
         """Show the bytes of an image; what did not change is not sent again."""
-        self.image.value, self.remark.value = data, HTML.soft(remark)
+        self.image.value = data
+        self.remark.value = HTML.soft(remark)
 
 
 FOLLOWS = "three placements and more; the recording can go on afterwards"
@@ -226,7 +227,8 @@ class Notes(logging.Handler):
 
     def __init__(self, part):
         super().__init__(logging.WARNING)
-        self.part, self.lines = part, []
+        self.part = part
+        self.lines = []
 
     def emit(self, record):
         """Show the newest lines."""
@@ -414,7 +416,8 @@ class Panel(Closed):
 
     def _refresh(self):
         """Show what can be done now."""
-        collector, parts = self.collector, self.parts
+        collector = self.collector
+        parts = self.parts
         parts.state.value = HTML.state("ready" if collector.connected else "off")
         parts.task.value = HTML.title("Next placement") + HTML.soft("connect a rig first")
         if collector.connected:

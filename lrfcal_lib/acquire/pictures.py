@@ -12,7 +12,11 @@ REACHES = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0, 30.0, 50.0, 82.0)  # of the top 
 RING_STEPS = ((6.0, 1.0), (12.0, 2.0), (30.0, 5.0), (82.0, 20.0))
 SHIFT = 4  # binary digits of a pixel's fraction, as OpenCV counts them
 MARGIN = 1.1  # a picture is so many times larger than what it shows
-LEFT, TOP, RIGHT, BOTTOM = 44, 12, 388, 255  # of a sweep in its picture, pixels
+# of a sweep in its picture, pixels
+LEFT = 44
+TOP = 12
+RIGHT = 388
+BOTTOM = 255
 
 # greys and colours, blue first
 SECTOR = (246, 246, 246)
@@ -116,7 +120,8 @@ def sweep_picture(rows, bearings, field_of_view, pitch, step):
         return image
 
     shades = _shades(np.array(list(rows.values())))
-    width, height = RIGHT - LEFT, BOTTOM - TOP
+    width = RIGHT - LEFT
+    height = BOTTOM - TOP
     u = (np.arange(width) + 0.5) / width
     v = (np.arange(height) + 0.5) / height
     bearing = np.interp(u, (0, 1), across)
@@ -145,7 +150,8 @@ def _axes(across, down):
 def _shades(ranges):
     """Colours (L, B, 3) of ranges (L, B): near is bright, none is grey."""
     known = np.isfinite(ranges)
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     if known.any():
         low, high = np.percentile(ranges[known], [2, 90])
     scaled = (np.nan_to_num(ranges, nan=high) - low) / max(high - low, 0.1)

@@ -19,15 +19,15 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import SessionRecorder, not_written
 
-FAILED, INTERRUPTED = 2, 130  # exit codes
+FAILED = 2
+INTERRUPTED = 130  # exit codes
 MARKS = {"ok": "  ok  ", "warn": "  WARN", "bad": "  BAD "}
 HOW = {  # a session was recorded, by the mode of the plan
     "stop-and-go": (
         "stop-and-go: the head rests at every pitch step, scans and images are taken at rest"
     ),
     "continuous": (
-        "continuous: scans are taken while the head moves, "
-        "each with the pitch at its middle beam"
+        "continuous: scans are taken while the head moves, each with the pitch at its middle beam"
     ),
 }
 
@@ -155,7 +155,9 @@ class Recording(Closed):
         return light
 
     def check(self, number, advice=None):
-        """Lights of a finished placement, see :func:`~lrfcal_lib.acquire.checks.check_placement`."""
+        """Lights of a finished placement, see
+        :func:`~lrfcal_lib.acquire.checks.check_placement`.
+        """
         return check_placement(open_session(self.path), number, advice)
 
     def drop(self, number):

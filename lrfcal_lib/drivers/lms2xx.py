@@ -76,15 +76,26 @@ class LMS2xx(Closed):
         For a rate or an address that no LMS2xx has, or a password of another length.
     """
 
-    def __init__(self, port, *, baudrate=None, address=0, password=b"SICK_LMS", variant=None, find_s=FIND_S,
-                 host=REAL, **configuration):  # fmt: skip
+    def __init__(
+        self,
+        port,
+        *,
+        baudrate=None,
+        address=0,
+        password=b"SICK_LMS",
+        variant=None,
+        find_s=FIND_S,
+        host=REAL,
+        **configuration,
+    ):
         if baudrate not in (None, *RATES):
             raise ValueError(
                 f"an LMS2xx has {', '.join(map(str, sorted(RATES)))} Bd, got {baudrate}"
             )
         if not 0 <= address < 0x80 or len(password) != 8:
             raise ValueError(
-                f"an address is 0 to 127, got {address}; a password has 8 bytes, got {len(password)}"
+                f"an address is 0 to 127, got {address}; a password has 8 bytes, got "
+                f"{len(password)}"
             )
         self.port = str(port)
         self._password = bytes(password)
@@ -123,21 +134,28 @@ class LMS2xx(Closed):
             self._link.close()
             self._link = None
 
-    baudrate = property(lambda self: self._opened().baudrate, doc="Of both ends of the line.")
+    @property
+    def baudrate(self):
+        """Of both ends of the line."""
+        return self._opened().baudrate
 
     @property
     def counts(self):
         """How often what happened since the device was opened, a dict.
 
-        'dropped': scans that the mirror made between two that came (needs real-time indices), most of them because the
-        line is slow; 'stale': scans that were not newer than the one before; 'reconnects'.
+        'dropped': scans that the mirror made between two that came (needs real-time indices), most
+        of them because the line is slow; 'stale': scans that were not newer than the one before;
+        'reconnects'.
         """
         return dict(self._counts)
 
-    # ------------------------------------------------------------------------------------------------- connecting
+    # ---------------------------------------------------------------------------------------------
+    # connecting
 
     def _connect(self, first, end, deadline=math.inf):
-        """Open the port and leave the device quiet, with everything about it read; the rate is found by `end`."""
+        """Open the port and leave the device quiet, with everything about it read; the rate is
+        found by `end`.
+        """
         self._link = Link(self.port, first, **self._options)
         self._scan_clock = ScanClock()
         self._link.deadline = deadline
@@ -163,7 +181,10 @@ class LMS2xx(Closed):
                 f"{self.port}: the {self.type} scans {self.variant} deg, which no LMS2xx does"
             )
         if (mode := self.configuration.measuring_mode) not in MODES:
-            text = f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are no ranges"
+            text = (
+                f"{self.port}: the {self.type} is in measuring mode {mode:02X}, whose values are "
+                "no ranges"
+            )
             raise WrongDevice(
                 f"{text} that can be told from errors: state measuring_mode, 0 to 6, to have it set"
             )
@@ -189,10 +210,11 @@ class LMS2xx(Closed):
             raise DeviceError(f"{self.port}: the device streams; call stop() first")
 
     def reconnect(self, deadline=10.0):
-        """Find the device again after the line was lost or it restarted, within seconds, and set it as it was.
+        """Find the device again after the line was lost or it restarted, within seconds, and set it
+        as it was.
 
-        LineLost if the port did not come back; NoReply, WrongDevice or Refused if it did, but the device does not work
-        as before.
+        LineLost if the port did not come back; NoReply, WrongDevice or Refused if it did, but the
+        device does not work as before.
         """
         self._idle()
         self._mend(deadline)
@@ -219,7 +241,8 @@ class LMS2xx(Closed):
         self._counts["reconnects"] += 1
         LOG.warning("%s: the device is back at %d Bd", self.port, rate)
 
-    # ------------------------------------------------------------------------------------------------- settings
+    # ---------------------------------------------------------------------------------------------
+    # settings
 
     @property
     def variant(self):
@@ -234,7 +257,9 @@ class LMS2xx(Closed):
         self.configuration = self._told(wire.CONFIGURATION, parse)
 
     def _set_rate(self, rate):
-        """Change the rate of both ends; flash is not written. Where it does not come through the old one holds."""
+        """Change the rate of both ends; flash is not written. Where it does not come through the
+        old one holds.
+        """
         old = self.baudrate
         self._link.set_rate(rate)  # before the device is told: raises where this end cannot
         self._link.set_rate(old)
@@ -247,7 +272,10 @@ class LMS2xx(Closed):
             need = "a shorter cable"
             if rate == 500000:
                 need = "RS-422 (a jumper in the plug of the device)"
-            text = f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; {self.baudrate} Bd now"
+            text = (
+                f"{self.port}: nothing comes through at {rate} Bd, which needs {need}; "
+                f"{self.baudrate} Bd now"
+            )
             raise NoReply(text) from error
 
     def _mode(self, data, what, sign=None):
@@ -257,7 +285,9 @@ class LMS2xx(Closed):
             raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
 
     def set_variant(self, fov_deg, resolution_deg):
-        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg; whether they differed."""
+        """Set field of view and resolution, 180 with 1 or 0.5 or 100 with 1, 0.5 or 0.25 deg;
+        whether they differed.
+        """
         self._idle()
         wanted = (float(fov_deg), float(resolution_deg))
         if wanted not in POINTS:
@@ -280,15 +310,18 @@ class LMS2xx(Closed):
         if self.variant != wanted:
             have = "{:g} deg in steps of {:g} deg".format(*self.variant)
             raise Refused(
-                f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it keeps {have}"
+                f"{self.port}: the {self.type} has no variant {wanted[0]:g}/{wanted[1]:g}; it "
+                f"keeps {have}"
             )
 
     def configure(self, *, unit=None, measuring_mode=None, realtime_indices=None):
-        """Change settings that are kept in flash (some thousand writes), only if they differ; whether they did.
+        """Change settings that are kept in flash (some thousand writes), only if they differ;
+        whether they did.
 
-        The unit is 'cm' or 'mm', the measuring mode a key of `lms2xx_codec.MODES` (it tells the largest range, too).
-        Without real-time indices dropped and repeated scans cannot be seen. Refused for a wrong password, or values
-        that the device declines; ValueError for those that no LMS2xx has.
+        The unit is 'cm' or 'mm', the measuring mode a key of `lms2xx_codec.MODES` (it tells the
+        largest range, too). Without real-time indices dropped and repeated scans cannot be seen.
+        Refused for a wrong password, or values that the device declines; ValueError for those that
+        no LMS2xx has.
         """
         self._idle()
         if unit not in (None, *UNITS) or measuring_mode not in (None, *MODES):
@@ -324,7 +357,8 @@ class LMS2xx(Closed):
                 f"{self.port}: the device does not take the configuration {wanted.block.hex(' ')}"
             )
 
-    # ---------------------------------------------------------------------------------------------------- scans
+    # ---------------------------------------------------------------------------------------------
+    # scans
 
     def request(self, timeout=None):
         """One scan, a Reading, within so many seconds; by default what three tries need."""
@@ -340,7 +374,8 @@ class LMS2xx(Closed):
             if reading is not None:
                 return reading
         raise NoReply(
-            f"{self.port}: scans arrive, but too late, not new, or not of the variant {self.variant}"
+            f"{self.port}: scans arrive, but too late, not new, or not of the variant "
+            f"{self.variant}"
         )
 
     def _scan(self, arrival):
@@ -349,8 +384,8 @@ class LMS2xx(Closed):
     def start(self, interlaced=False):
         """Stream: a thread reads every scan from now on.
 
-        With `interlaced` partial scans are merged to 180 deg in steps of 0.25 deg; the variant becomes 100/0.25, which
-        such scans need.
+        With `interlaced` partial scans are merged to 180 deg in steps of 0.25 deg; the variant
+        becomes 100/0.25, which such scans need.
         """
         self._idle()
         self._interlaced = interlaced
@@ -362,15 +397,19 @@ class LMS2xx(Closed):
         self._thread = self._host.thread(self._run, "LMS2xx reader")
         self._thread.start()
 
-    interval_s = property(lambda self: (4 if self._interlaced else 1) * self._assembler.interval_s,
-                          doc="Seconds between two scans of the stream.")  # fmt: skip
+    @property
+    def interval_s(self):
+        """Seconds between two scans of the stream."""
+        return (4 if self._interlaced else 1) * self._assembler.interval_s
 
     def _stream(self):
         self._prepare(self._interlaced)
         self._mode(INTERLACED if self._interlaced else STREAM, "to stream", sign=SCAN)
 
     def _run(self):
-        """Read until the stream is to stop; whatever goes wrong with the line, find the device again."""
+        """Read until the stream is to stop; whatever goes wrong with the line, find the device
+        again.
+        """
         lost = False
         while not self._interrupted.is_set():
             try:
@@ -391,7 +430,9 @@ class LMS2xx(Closed):
                 raise
 
     def _read(self):
-        """Post readings until the stream falls silent, or until the end; the list is replaced, never changed."""
+        """Post readings until the stream falls silent, or until the end; the list is replaced,
+        never changed.
+        """
         last = self._host.now()
         while not self._interrupted.is_set():
             found = self._opened().receive()
@@ -406,10 +447,11 @@ class LMS2xx(Closed):
                 raise NoReply("the stream fell silent")
 
     def take(self, count, after=None, timeout=None):
-        """Consecutive scans of the stream, a list of Reading, later than an instant, by default that of the call.
+        """Consecutive scans of the stream, a list of Reading, later than an instant, by default
+        that of the call.
 
-        The last 256 scans are kept, so that with the instant of the last scan of one call the next call goes on
-        without a gap. By default it lasts as long as the line needs and 2 s.
+        The last 256 scans are kept, so that with the instant of the last scan of one call the next
+        call goes on without a gap. By default it lasts as long as the line needs and 2 s.
         """
         if self._thread is None:
             raise DeviceError(f"{self.port}: the device does not stream; call start() first")

@@ -1,4 +1,6 @@
-"""The line to an LMS2xx: telegrams with their instants, retries, the baud rate, scans on request and as a stream."""
+"""The line to an LMS2xx: telegrams with their instants, retries, the baud rate, scans on request
+and as a stream.
+"""
 
 import itertools
 import math
@@ -16,7 +18,6 @@ NAK = 0x15
 MODE = 0x20
 VALUES = 0x30
 STATUS = 0x31
-ERRORS = 0x32
 TYPE = 0x3A
 VARIANT = 0x3B
 CONFIGURATION = 0x74
@@ -33,8 +34,8 @@ SILENCE_S = 0.02  # longer than any gap within a telegram (14 ms)
 TRIES = 3
 NAK_PAUSE_S = 0.035
 NO_ACK_S = 0.35  # the manual allows 60 ms; a machine may be busy
-# Seconds until a request that was acknowledged is sent again, and until it failed. A mode may take 3 s; what writes
-# to flash is not sent again, its caller looks whether it was done.
+# Seconds until a request that was acknowledged is sent again, and until it failed. A mode may take
+# 3 s; what writes to flash is not sent again, its caller looks whether it was done.
 PATIENCE = {MODE: (1.0, 4.0), VARIANT: (2.5, 2.5), CONFIGURE: (2.5, 2.5)}
 USUAL = (0.6, 2.5)
 WINDOWS_S = (0.25, 0.25, 0.6)  # to listen at a rate, in turn
@@ -45,26 +46,35 @@ class Arrival(NamedTuple):
 
     raw: bytes
     time_s: float
-    code = property(lambda self: self.raw[4], doc="Of the reply.")
+
+    @property
+    def code(self):
+        """Of the reply."""
+        return self.raw[4]
 
 
 def transfer_s(size, baudrate):
-    """Seconds from the first byte of a scan to its last (manual, 10.10.2: bursts of 508 bytes a turn at 500 kBd)."""
+    """Seconds from the first byte of a scan to its last (manual, 10.10.2: bursts of 508 bytes a
+    turn at 500 kBd).
+    """
     turns = (size - 1) // BURST if baudrate == 500000 else 0
     return turns * TURN_S + (size - turns * BURST) * 10 / baudrate
 
 
 def interval_s(size, baudrate, scan_s):
-    """Seconds between two scans of a stream: whole scans pass while one is sent (manual, table 10-17)."""
+    """Seconds between two scans of a stream: whole scans pass while one is sent (manual, table
+    10-17).
+    """
     return math.ceil(size * 10 / baudrate / scan_s - 1e-9) * scan_s
 
 
 class Link:
     """An open port with an LMS2xx at its other end.
 
-    Address 0 reaches any device; once the event `interrupted` is set, whoever waits here gets NoReply. Replies count
-    whose address byte is among `senders` (None: any), no request lasts beyond `deadline` (by ``host.now()``), `asked_s`
-    is the instant by the clock at which the last one was sent for the first time, and `heard` counts bytes of any kind.
+    Address 0 reaches any device; once the event `interrupted` is set, whoever waits here gets
+    NoReply. Replies count whose address byte is among `senders` (None: any), no request lasts
+    beyond `deadline` (by ``host.now()``), `asked_s` is the instant by the clock at which the last
+    one was sent for the first time, and `heard` counts bytes of any kind.
     """
 
     def __init__(self, path, baudrate, *, address=0, interrupted=None, host=REAL):
@@ -79,17 +89,26 @@ class Link:
         self._port = host.port(path, baudrate, timeout=READ_S)
         self._forget()
 
-    baudrate = property(lambda self: self._port.baudrate, doc="Of this end of the line.")
-    silent_s = property(
-        lambda self: self.host.now() - self._last, doc="Seconds since the last byte, or request."
-    )
-    acknowledged = property(
-        lambda self: self._stray == ACK, doc="Whether the last stray byte is ACK."
-    )
+    @property
+    def baudrate(self):
+        """Of this end of the line."""
+        return self._port.baudrate
+
+    @property
+    def silent_s(self):
+        """Seconds since the last byte, or request."""
+        return self.host.now() - self._last
+
+    @property
+    def acknowledged(self):
+        """Whether the last stray byte is ACK."""
+        return self._stray == ACK
 
     @property
     def declined(self):
-        """Whether the last byte is NAK and nothing followed; amid other bytes 0x15 means nothing."""
+        """Whether the last byte is NAK and nothing followed; amid other bytes 0x15 means
+        nothing.
+        """
         return self._stray == NAK and not self._rest and self.silent_s > SILENCE_S
 
     def set_rate(self, baudrate):
@@ -119,10 +138,11 @@ class Link:
                 self.host.sleep(pause)
 
     def receive(self):
-        """The device's telegrams, often none; waits 20 ms at most, longer only while more bytes keep coming.
+        """The device's telegrams, often none; waits 20 ms at most, longer only while more bytes
+        keep coming.
 
-        The bytes after a telegram tell how much earlier it came. Raises LineLost if the port vanished, NoReply if
-        somebody set `interrupted`.
+        The bytes after a telegram tell how much earlier it came. Raises LineLost if the port
+        vanished, NoReply if somebody set `interrupted`.
         """
         if self.interrupted.is_set():
             raise NoReply(f"{self.path}: waiting was interrupted")
@@ -154,13 +174,15 @@ class Link:
         ]
         return [one for one in found if self.senders is None or one.raw[1] in self.senders]
 
-    # ---------------------------------------------------------------------------------------------- requests
+    # ----------------------------------------------------------------------------------------------
+    # requests
 
     def ask(self, code, data=b"", *, limit_s=math.inf, sign=None):
-        """Send a request until its reply comes, within `limit_s` and what the manual allows this request.
+        """Send a request until its reply comes, within `limit_s` and what the manual allows this
+        request.
 
-        A reply of the code `sign`, too, shows that the request was obeyed; it stays to be received. Raises NoReply,
-        Refused or LineLost.
+        A reply of the code `sign`, too, shows that the request was obeyed; it stays to be received.
+        Raises NoReply, Refused or LineLost.
         """
         again_s, longest_s = PATIENCE.get(code, USUAL)
         end = min(self.host.now() + min(longest_s, limit_s), self.deadline)
@@ -182,7 +204,9 @@ class Link:
         )
 
     def _await(self, code, sign, again_s, end):
-        """The reply, or None and why the device declined (None if it said nothing until it is time to ask again)."""
+        """The reply, or None and why the device declined (None if it said nothing until it is time
+        to ask again).
+        """
         begin = self.host.now()
         acknowledged = False
         while (now := self.host.now()) < end:
@@ -201,12 +225,15 @@ class Link:
                 break
         return None, None
 
-    # ------------------------------------------------------------------------------------------ finding the rate
+    # ------------------------------------------------------------------------------------------
+    # finding the rate
 
     def find(self, rates, limit_s):
-        """Set the rate, of those to try in their order, at which the device answers, and stop whatever it does.
+        """Set the rate, of those to try in their order, at which the device answers, and stop
+        whatever it does.
 
-        Raises NoReply if nothing was heard at any rate, WrongDevice if only bytes that make no telegram.
+        Raises NoReply if nothing was heard at any rate, WrongDevice if only bytes that make no
+        telegram.
         """
         end = self.host.now() + limit_s
         heard = self.heard
@@ -219,13 +246,19 @@ class Link:
         if self.address == 0:
             tried += " (any)"
         if self.heard > heard:
-            raise WrongDevice(f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
-                              "another device, wires that echo, or a line that damages everything")  # fmt: skip
-        raise NoReply(f"{self.path}: no reply at {tried}: check power (ready up to 60 s after switching on), "
-                      "the address, whether RX and TX are crossed, and the jumper for RS-422 in the plug")  # fmt: skip
+            raise WrongDevice(
+                f"{self.path}: bytes arrive, but no telegram of an LMS2xx at {tried}: "
+                "another device, wires that echo, or a line that damages everything"
+            )
+        raise NoReply(
+            f"{self.path}: no reply at {tried}: check power (ready up to 60 s after switching on), "
+            "the address, whether RX and TX are crossed, and the jumper for RS-422 in the plug"
+        )
 
     def _answers(self, rate, window, end):
-        """Whether the device confirms at a rate that it stops streaming; once it acknowledges it gets 3 s for that."""
+        """Whether the device confirms at a rate that it stops streaming; once it acknowledges it
+        gets 3 s for that.
+        """
         try:
             self.set_rate(rate)
         except PortError:  # most RS-232 ports lack 500000 Bd
@@ -245,7 +278,9 @@ class Link:
         return False
 
     def hush(self):
-        """See that nothing comes in, else ask again to stop streaming; raises NoReply, Refused or LineLost."""
+        """See that nothing comes in, else ask again to stop streaming; raises NoReply, Refused or
+        LineLost.
+        """
         for _ in range(TRIES):
             begin = self.host.now()
             heard = self.heard
@@ -262,7 +297,8 @@ class Link:
 POINTS = {(100, 1.0): 101, (100, 0.5): 201, (100, 0.25): 401, (180, 1.0): 181, (180, 0.5): 361}
 WINDOW_S = 2.0  # arrivals in the last so many seconds tell the host's clock from the device's
 OFF_S = 1.2  # how far a scan may arrive off its expected instant
-JITTER_S = 0.05  # corrections of the clock up to this are spread over scans; at larger ones scans are left out
+# corrections of the clock up to this are spread over scans; at larger ones scans are left out
+JITTER_S = 0.05
 LEAST_S = TURN_S / 100  # between two instants told; far less than between two scans
 FORGET_S = 30.0  # after such a pause the number of turns in between is not known
 STUBBORN = 5  # so many implausible scan indices in a row: the device counts anew
@@ -286,9 +322,10 @@ class Reading:
 class ScanClock:
     """Instants of scans: arrivals jitter late, the device's index of turns does not.
 
-    Without indices an arrival counts as it is. With them, the earliest of the arrivals of the last two seconds ties
-    the count of turns to the host's clock, so that a busy host or a late telegram does not shift a scan. A mirror that
-    is off its nominal speed by a part e shifts it by up to 2 e seconds.
+    Without indices an arrival counts as it is. With them, the earliest of the arrivals of the last
+    two seconds ties the count of turns to the host's clock, so that a busy host or a late telegram
+    does not shift a scan. A mirror that is off its nominal speed by a part e shifts it by up to 2 e
+    seconds.
     """
 
     def __init__(self):
@@ -299,9 +336,9 @@ class ScanClock:
     def place(self, index, time_s):
         """Instant of a scan, and turns since the last one.
 
-        `index` counts the turns of the mirror modulo 256 and is -1 where the device does not send it, `time_s` is the
-        instant as of its arrival. Instants rise from scan to scan; that of a scan that is not newer is None. The turns
-        are 0 where they are not known.
+        `index` counts the turns of the mirror modulo 256 and is -1 where the device does not send
+        it, `time_s` is the instant as of its arrival. Instants rise from scan to scan; that of a
+        scan that is not newer is None. The turns are 0 where they are not known.
         """
         if index < 0:
             return time_s, 0
@@ -335,12 +372,14 @@ class ScanClock:
 
 
 class Assembler:
-    """Readings out of the telegrams of a variant (field of view and resolution, degrees), one by one.
+    """Readings out of the telegrams of a variant (field of view and resolution, degrees), one by
+    one.
 
-    With `interlaced` four partial scans of 180 deg are merged into one of 721 values. 'dropped' (scans between two
-    telegrams that were not sent or got lost) and 'stale' are counted up. The clock is that of the scans before, where
-    the mirror went on turning: an old telegram that comes first is then known as such. One turn in `turns` begins a
-    telegram, which takes `duration_s` from its beginning to its last byte; `interval_s` is that of a stream.
+    With `interlaced` four partial scans of 180 deg are merged into one of 721 values. 'dropped'
+    (scans between two telegrams that were not sent or got lost) and 'stale' are counted up. The
+    clock is that of the scans before, where the mirror went on turning: an old telegram that comes
+    first is then known as such. One turn in `turns` begins a telegram, which takes `duration_s`
+    from its beginning to its last byte; `interval_s` is that of a stream.
     """
 
     def __init__(self, variant, configuration, baudrate, interlaced, counts, clock=None):
@@ -359,9 +398,11 @@ class Assembler:
         self.interval_s = interval_s(size, baudrate, self.turns * TURN_S)
 
     def feed(self, raw, arrival_s):
-        """The Reading that a telegram with a sound checksum completes, whose last byte came at an instant.
+        """The Reading that a telegram with a sound checksum completes, whose last byte came at an
+        instant.
 
-        None for a part of a set, and for what is no scan of this variant, unit and kind or is not new.
+        None for a part of a set, and for what is no scan of this variant, unit and kind or is not
+        new.
         """
         own = self.configuration
         try:
@@ -417,8 +458,10 @@ class Assembler:
         parts = self._parts
         self._parts = []
         order = np.argsort(np.concatenate([one.bearings for one in parts]))
-        columns = {name: np.concatenate([getattr(one, name) for one in parts])[order]
-                   for name in ("ranges", "reasons", "bearings", "beam_times_s")}  # fmt: skip
+        columns = {
+            name: np.concatenate([getattr(one, name) for one in parts])[order]
+            for name in ("ranges", "reasons", "bearings", "beam_times_s")
+        }
         return replace(
             parts[0], telegrams=tuple(t for one in parts for t in one.telegrams), **columns
         )

@@ -36,7 +36,10 @@ class Frame:
     data1: int = 0
     data2: int = 0
 
-    value = property(lambda self: self.data1 << 8 | self.data2, doc="Number of both data bytes.")
+    @property
+    def value(self):
+        """Number of both data bytes."""
+        return self.data1 << 8 | self.data2
 
 
 @dataclass(frozen=True)

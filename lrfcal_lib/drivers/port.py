@@ -1,4 +1,6 @@
-"""Ports that open with errors that say what to do, what can go wrong, and heads that stop on every exit."""
+"""Ports that open with errors that say what to do, what can go wrong, and heads that stop on every
+exit.
+"""
 
 import atexit
 import errno
@@ -20,7 +22,9 @@ class DeviceError(RuntimeError):
 
 
 class PortError(DeviceError):
-    """The port cannot be opened or set: missing, no permission, busy, no serial line, rate not possible."""
+    """The port cannot be opened or set: missing, no permission, busy, no serial line, rate not
+    possible.
+    """
 
 
 class NoReply(DeviceError):
@@ -55,7 +59,9 @@ _before = {}
 
 
 def guard(device):
-    """Call ``device.emergency_stop()`` at exit, and in the main thread on SIGTERM and SIGHUP, until `release`."""
+    """Call ``device.emergency_stop()`` at exit, and in the main thread on SIGTERM and SIGHUP, until
+    `release`.
+    """
     _moving_things.add(device)
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -80,7 +86,9 @@ def _stop_all():
 
 
 def _on_signal(number, frame):
-    """Stop, then do what would have been done; what would kill becomes an exit that closes files."""
+    """Stop, then do what would have been done; what would kill becomes an exit that
+    closes files.
+    """
     _stop_all()
     before = _before.get(number)
     if callable(before):
@@ -95,7 +103,8 @@ WRITE_S = 1.0  # longest time a write may block
 
 
 def open_port(path, baudrate, *, timeout):
-    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit; reads wait `timeout` seconds.
+    """Open a serial port for this process alone: 8 data bits, no parity, 1 stop bit; reads wait
+    `timeout` seconds.
 
     Raises
     ------
@@ -143,15 +152,19 @@ def _holder(path):
 
 
 def set_rate(port, baudrate):
-    """Change the rate of an open port and read it back; PortError if it cannot (the old one holds), or LineLost."""
+    """Change the rate of an open port and read it back; PortError if it cannot (the old one holds),
+    or LineLost.
+    """
     old = port.baudrate
     try:
         with line_lost(port.port):
             port.baudrate = baudrate
             if set(termios.tcgetattr(port.fd)[4:6]) == {getattr(termios, f"B{baudrate}", None)}:
                 return
-        reason = (f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 interface "
-                  "whose clock divides to it, else use 38400")  # fmt: skip
+        reason = (
+            f"does not take {baudrate} Bd: its driver set another rate; 500000 Bd needs an RS-422 "
+            "interface whose clock divides to it, else use 38400"
+        )
     except ValueError as error:
         reason = f"cannot do {baudrate} Bd: {error}"
     port.baudrate = old
@@ -171,7 +184,9 @@ MOMENT_S = 1e-3
 
 
 class Host:
-    """What drivers have of this machine, named as in `time` and `threading`; tests have another one."""
+    """What drivers have of this machine, named as in `time` and `threading`; tests have another
+    one.
+    """
 
     now = staticmethod(time.monotonic)
     _zero = time.time() - time.monotonic()
@@ -181,12 +196,16 @@ class Host:
     set_rate = staticmethod(set_rate)
 
     def time(self):
-        """A date, s, that nobody sets while this program runs: a step would tear scans and pitch apart."""
+        """A date, s, that nobody sets while this program runs: a step would tear scans and pitch
+        apart.
+        """
         return self._zero + time.monotonic()
 
     @staticmethod
     def sleep(seconds):
-        """Wait; moments are spent awake, since a busy machine gives the processor back late to those who sleep."""
+        """Wait; moments are spent awake, since a busy machine gives the processor back late to
+        those who sleep.
+        """
         end = time.monotonic() + seconds
         if seconds > MOMENT_S:
             time.sleep(seconds)

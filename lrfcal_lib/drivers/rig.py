@@ -20,9 +20,11 @@ from lrfcal_lib.session.lms2xx_codec import METRES, MODES, encode_configuration
 
 @dataclass(frozen=True)
 class Moved:
-    """The head rests at a stop, number so many of so many; what is recorded at it is later than its host time.
+    """The head rests at a stop, number so many of so many; what is recorded at it is later than its
+    host time.
 
-    Pitch in radians, as commanded and as it is: measured, or dead reckoning where the head does not tell it.
+    Pitch in radians, as commanded and as it is: measured, or dead reckoning where the head does not
+    tell it.
     """
 
     placement: int
@@ -36,7 +38,9 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """Readings, each with its pitch in radians; `share` is what is done of a continuous sweep, NaN at a stop."""
+    """Readings, each with its pitch in radians; `share` is what is done of a continuous sweep, NaN
+    at a stop.
+    """
 
     placement: int
     readings: tuple
@@ -46,7 +50,9 @@ class Scanned:
 
 @dataclass(frozen=True, eq=False)
 class Photographed:
-    """An image of a placement, -1 for the board held close; purpose 'board', 'scene' or 'intrinsics'."""
+    """An image of a placement, -1 for the board held close; purpose 'board', 'scene' or
+    'intrinsics'.
+    """
 
     placement: int
     camera: str
@@ -57,7 +63,9 @@ class Photographed:
 
 @dataclass(frozen=True)
 class Tracked:
-    """The pitch over a continuous sweep to a commanded one, a tuple of host time, radians, whether it was measured."""
+    """The pitch over a continuous sweep to a commanded one, a tuple of host time, radians, whether
+    it was measured.
+    """
 
     placement: int
     commanded: float
@@ -79,7 +87,8 @@ STILL = 1.9  # mean ratio of von Neumann; 2 of scans that differ by noise alone
 
 
 class Rig(Closed):
-    """The devices of a RigFile, all with the same host clock, s; a context manager that stops the head and closes them.
+    """The devices of a RigFile, all with the same host clock, s; a context manager that stops the
+    head and closes them.
 
     :meth:`open` opens them.
     """
@@ -95,10 +104,12 @@ class Rig(Closed):
 
     @classmethod
     def open(cls, stated, *, host=REAL, camera=None):
-        """Open all devices and set the laser range finder as the rig file asks; what is set already is left alone.
+        """Open all devices and set the laser range finder as the rig file asks; what is set already
+        is left alone.
 
-        The host is the machine that the drivers run on; ``camera(name)`` opens cameras whose images come from elsewhere
-        than the source stated. DeviceError, with the device in the message: those opened before are closed again.
+        The host is the machine that the drivers run on; ``camera(name)`` opens cameras whose images
+        come from elsewhere than the source stated. DeviceError, with the device in the message:
+        those opened before are closed again.
         """
         devices = stated.devices
         skipped = {"port", "interlaced"}
@@ -134,24 +145,35 @@ class Rig(Closed):
 
     @property
     def lrf_info(self):
-        """The stated LrfInfo with the field of view, step, unit and largest range that the device has now."""
+        """The stated LrfInfo with the field of view, step, unit and largest range that the device
+        has now.
+        """
         stated = self.stated.lrf
         lrf = self.lrf
         view, step = (180, 0.25) if self.stated.devices.lrf.interlaced else lrf.variant
         unit = METRES[lrf.configuration.unit]
         largest = MODES[lrf.configuration.measuring_mode].largest
-        seen = {"field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
-                "bearing_step": math.radians(step), "range_resolution": unit, "max_range": largest * unit}  # fmt: skip
+        seen = {
+            "field_of_view": tuple(np.radians([90 - view / 2, 90 + view / 2]).tolist()),
+            "bearing_step": math.radians(step),
+            "range_resolution": unit,
+            "max_range": largest * unit,
+        }
         return replace(stated, model=stated.model or lrf.type, **seen)
 
     def begin_telegrams(self):
-        """Telegrams with which a recording begins: the configuration, which states the measuring mode."""
+        """Telegrams with which a recording begins: the configuration, which states the measuring
+        mode.
+        """
         return [encode_configuration(self.lrf.configuration)]
 
-    # -------------------------------------------------------------------------------------------- the board
+    # --------------------------------------------------------------------------------------------
+    # the board
 
     def move_board(self, placement):
-        """Put the board of an emulated rig at a placement; False where nobody but the user can: a real rig."""
+        """Put the board of an emulated rig at a placement; False where nobody but the user can: a
+        real rig.
+        """
         return self._control(f"place/{placement}")
 
     def hold_close(self, camera, view):
@@ -178,16 +200,19 @@ class Rig(Closed):
             "Remove devices.control from the rig file to move a real board by hand"
         )
 
-    # ---------------------------------------------------------------------------------------------- recording
+    # ----------------------------------------------------------------------------------------------
+    # recording
 
     def acquire(self, placement):
-        """Record a Placement of the plan: a generator of Moved, Scanned, Photographed and Tracked, as they happen.
+        """Record a Placement of the plan: a generator of Moved, Scanned, Photographed and Tracked,
+        as they happen.
 
-        Scans and images of a stop are later than the instant at which the head came to rest there. In a continuous
-        sweep every scan has the pitch at the instant of its middle beam, interpolated between the head's readings (dead
-        reckoning without them), and is handed out as soon as that is known. Whatever happens, also when the generator
-        is closed, the head is stopped, and the scans are. DeviceError, too, after a sweep with a head that tells
-        nothing if the scans are all alike: it did not move.
+        Scans and images of a stop are later than the instant at which the head came to rest there.
+        In a continuous sweep every scan has the pitch at the instant of its middle beam,
+        interpolated between the head's readings (dead reckoning without them), and is handed out as
+        soon as that is known. Whatever happens, also when the generator is closed, the head is
+        stopped, and the scans are. DeviceError, too, after a sweep with a head that tells nothing
+        if the scans are all alike: it did not move.
         """
         sweep = self._continuous if self.stated.plan.mode == "continuous" else self._stop_and_go
         seen = []
@@ -203,7 +228,8 @@ class Rig(Closed):
             ):
                 head = self.stated.devices.head
                 raise NoReply(
-                    f"the head did not move: all {len(seen)} scans of the sweep show the same; check its power, the "
+                    f"the head did not move: all {len(seen)} scans of the sweep show the same; "
+                    "check its power, the "
                     f"wires A and B, address {head.address} and {head.baudrate} Bd at {head.port}"
                 )
         except BaseException:
@@ -211,7 +237,9 @@ class Rig(Closed):
             raise
 
     def acquire_close(self, camera):
-        """Take one image of the board held close to a camera, the head at pitch 0; events as :meth:`acquire`."""
+        """Take one image of the board held close to a camera, the head at pitch 0; events as
+        :meth:`acquire`.
+        """
         try:
             yield from self._photograph([camera], -1, self._move(-1, 0.0, 1, 1), "intrinsics")
         except BaseException:
@@ -251,7 +279,9 @@ class Rig(Closed):
         self.lrf.stop()
 
     def _scans(self, after, interlaced):
-        """Scans of a stream, or one by one, later than an instant; a line that was lost has one chance to come back."""
+        """Scans of a stream, or one by one, later than an instant; a line that was lost has one
+        chance to come back.
+        """
         count = self.stated.plan.scans_per_stop
         if interlaced:
             return self.lrf.take(count, after=after, timeout=SCAN_S * count)
@@ -309,7 +339,8 @@ class Rig(Closed):
                 newest = fresh[-1].time_s
             elif self._now() - heard > GAP_S:
                 raise NoReply(
-                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range finder"
+                    f"no scan for {GAP_S:g} s of the sweep: check the line of the laser range "
+                    "finder"
                 )
             sure = [point for point in self.head.track if point[2] or not self.head.has_feedback]
             # what is not measured may change until the next reading
@@ -350,10 +381,11 @@ def _placed(readings, track):
 def unchanged(scans):
     """Whether scans differ by noise alone, as those of a head at rest do.
 
-    By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for noise, less where
-    something changes slowly or once. The mean over the beams counts, since beams along the tilt axis see the same wall
-    at any pitch: a head that moves is never accused, one that does not is believed where much else moves. Beams without
-    a range in one of the scans, (B,) each, do not count; False where all lack one.
+    By the ratio of von Neumann: squared steps from scan to scan over the squared spread, 2 for
+    noise, less where something changes slowly or once. The mean over the beams counts, since beams
+    along the tilt axis see the same wall at any pitch: a head that moves is never accused, one that
+    does not is believed where much else moves. Beams without a range in one of the scans, (B,)
+    each, do not count; False where all lack one.
     """
     ranges = np.array(scans)
     ranges = ranges[:, np.isfinite(ranges).all(axis=0)]
@@ -372,6 +404,8 @@ def _camera(stated, name):
     camera = Camera(asked.source, name=name, size=size, **options)
     if (got := camera.size) not in (None, size):
         camera.close()
-        raise ValueError(f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x {size[1]}: "
-                         "state a size that it can do")  # fmt: skip
+        raise ValueError(
+            f"it gives {got[0]} x {got[1]} pixels, rig.cameras.{name} states {size[0]} x "
+            f"{size[1]}: state a size that it can do"
+        )
     return camera

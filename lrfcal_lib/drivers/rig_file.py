@@ -1,4 +1,6 @@
-"""The rig file: what is stated about a rig, where its devices are, and what is to be recorded (JSON)."""
+"""The rig file: what is stated about a rig, where its devices are, and what is to be recorded
+(JSON).
+"""
 
 import json
 import math
@@ -7,24 +9,39 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, StrictBool, StrictStr, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    StrictBool,
+    StrictStr,
+    model_validator,
+)
 from scipy.spatial.transform import RigidTransform
 
+from lrfcal_lib.drivers.lms2xx_link import RATES
 from lrfcal_lib.drivers.pelco_d import FASTEST
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session.stated import CameraInfo, LrfInfo, SessionStated, parse_session, refused
 
-PURPOSES = ("board", "scene")
-MOST_STOPS, FINEST_DEG, MOST_BYTES, MOST_PLACEMENTS = 5000, 1e-3, 10_000_000, 1000
+MOST_STOPS = 5000
+FINEST_DEG = 1e-3
+MOST_BYTES = 10_000_000
+MOST_PLACEMENTS = 1000
 STOPS = f"first, last, and a step of {FINEST_DEG:g} or more for 2 to {MOST_STOPS} stops are needed"
 
 
 class RigFileError(ValueError):
-    """A rig file that cannot be used: the message names the file, the key, the value and what to do about it."""
+    """A rig file that cannot be used: the message names the file, the key, the value and what to do
+    about it.
+    """
 
 
 class Stated(BaseModel, frozen=True):
-    """An object of a rig file: null is as good as left out, and keys that it does not have are refused."""
+    """An object of a rig file: null is as good as left out, and keys that it does not have are
+    refused.
+    """
 
     @model_validator(mode="before")
     @classmethod
@@ -39,7 +56,9 @@ class Stated(BaseModel, frozen=True):
 def number(least, most, unit="", kinds=(int, float), what="a number"):
     """A number within limits; NaN is in none, and true is no number."""
     words = f"{what} from {least} to {most} {unit}".rstrip() + " is needed"
-    return Annotated[Any, refused(lambda value: type(value) not in kinds or not least <= value <= most, words)]
+    return Annotated[
+        Any, refused(lambda value: type(value) not in kinds or not least <= value <= most, words)
+    ]
 
 
 def whole(least, most):
@@ -49,20 +68,27 @@ def whole(least, most):
 
 def several(kind, count):
     """So many values of a kind."""
-    return Annotated[tuple[kind, ...], refused(lambda values: len(values) != count, f"a list of {count} is needed")]
+    return Annotated[
+        tuple[kind, ...],
+        refused(lambda values: len(values) != count, f"a list of {count} is needed"),
+    ]
 
 
-Text = Annotated[StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")]
+Text = Annotated[
+    StrictStr, refused(lambda text: not text.isprintable() or not text, "a text is needed")
+]
 Angle = number(-180, 180, "deg")
 Perhaps = Literal["auto", True, False]
-Near, Seconds, Speed = number(1e-4, 45, "deg"), number(0, 60, "s"), number(0.01, 360, "deg/s")
+Near = number(1e-4, 45, "deg")
+Seconds = number(0, 60, "s")
+Speed = number(0.01, 360, "deg/s")
 ORDER = "the lower one comes first"
 
 
-RATES = (9600, 19200, 38400, 500000)  # of an LMS2xx
 OTHER_RATE = (
-    "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range finder is driven here; "
-    "record it by a program of your own that writes a session (lrfcal_lib.session.write.SessionWriter)"
+    "one of 9600, 19200, 38400, 500000 is needed, the rates of a SICK LMS2xx: no other range "
+    "finder is driven here; record it by a program of your own that writes a session "
+    "(lrfcal_lib.session.write.SessionWriter)"
 )
 
 
@@ -70,10 +96,14 @@ class LrfDevice(Stated):
     """Where the laser range finder is, and how it is to be set."""
 
     port: Text
-    baudrate: Annotated[Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)] = None
+    baudrate: Annotated[
+        Any, refused(lambda rate: type(rate) is not int or rate not in RATES, OTHER_RATE)
+    ] = None
     address: whole(0, 127) = None
     password: Annotated[
-        Text, AfterValidator(str.encode), refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed")
+        Text,
+        AfterValidator(str.encode),
+        refused(lambda raw: len(raw) != 8, "8 ASCII characters are needed"),
     ] = None
     variant: several(number(0.25, 180, "deg"), 2) = None
     unit: Literal["mm", "cm"] = None
@@ -90,21 +120,27 @@ class HeadSettings(Stated):
 
     address: whole(0, 255) = 1  # the usual factory setting of the DIP switches
     baudrate: whole(50, 4_000_000) = 2400  # the most common default; 9600 is the next
-    # Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file that does not state
-    # it means true: a silent head may as well be one with another address or rate.
+    # Whether it tells its tilt (query 53). "auto" asks; most cheap heads never answer. A rig file
+    # that does not state it means true: a silent head may as well be one with another address or
+    # rate.
     feedback: Perhaps = "auto"
-    # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are used.
+    # Whether it obeys set-tilt (4D). "auto" tries where there is feedback; else up and down are
+    # used.
     absolute: Perhaps = "auto"
-    # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed; true makes a missing
-    # one an error (the adapter is dead), false makes one a warning.
+    # Whether the adapter hands sent bytes back, as two-wire RS-485 may. Echoes are always removed;
+    # true makes a missing one an error (the adapter is dead), false makes one a warning.
     echo: Perhaps = "auto"
     # Asking for more is an error. The protocol knows no limits; typical heads tilt by -90 to 90.
-    pitch_limits_deg: Annotated[several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)] = (-60.0, 60.0)
+    pitch_limits_deg: Annotated[
+        several(Angle, 2), refused(lambda ends: ends[0] >= ends[1], ORDER)
+    ] = (-60.0, 60.0)
     position_zero_deg: number(-360, 360, "deg") = 0.0  # elevation that the head tells at pitch 0
-    invert: StrictBool = False  # it hangs upside down or counts the other way: its "up" lowers the view
+    invert: StrictBool = (
+        False  # it hangs upside down or counts the other way: its "up" lowers the view
+    )
     tilt_speed: whole(0, FASTEST) = 0x20  # speed byte, 0 is very slow
-    # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed heads, until it was
-    # learnt, and the log says so.
+    # At `tilt_speed`, both ways or (up, down). Not stated: 4 is assumed, as of constant-speed
+    # heads, until it was learnt, and the log says so.
     degrees_per_second: Annotated[
         several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
     ] = None
@@ -119,9 +155,11 @@ class HeadSettings(Stated):
     reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
     gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
     retries: whole(0, 20) = 3  # queries repeated when no reply came
-    sends: whole(1, 20) = 1  # motion frames in a row: 2 on weak lines; stops are sent twice in any case
+    # motion frames in a row: 2 on weak lines; stops are sent twice in any case
+    sends: whole(1, 20) = 1
     repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
-    reconnect_s: number(0, 3600, "s") = 3.0  # a call waits this long for a vanished port to come back
+    # a call waits this long for a vanished port to come back
+    reconnect_s: number(0, 3600, "s") = 3.0
 
     def elevation(self, pitch):
         """What the head calls a pitch, rad."""
@@ -145,9 +183,13 @@ class CameraDevice(Stated):
 
     source: Annotated[
         Any,
-        refused(lambda v: not (type(v) is int and 0 <= v <= 255 or type(v) is str and v and v.isprintable()),
-                "a text, or a whole number from 0 to 255 is needed"),
-    ]  # fmt: skip
+        refused(
+            lambda v: (
+                not (type(v) is int and 0 <= v <= 255 or type(v) is str and v and v.isprintable())
+            ),
+            "a text, or a whole number from 0 to 255 is needed",
+        ),
+    ]
     size: several(whole(1, 100_000), 2) = None
     exposure: number(1e-6, 60, "s") = None
     fps: number(0.01, 10_000, "Hz") = None
@@ -166,12 +208,16 @@ class Devices(Stated):
     def ports(self):
         """Each device has a port of its own."""
         if self.lrf.port == self.head.port:
-            raise ValueError(f"lrf.port and head.port are both {self.lrf.port}: each device has its own")
+            raise ValueError(
+                f"lrf.port and head.port are both {self.lrf.port}: each device has its own"
+            )
         return self
 
 
 def stops_of(sweep):
-    """Pitch angles of a sweep (first, last, step; deg), radians: its ends are met, its step is not exceeded."""
+    """Pitch angles of a sweep (first, last, step; deg), radians: its ends are met, its step is not
+    exceeded.
+    """
     first, last, step = sweep
     count = math.ceil(round(abs(last - first) / step, 6)) + 1 if step >= FINEST_DEG else 0
     return np.radians(np.linspace(first, last, count if count <= MOST_STOPS else 0))
@@ -181,7 +227,9 @@ Sweep = Annotated[several(Angle, 3), refused(lambda sweep: len(stops_of(sweep)) 
 
 
 class ListedPlacement(Stated):
-    """A placement of the plan; a board of false is a scene without one, what is left out is as in the plan."""
+    """A placement of the plan; a board of false is a scene without one, what is left out is as in
+    the plan.
+    """
 
     number: whole(0, 999_999) = None
     pitch_deg: Sweep = None
@@ -194,7 +242,8 @@ class Placement:
     """What is recorded while the board stays where it is."""
 
     number: int
-    pitch: np.ndarray  # where scans are taken, radians, in the order of motion; of a continuous sweep its ends
+    # where scans are taken, radians, in the order of motion; of a continuous sweep its ends
+    pitch: np.ndarray
     image_pitch: tuple[float, ...]  # where images are taken, radians
     purpose: str = "board"  # of the images, or "scene"
 
@@ -207,9 +256,10 @@ class Placement:
 class Plan(Stated):
     """What is to be recorded.
 
-    Of `count` placements, where none are listed, every other one is swept the other way, which shows the play of the
-    gear; `sweep_speed` is the speed byte of the head in continuous sweeps, by default its `tilt_speed`;
-    `intrinsics_images` are those of the board held close to each camera, before the placements.
+    Of `count` placements, where none are listed, every other one is swept the other way, which
+    shows the play of the gear; `sweep_speed` is the speed byte of the head in continuous sweeps, by
+    default its `tilt_speed`; `intrinsics_images` are those of the board held close to each camera,
+    before the placements.
     """
 
     pitch_deg: Sweep = (-30.0, 10.0, 0.5)
@@ -219,7 +269,9 @@ class Plan(Stated):
     sweep_speed: whole(0, 63) = None
     count: whole(1, 1000) = 12
     intrinsics_images: whole(0, 1000) = 0
-    placements: Annotated[tuple[ListedPlacement, ...], Field(fail_fast=True, max_length=MOST_PLACEMENTS)] = ()
+    placements: Annotated[
+        tuple[ListedPlacement, ...], Field(fail_fast=True, max_length=MOST_PLACEMENTS)
+    ] = ()
 
     @model_validator(mode="after")
     def numbered(self):
@@ -230,7 +282,9 @@ class Plan(Stated):
         return self
 
     def to_do(self, count=None):
-        """The placements to record, in order, a list of Placement; only so many of them if that is given."""
+        """The placements to record, in order, a list of Placement; only so many of them if that is
+        given.
+        """
         listed = self.placements or [ListedPlacement()] * (count or self.count)
         found = []
         for i, one in enumerate(listed[:count], 1):
@@ -238,7 +292,8 @@ class Plan(Stated):
             images = self.image_pitch_deg if one.image_pitch_deg is None else one.image_pitch_deg
             stops = stops if self.placements or i % 2 else stops[::-1]
             number = i if one.number is None else one.number
-            found.append(Placement(number, stops, tuple(map(math.radians, images)), PURPOSES[not one.board]))
+            purpose = "board" if one.board else "scene"
+            found.append(Placement(number, stops, tuple(map(math.radians, images)), purpose))
         return found
 
 
@@ -251,7 +306,8 @@ class RigFile:
     board: Board
     lrf: LrfInfo
     T_head_lrf: RigidTransform | None
-    platform_sigma: tuple[float, float]  # how well the platform is known: direction (radians) and offset (metres)
+    # how well the platform is known: direction (radians) and offset (metres)
+    platform_sigma: tuple[float, float]
     cameras: dict[str, CameraInfo]
     devices: Devices
     plan: Plan
@@ -262,18 +318,23 @@ class RigFile:
             asked = np.degrees([*placement.pitch, *placement.image_pitch])
             if asked.min() < low - 1e-6 or asked.max() > high + 1e-6:
                 raise RigFileError(
-                    f"{self.path}: plan: placement {placement.number} asks for a pitch of {asked.min():g} to "
-                    f"{asked.max():g} deg, devices.head.pitch_limits_deg are {low:g} to {high:g}: ask for less"
+                    f"{self.path}: plan: placement {placement.number} asks for a pitch of "
+                    f"{asked.min():g} to {asked.max():g} deg, devices.head.pitch_limits_deg are "
+                    f"{low:g} to {high:g}: ask for less"
                 )
         if self.plan.mode == "continuous" and self.devices.lrf.interlaced:
             raise RigFileError(
-                f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the head at rest, "
-                "use the mode stop-and-go, or a variant of 0.5 or 1 deg"
+                f"{self.path}: devices.lrf.interlaced is true: the four scans of a set need the "
+                "head at rest, use the mode stop-and-go, or a variant of 0.5 or 1 deg"
             )
 
     def with_mode(self, mode):
         """The same with another mode of the plan (None: its own)."""
-        return self if mode is None else replace(self, plan=self.plan.model_copy(update={"mode": mode}))
+        return (
+            self
+            if mode is None
+            else replace(self, plan=self.plan.model_copy(update={"mode": mode}))
+        )
 
 
 def read_rig_file(path):
@@ -291,7 +352,9 @@ def read_rig_file(path):
     path = Path(path)
     try:
         if path.stat().st_size > MOST_BYTES or not path.is_file():
-            raise RigFileError(f"{path}: no file, or one of more than {MOST_BYTES} bytes: name a rig file")
+            raise RigFileError(
+                f"{path}: no file, or one of more than {MOST_BYTES} bytes: name a rig file"
+            )
         data = json.loads(path.read_bytes())
     except OSError as error:
         hint = "'python -m lrfcal_lib emulate --rig-file' writes an example"
@@ -313,16 +376,25 @@ def rig_of(data, path=Path("rig.json")):
     try:
         if not isinstance(data, dict):
             raise ValueError(f"the file is {ascii(data)[:80]}: an object is needed")
-        given = {"name": "rig", "licence": "", "source": "", "simulated": False} | data | {"placements": ()}
+        given = (
+            {"name": "rig", "licence": "", "source": "", "simulated": False}
+            | data
+            | {"placements": ()}
+        )
         stated = parse_session({k: v for k, v in given.items() if v is not None}, RigFileStated)
-        devices, cameras = stated["devices"].cameras, stated["cameras"]
+        devices = stated["devices"].cameras
+        cameras = stated["cameras"]
         if set(devices) != set(cameras):
-            raise ValueError(f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
-                             f"{', '.join(cameras) or 'none'}: every camera stands in both")  # fmt: skip
+            raise ValueError(
+                f"devices.cameras are {', '.join(devices) or 'none'}, rig.cameras "
+                f"{', '.join(cameras) or 'none'}: every camera stands in both"
+            )
         for name, info in cameras.items():
             if devices[name].size not in (None, (info.width, info.height)):
-                raise ValueError(f"devices.cameras.{name}.size is {list(devices[name].size)}, rig.cameras.{name} "
-                                 f"states {[info.width, info.height]}: leave it out")  # fmt: skip
+                raise ValueError(
+                    f"devices.cameras.{name}.size is {list(devices[name].size)}, "
+                    f"rig.cameras.{name} states {[info.width, info.height]}: leave it out"
+                )
     except (ValueError, RecursionError) as error:
         raise RigFileError(f"{path}: {error}") from error
     about = {key: stated[key] for key in ("licence", "source", "simulated")}

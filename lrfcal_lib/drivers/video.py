@@ -1,4 +1,6 @@
-"""Colour cameras: devices, streams and files; the newest frame with the time at which it was grabbed."""
+"""Colour cameras: devices, streams and files; the newest frame with the time at which it was
+grabbed.
+"""
 
 import contextlib
 import glob
@@ -32,14 +34,17 @@ FPS = cv2.CAP_PROP_FPS
 IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm"}
 AGAIN_S = 0.25  # between attempts to find a lost device
 CLOSE_S = 2.0  # longest wait for a frame that is being grabbed
-# A camera that is lost is told once, by us: FFmpeg and OpenCV would say so at every attempt to find it.
+# A camera that is lost is told once, by us: FFmpeg and OpenCV would say so at every attempt to find
+# it.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet
 if "OPENCV_LOG_LEVEL" not in os.environ:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 class Images:
-    """Encoded images that are read like cv2.VideoCapture; ``take()`` gives the next one, None at the end."""
+    """Encoded images that are read like cv2.VideoCapture; ``take()`` gives the next one, None at
+    the end.
+    """
 
     def __init__(self):
         self._image = b""
@@ -62,7 +67,9 @@ class Images:
         return image is not None, image
 
     def get(self, key):
-        """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for what is unknown."""
+        """Size of the image grabbed last, or of the first, which is kept for the next grab; 0 for
+        what is unknown.
+        """
         if self._image == b"":
             self._held = self.grab()
         done, image = self.retrieve()
@@ -73,8 +80,9 @@ class Images:
 class MjpegStream(Images):
     """Images of an MJPEG stream; `timeout` in s, to connect and between any two bytes.
 
-    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame grabbed last was
-    waited for; otherwise it came at some time since the one before. OSError if nothing answers, or the URL names none.
+    `multipart`: the answer is a stream of images; anything else is not read. `waited`: the frame
+    grabbed last was waited for; otherwise it came at some time since the one before. OSError if
+    nothing answers, or the URL names none.
     """
 
     def __init__(self, url, timeout):
@@ -97,7 +105,9 @@ class MjpegStream(Images):
         return super().grab()
 
     def take(self):
-        """The next whole image: as long as is stated before it (it may hold another one), else up to its end."""
+        """The next whole image: as long as is stated before it (it may hold another one), else up
+        to its end.
+        """
         while True:
             begin = self._buffer.find(BEGIN)
             stated = LENGTH.findall(self._buffer[: max(begin, 0)])
@@ -216,14 +226,15 @@ class Frame:
 class Camera(Closed):
     """A camera, set to what is asked for; what could not be set is logged. A context manager.
 
-    A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and that looks for the
-    source again when it is lost. A recorded one (video file, images) gives its next image each time it is asked.
+    A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and
+    that looks for the source again when it is lost. A recorded one (video file, images) gives its
+    next image each time it is asked.
 
     Parameters
     ----------
     source : int, str or Path
-        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such as
-        ``"images/*.png"``.
+        V4L2 index or path (/dev/video0), URL, video file, image, folder of images, or pattern such
+        as ``"images/*.png"``.
     name : str
     size : (int, int), optional
         Width and height, pixels.
@@ -238,7 +249,8 @@ class Camera(Closed):
     size : tuple of int or None
         Width and height that it gives, pixels; None where that is unknown.
     lost : bool
-        A live source gave no frame when it should have, and was not found again yet; a recorded one is at its end.
+        A live source gave no frame when it should have, and was not found again yet; a recorded one
+        is at its end.
 
     Raises
     ------
@@ -271,7 +283,8 @@ class Camera(Closed):
             self._thread.start()
 
     def newest(self, after=None, timeout=5.0):
-        """The newest frame within so many seconds, grabbed later than `after` by the host's clock if that is given.
+        """The newest frame within so many seconds, grabbed later than `after` by the host's clock
+        if that is given.
 
         A recorded source gives its next image.
 
@@ -300,8 +313,10 @@ class Camera(Closed):
             if self._thread is None:
                 self.lost = not self._capture.grab() or not self._keep(REAL.time())
                 if self.lost:
-                    raise LineLost(f"camera {self.name} is at the end of its {self._count} recorded images: "
-                                   "open it again")  # fmt: skip
+                    raise LineLost(
+                        f"camera {self.name} is at the end of its {self._count} recorded images: "
+                        "open it again"
+                    )
                 return self._frame
             if there():
                 return self._frame
@@ -319,7 +334,8 @@ class Camera(Closed):
         else:
             self._release()
 
-    # ------------------------------------------------------------------------------------------------- grabbing
+    # ---------------------------------------------------------------------------------------------
+    # grabbing
 
     def _release(self):
         if self._capture is not None:
@@ -377,17 +393,24 @@ class Camera(Closed):
             exposure = (
                 None if asked["exposure"] is None else round(asked["exposure"] / EXPOSURE_UNIT_S)
             )
-            wanted = {cv2.CAP_PROP_BUFFERSIZE: 1, **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
-                      FPS: asked["fps"], cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,
-                      cv2.CAP_PROP_EXPOSURE: exposure}  # fmt: skip
+            wanted = {
+                cv2.CAP_PROP_BUFFERSIZE: 1,
+                **dict(zip((WIDTH, HEIGHT), asked["size"] or (), strict=False)),
+                FPS: asked["fps"],
+                cv2.CAP_PROP_AUTO_EXPOSURE: exposure and MANUAL,
+                cv2.CAP_PROP_EXPOSURE: exposure,
+            }
             done = {
                 key: capture.set(key, value) for key, value in wanted.items() if value is not None
             }
             ticks = capture.get(cv2.CAP_PROP_EXPOSURE) * done.get(cv2.CAP_PROP_EXPOSURE, True)
         size = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
         self.size = size if all(size) else None
-        found = {"size": self.size, "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
-                 "fps": capture.get(FPS) or None}  # fmt: skip
+        found = {
+            "size": self.size,
+            "exposure": ticks * EXPOSURE_UNIT_S if ticks > 0 else None,
+            "fps": capture.get(FPS) or None,
+        }
         for key, got in found.items():
             if (
                 asked[key] is None
@@ -395,7 +418,10 @@ class Camera(Closed):
                 and np.allclose(asked[key], got, rtol=0.05, atol=0)
             ):
                 continue
-            text = f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, asked {asked[key]}"
+            text = (
+                f"camera {self.name}: {key} {'cannot be set' if got is None else f'is {got}'}, "
+                f"asked {asked[key]}"
+            )
             if text not in self._told:  # once, however often it is opened again
                 self._told.add(text)
                 LOG.warning(text)

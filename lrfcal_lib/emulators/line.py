@@ -58,7 +58,10 @@ class SerialDevice:
         self._agenda = []  # heap of instant, order, action, tag
         self._order = itertools.count()
 
-    byte_s = property(lambda self: 10 / self.baudrate, doc="Seconds a byte takes.")
+    @property
+    def byte_s(self):
+        """Seconds a byte takes."""
+        return 10 / self.baudrate
 
     def start(self):
         """Let the port appear."""
@@ -70,7 +73,8 @@ class SerialDevice:
         """Remove the port."""
         self.port.end()
 
-    __enter__, __exit__ = start, close
+    __enter__ = start
+    __exit__ = close
 
     def at(self, instant, action, tag=None):
         """Call ``action(instant)`` when its time has come."""
@@ -147,8 +151,13 @@ class Terminal(threading.Thread):
         self._quit = False
         self._master = None
 
-    there = property(lambda self: self._master is not None)
-    rate = property(lambda self: RATES.get(termios.tcgetattr(self._master)[5], 0))
+    @property
+    def there(self):
+        return self._master is not None
+
+    @property
+    def rate(self):
+        return RATES.get(termios.tcgetattr(self._master)[5], 0)
 
     def end(self):
         """Take the port away and end the thread."""

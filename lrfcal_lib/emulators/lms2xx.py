@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lrfcal_lib.drivers.lms2xx_link import BURST
 from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
@@ -31,7 +32,6 @@ WRITE_S = 0.107  # the same where flash is written (measured: 0x77)
 RESET_S = 0.010
 STOP_S = 0.52  # most that a change of mode takes longer while streaming (measured: 71 to 588 ms)
 GAP_S = 0.006  # a host that pauses longer within a telegram is not heard
-BURST = 508  # bytes that leave in one turn of the mirror at 500000 Bd
 AHEAD_S = 0.035  # the head reacts more slowly, so the pitch until then is known
 # A stream that lags so far leaves scans out, as no host can know how late they are.
 LATE_S = 1.0
@@ -109,7 +109,6 @@ class Memory:
     mode: int = REQUEST  # operating mode, the sub-command of 0x20
     address: int = 0
     password: bytes = b"SICK_LMS"
-    serial: str = "05270497"
     flash_writes: int = 0  # since the device was made; the flash endures a few thousand
 
     def takes_variant(self, variant):
@@ -136,7 +135,6 @@ class Memory:
         parts = {
             1: self.model[14:21].encode(),
             8: bytes([self.mode]),
-            10: f"{self.serial:8.8}".encode(),
             102: bytes([c.measuring_mode]),
             107: words_of(self.variant),
             116: words_of([BAUD_WORD[self.baudrate]]),
@@ -186,8 +184,15 @@ class EmulatedLms(SerialDevice):
         moving head needs some 20 ms of its processor for a scan.
     """
 
-    baudrate = property(lambda self: self.memory.baudrate, doc="Of the device now.")
-    streaming = property(lambda self: self.memory.mode in STREAMED, doc="Whether scans come.")
+    @property
+    def baudrate(self):
+        """Of the device now."""
+        return self.memory.baudrate
+
+    @property
+    def streaming(self):
+        """Whether scans come."""
+        return self.memory.mode in STREAMED
 
     def __init__(
         self,

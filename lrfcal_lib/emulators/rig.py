@@ -36,8 +36,6 @@ class EmulatedRig:
     Parameters
     ----------
     setup : Setup
-    folder : path-like, optional
-        Where the ports `lrf` and `head` appear; a new temporary folder by default.
     seed : int
         Of noise; the world follows from the setup's own seed.
     placements : sequence of Placement, optional
@@ -59,7 +57,6 @@ class EmulatedRig:
         self,
         setup,
         *,
-        folder=None,
         seed=0,
         placements=None,
         head_options=None,
@@ -69,23 +66,16 @@ class EmulatedRig:
         self.setup = setup
         self.host = host
         self._closing = contextlib.ExitStack()
-        own = (
-            None
-            if folder
-            else tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
-        )
-        self.folder = Path(folder or self._closing.enter_context(own))
-        self.folder.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(prefix="lrfcal-", ignore_cleanup_errors=True)
+        self.folder = Path(self._closing.enter_context(folder))
         self.world = EmulatedWorld(setup, host, seed, placements)
         shared = {"host": host, "seed": seed}
         self.lrf = EmulatedLms(self.world, path=self.folder / "lrf", **shared)
         self.pan_tilt = EmulatedHead(
             self.world.head, path=self.folder / "head", **shared, **(head_options or {})
         )
-        self.scans, self.camera_server = (
-            self.lrf.scans,
-            CameraServer(self.world, seed=seed, rest_s=rest_s),
-        )
+        self.scans = self.lrf.scans
+        self.camera_server = CameraServer(self.world, seed=seed, rest_s=rest_s)
         self.camera_urls = {
             name: f"{self.camera_server.url}/{name}.mjpg" for name in self.camera_server.cameras
         }
@@ -100,7 +90,7 @@ class EmulatedRig:
         return self
 
     def close(self, *_):
-        """Remove all devices, and the folder where it was made here."""
+        """Remove all devices, and their folder."""
         self._closing.close()
 
     __enter__ = start
@@ -146,8 +136,8 @@ class EmulatedRig:
         }
 
     def rig_file(self):
-        """Statement of the rig for recording, as JSON: board and rig as in session.json,
-        devices, plan.
+        """Statement of the rig for recording, as JSON: board and rig as in session.json, devices,
+        plan.
         """
         rig = self.setup.rig
         setup = self.setup

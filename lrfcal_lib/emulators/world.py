@@ -47,7 +47,10 @@ class EmulatedWorld:
     `placements` are where the board can be put; by default those of the setup.
     """
 
-    place = property(lambda self: self._scene[0], doc="Where the board is.")
+    @property
+    def place(self):
+        """Where the board is."""
+        return self._scene[0]
 
     def __init__(self, setup, host=REAL, seed=0, placements=None):
         self.setup = setup

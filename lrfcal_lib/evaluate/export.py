@@ -228,42 +228,6 @@ def write_pcd(path, ply):
             raise OSError("is the disk full?")
 
 
-def write_mesh(path, ply, step=0.02):
-    """Write a surface mesh of a PLY of :func:`write_ply` as PLY: Poisson's, cut where there are no
-    points.
-
-    Parameters
-    ----------
-    path, ply : path
-    step : float
-        Metres; points are thinned to cubes of this size first, and details are about as fine.
-
-    Returns
-    -------
-    int
-        Triangles; ValueError if no point has a normal, or the file cannot be written.
-    """
-    import open3d as o3d
-
-    cloud = o3d.io.read_point_cloud(str(ply), remove_nan_points=True)
-    normals = np.isfinite(np.asarray(cloud.normals)).all(axis=1)
-    cloud = cloud.select_by_index(np.flatnonzero(normals)).voxel_down_sample(step)
-    if not len(cloud.points):
-        raise ValueError(f"{ply}: no point has a normal, a surface needs neighbouring scan lines")
-    depth = int(np.ceil(np.log2(np.ptp(np.asarray(cloud.points), axis=0).max() / step))) + 1
-    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=min(depth, 11), n_threads=1
-    )
-    corners = o3d.geometry.PointCloud(mesh.vertices)
-    mesh.remove_vertices_by_mask(np.asarray(corners.compute_point_cloud_distance(cloud)) > 2 * step)
-    mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0, 1))
-    with whole(path) as draft:
-        o3d.io.write_triangle_mesh(str(draft), mesh)  # true also where the disk is full
-        if len(o3d.io.read_triangle_mesh(str(draft)).triangles) < len(mesh.triangles):
-            raise OSError("is the disk full?")
-    return len(mesh.triangles)
-
-
 def calibrate_session(path, out=None):
     """Calibrate a session from the command line: verdict and poses, ``calibration.json`` and
     clouds.

@@ -1,7 +1,9 @@
-"""What every notebook needs around its subject: its looks, its session, and where figures, tables and findings go.
+"""What every notebook needs around its subject: its looks, its session, and where figures, tables
+and findings go.
 
-Nothing is written outside a report run (:mod:`lrfcal_lib.report.report`), which sets ``LRFCAL_SESSION`` (folder of the
-session), ``LRFCAL_REPORT`` (takes ``figures/``, ``tables/`` and ``parts/``) and ``LRFCAL_NOTEBOOK`` (a name in these).
+Nothing is written outside a report run (:mod:`lrfcal_lib.report.report`), which sets
+``LRFCAL_SESSION`` (folder of the session), ``LRFCAL_REPORT`` (takes ``figures/``, ``tables/`` and
+``parts/``) and ``LRFCAL_NOTEBOOK`` (a name in these).
 """
 
 import json
@@ -17,27 +19,40 @@ from IPython import get_ipython
 from IPython.display import HTML, display
 
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import escape
+from lrfcal_lib.session.shown import escape
 from lrfcal_lib.solvers import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "data" / "sim_lms221"
 STYLE = Path(__file__).with_name("figures.mplstyle")
-UNITS = {"deg": "deg", "mm": "mm", "px": "px", "m": "m", "m3": "m³", "percent": "%", "radii": "spot radii"}
+UNITS = {
+    "deg": "deg",
+    "mm": "mm",
+    "px": "px",
+    "m": "m",
+    "m3": "m³",
+    "percent": "%",
+    "radii": "spot radii",
+}
 OTHER_LABELS = {  # of what is no row of METHODS
-    "joint": "joint estimate", "line_3d": "lines in space", "projected_last_beam": "projected lines, last beam",
+    "joint": "joint estimate",
+    "line_3d": "lines in space",
+    "projected_last_beam": "projected lines, last beam",
     "projected_printed": "projected lines as the paper prints them",
-}  # fmt: skip
+}
 _found = {"figures": [], "tables": [], "findings": [], "verdicts": []}
 
 
 def set_up():
     """Style figures and tables and keep libraries quiet; for a notebook that needs no session."""
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # read by Open3D when it is imported
-    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")  # without it Mesa complains on stderr, in some runs only
+    # read by Open3D when it is imported
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
+    # without it Mesa complains on stderr, in some runs only
+    os.environ.setdefault("XDG_RUNTIME_DIR", "/tmp")
     plt.style.use(STYLE)
     pd.set_option("display.precision", 4, "display.max_rows", 40, "display.width", 120)
-    if get_ipython() is not None:  # the same pixels must give the same bytes: no version of matplotlib in the PNG
+    # the same pixels must give the same bytes: no version of matplotlib in the PNG
+    if get_ipython() is not None:
         kwargs = {"bbox_inches": None, "metadata": {"Software": None}}
         get_ipython().run_line_magic("config", f"InlineBackend.print_figure_kwargs = {kwargs}")
         while _only_start in get_ipython().input_transformers_cleanup:
@@ -47,13 +62,17 @@ def set_up():
 
 
 def start():
-    """First cell of a notebook: :func:`set_up`, then the Session ``LRFCAL_SESSION``, else the shipped one."""
+    """First cell of a notebook: :func:`set_up`, then the Session ``LRFCAL_SESSION``, else the
+    shipped one.
+    """
     set_up()
     return open_session(os.environ.get("LRFCAL_SESSION") or SHIPPED)
 
 
 def report_file(name):
-    """Path of a file of the report (e.g. ``"cloud.ply"``), its folder made; None outside a report run."""
+    """Path of a file of the report (e.g. ``"cloud.ply"``), its folder made; None outside a report
+    run.
+    """
     if not os.environ.get("LRFCAL_REPORT"):
         return None
     path = Path(os.environ["LRFCAL_REPORT"]) / name
@@ -76,20 +95,25 @@ def save(fig, name, caption, *, main=True):
         Whether the first page of the report shows it.
     """
     _record("figures", name, {"name": name, "caption": caption, "main": main})
-    # drawing gives a figure without layout engine the default one, which would move what was placed by hand
+    # drawing gives a figure without layout engine the default one, which would move what was placed
+    # by hand
     with plt.rc_context({"figure.constrained_layout.use": False}):
-        fig.draw_without_rendering()  # equal scales and ticks move what is laid out: a second pass settles them
+        # equal scales and ticks move what is laid out: a second pass settles them
+        fig.draw_without_rendering()
         if path := report_file(f"figures/{name}.png"):
             fig.savefig(path, metadata={"Software": None})
         if get_ipython() is not None:
             display(fig)
     if get_ipython() is not None:
-        display(HTML(f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>'))
+        display(
+            HTML(f'<p id="figure-{name}" style="color:#555;max-width:48em">{escape(caption)}</p>')
+        )
     plt.close(fig)
 
 
 def table(df, name, digits=3, caption=""):
-    """A table to show, its columns and methods in words, kept as ``tables/<name>.csv`` in a report run.
+    """A table to show, its columns and methods in words, kept as ``tables/<name>.csv`` in a report
+    run.
 
     Parameters
     ----------
@@ -98,7 +122,8 @@ def table(df, name, digits=3, caption=""):
     name : str
         Lower-case letters, digits and underscores; others raise a ValueError.
     digits : int or dict of str to int
-        Decimals shown (all columns, or by column; 3 where a column is not named). The CSV keeps nine digits.
+        Decimals shown (all columns, or by column; 3 where a column is not named). The CSV keeps
+        nine digits.
     caption : str
 
     Returns
@@ -115,9 +140,14 @@ def table(df, name, digits=3, caption=""):
     shown = df.reset_index(drop=True)
     for column in shown.columns[[kind.kind not in "biuf" for kind in shown.dtypes]]:
         words = str if column == "source" else in_words  # a session is called as it is
-        shown[column] = [v if v is None or isinstance(v, Number) else escape(words(v)) for v in shown[column]]
-    styler = shown.style.format(shapes, na_rep="–").format_index(lambda c: escape(in_words(c, True)), axis=1)
-    styler, caption = styler.hide(axis="index").set_uuid(name), caption or in_words(name).capitalize()
+        shown[column] = [
+            v if v is None or isinstance(v, Number) else escape(words(v)) for v in shown[column]
+        ]
+    styler = shown.style.format(shapes, na_rep="–").format_index(
+        lambda c: escape(in_words(c, True)), axis=1
+    )
+    styler = styler.hide(axis="index").set_uuid(name)
+    caption = caption or in_words(name).capitalize()
     made = styler.set_caption(escape(caption)).to_html()
     _record("tables", name, {"name": name, "caption": caption, "html": made})
     return HTML(made)
@@ -129,7 +159,9 @@ def label_of(name):
 
 
 def in_words(text, column=False):
-    """An identifier in words: a method by its name, a column with its unit; everything else as it is."""
+    """An identifier in words: a method by its name, a column with its unit; everything else as it
+    is.
+    """
     if not isinstance(text, str):
         return text
     label = label_of(text)
@@ -145,7 +177,8 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     Parameters
     ----------
     key : str
-        Lower-case letters, digits and underscores (others raise a ValueError); unique over all notebooks.
+        Lower-case letters, digits and underscores (others raise a ValueError); unique over all
+        notebooks.
     value : float, int or str
         A verdict in words, or a number (NaN is said to be unknown).
     text : str
@@ -158,16 +191,24 @@ def finding(key, value, text, unit="", digits=3, *, main=True):
     """
     shown = value = value.item() if hasattr(value, "item") else value
     if isinstance(value, float):
-        shown, value = (f"{value:z.{digits}f}", value) if math.isfinite(value) else ("unknown", None)
+        shown, value = (
+            (f"{value:z.{digits}f}", value) if math.isfinite(value) else ("unknown", None)
+        )
     shown = f"{shown} {unit}".strip()
-    _record("findings", key, {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main})
+    _record(
+        "findings",
+        key,
+        {"key": key, "value": value, "unit": unit, "text": text, "shown": shown, "main": main},
+    )
     print(f"{text}: {shown}")
 
 
 def verdict(title, sentences, record=None):
-    """Print sentences, the most important one first, and put them on the first page of the report before all else.
+    """Print sentences, the most important one first, and put them on the first page of the report
+    before all else.
 
-    With the record of a :class:`lrfcal_lib.evaluate.verdict.Verdict` its answer and expected errors stand in front.
+    With the record of a :class:`lrfcal_lib.evaluate.verdict.Verdict` its answer and expected errors
+    stand in front.
     """
     sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]
     _record("verdicts", "verdict", {"title": title, "sentences": sentences, "record": record})
@@ -191,9 +232,14 @@ def _only_start(lines):
 
 
 def _record(kind, name, entry):
-    """Keep an entry; the file is written each time, so that a notebook that fails later has told what it found."""
+    """Keep an entry; the file is written each time, so that a notebook that fails later has told
+    what it found.
+    """
     if not re.fullmatch(r"[a-z0-9_]+", name):
-        raise ValueError(f"'{name}' must consist of lower-case letters, digits and underscores: it becomes a file name")
+        raise ValueError(
+            f"'{name}' must consist of lower-case letters, digits and underscores: it becomes a "
+            "file name"
+        )
     _found[kind].append(entry)
     if path := report_file(f"parts/{os.environ.get('LRFCAL_NOTEBOOK', 'notebook')}.json"):
         path.write_text(json.dumps(_found, indent=1))

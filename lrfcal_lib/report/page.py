@@ -1,4 +1,6 @@
-"""Pages out of executed notebooks: formulas that any browser draws, code folded, figures and tables numbered."""
+"""Pages out of executed notebooks: formulas that any browser draws, code folded, figures and tables
+numbered.
+"""
 
 import base64
 import html
@@ -15,7 +17,8 @@ from lrfcal_lib.report.notebook import in_words
 
 SHORT = 15  # rows of a table that is shown unfolded
 PIXELS_PER_INCH = 96 / 150  # of a page, by those of a figure's file
-WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))  # columns from which a table is turned on screens as narrow
+# columns from which a table is turned on screens as narrow
+WIDTHS = ((9, "wide"), (3, "medium"), (0, "narrow"))
 
 
 class Renderer(IPythonRenderer):
@@ -27,18 +30,26 @@ class Renderer(IPythonRenderer):
     def block_math(self, body):
         number = re.search(r"\\tag\{(.*?)\}", body)
         drawn = formula(re.sub(r"\\tag\{.*?\}", "", body), display=True)
-        return f'<div class="formula"><div>{drawn}</div>' + (f"<span>({number[1]})</span>" if number else "") + "</div>"
+        return (
+            f'<div class="formula"><div>{drawn}</div>'
+            + (f"<span>({number[1]})</span>" if number else "")
+            + "</div>"
+        )
 
     def multiline_math(self, text):
         return self.block_math(text.strip("$"))
 
 
 def formula(latex, display=False):
-    """A formula as MathML; a displayed one in parts, so that lines can break where it says = or +, or leaves a gap."""
+    """A formula as MathML; a displayed one in parts, so that lines can break where it says = or +,
+    or leaves a gap.
+    """
     row = ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", convert(latex)))[0]
     parts = [[]]
     # what stands between \left and \right may be broken too
-    for node in chain.from_iterable(node if display and node.tag == "mrow" else [node] for node in row):
+    for node in chain.from_iterable(
+        node if display and node.tag == "mrow" else [node] for node in row
+    ):
         if display and parts[-1] and node.tag == "mo" and node.text in ("=", "+"):
             node.set("form", "infix")
             parts.append([])
@@ -52,22 +63,34 @@ def formula(latex, display=False):
 def render(notebook, found, number, folder):
     """The body of a notebook's page, and its figures and tables by name, as HTML.
 
-    `found` are the entries of :mod:`lrfcal_lib.report.notebook`; figures are taken from the report's `folder`.
+    `found` are the entries of :mod:`lrfcal_lib.report.notebook`; figures are taken from the
+    report's `folder`.
     """
-    figures = {entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
-               for n, entry in enumerate(found["figures"], start=1)}  # fmt: skip
-    tables = {e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)}
-    body, color = [], Highlight2HTML(pygments_lexer="ipython3")
+    figures = {
+        entry["name"]: _figure(folder, entry, f"Figure {number}.{n}")
+        for n, entry in enumerate(found["figures"], start=1)
+    }
+    tables = {
+        e["name"]: _table(e, f"Table {number}.{n}") for n, e in enumerate(found["tables"], start=1)
+    }
+    body = []
+    color = Highlight2HTML(pygments_lexer="ipython3")
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
-            renderer = Renderer(escape=False, attachments=cell.get("attachments", {}), exclude_anchor_links=True)
+            renderer = Renderer(
+                escape=False, attachments=cell.get("attachments", {}), exclude_anchor_links=True
+            )
             text = turned(MarkdownWithMath(renderer=renderer).render(cell.source))
             body.append(re.sub(r'(href="\d\d_\w+)\.ipynb"', r'\1.html"', text))
         elif cell.cell_type == "code":
-            body.append(f'<details class="code"><summary>Code</summary>{color(cell.source)}</details>')
+            body.append(
+                f'<details class="code"><summary>Code</summary>{color(cell.source)}</details>'
+            )
             for output in cell.outputs:
                 shown = _output(output)
-                if (caption := re.match(r'<p id="figure-(\w+)"', shown)) and figures.get(caption[1]):
+                if (caption := re.match(r'<p id="figure-(\w+)"', shown)) and figures.get(
+                    caption[1]
+                ):
                     body[-1] = figures[caption[1]]  # the picture stands before its caption
                 elif (styled := re.search(r'<table id="T_(\w+)"', shown)) and styled[1] in tables:
                     body.append(tables[styled[1]])
@@ -90,28 +113,42 @@ def _output(output):
 
 
 def _figure(folder, entry, label):
-    """A figure that holds its picture, as large as it was drawn; '' where its notebook failed before drawing it."""
+    """A figure that holds its picture, as large as it was drawn; '' where its notebook failed
+    before drawing it.
+    """
     if not (file := folder / "figures" / f"{entry['name']}.png").is_file():
         return ""
-    data, caption = file.read_bytes(), html.escape(entry["caption"])
+    data = file.read_bytes()
+    caption = html.escape(entry["caption"])
     width = round(int.from_bytes(data[16:20]) * PIXELS_PER_INCH)
-    picture = f'<img alt="{caption}" width="{width}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-    return (f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
-            f"<figcaption><b>{label}.</b> {caption}</figcaption></figure>")  # fmt: skip
+    picture = (
+        f'<img alt="{caption}" width="{width}" '
+        f'src="data:image/png;base64,{base64.b64encode(data).decode()}">'
+    )
+    return (
+        f'<figure id="{file.stem}"><a href="figures/{file.name}">{picture}</a>'
+        f"<figcaption><b>{label}.</b> {caption}</figcaption></figure>"
+    )
 
 
 def _table(entry, label):
     """A table, folded where it is long."""
     made = turned(entry["html"])
     rows = made.count("<tr>") - 1
-    file, caption = f"tables/{entry['name']}.csv", html.escape(entry["caption"])
-    return (f'<details class="table" id="T-{entry["name"]}"{" open" if rows <= SHORT else ""}><summary>'
-            f'<b>{label}.</b> {caption} <span class="soft">({rows} rows, <a href="{file}">CSV</a>)</span></summary>'
-            f"{made}</details>")  # fmt: skip
+    file = f"tables/{entry['name']}.csv"
+    caption = html.escape(entry["caption"])
+    return (
+        f'<details class="table" id="T-{entry["name"]}"{" open" if rows <= SHORT else ""}><summary>'
+        f'<b>{label}.</b> {caption} <span class="soft">({rows} rows, <a '
+        f'href="{file}">CSV</a>)</span></summary>'
+        f"{made}</details>"
+    )
 
 
 def turned(text):
-    """HTML whose tables a narrow screen can show turned: every cell knows the heading of its column."""
+    """HTML whose tables a narrow screen can show turned: every cell knows the heading of its
+    column.
+    """
     soup = BeautifulSoup(text, "html.parser")
     for part in soup(["style", "caption"]):
         part.decompose()

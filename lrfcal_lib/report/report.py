@@ -34,13 +34,23 @@ from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import SessionError
 from lrfcal_lib.session.write import RECORDINGS
 
-NOTEBOOKS, NUMBERED = ROOT / "notebooks", "[0-9][0-9]_*.ipynb"
+NOTEBOOKS = ROOT / "notebooks"
+NUMBERED = "[0-9][0-9]_*.ipynb"
 PACKAGES = ("lrfcal", "numpy", "scipy", "opencv-python-headless", "open3d", "pandas", "matplotlib")
 OWN_FILES = (  # folders, files to link to, the page itself
-    "figures", "tables", "parts", "calibration.json", "scene.html", "cloud.ply", "scene.ply", "scene.pcd",
-    "findings.json", "index.html",
-)  # fmt: skip
-BESIDE = ("Expected error", "In the image of")  # begin sentences of a verdict that the first screen tells in numbers
+    "figures",
+    "tables",
+    "parts",
+    "calibration.json",
+    "scene.html",
+    "cloud.ply",
+    "scene.ply",
+    "scene.pcd",
+    "findings.json",
+    "index.html",
+)
+# begin sentences of a verdict that the first screen tells in numbers
+BESIDE = ("Expected error", "In the image of")
 AT_WORKING_FOLDER = -100  # AT_FDCWD, see renameat2(2)
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 PICTURES = ("scene", "cloud", "clouds_of_boards", "frames")  # of the first screen, the best first
@@ -65,7 +75,9 @@ MEASURED = ("combined", "half_step", "last_beam")  # edge lengths, the best way 
 
 @dataclass(frozen=True)
 class Run:
-    """One executed notebook: file name without suffix, first heading, first paragraph; `error` is a traceback or ''."""
+    """One executed notebook: file name without suffix, first heading, first paragraph; `error` is a
+    traceback or ''.
+    """
 
     name: str
     title: str
@@ -83,9 +95,9 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     session_path : path
         Folder of a session.
     out : path, optional
-        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written beside it and takes
-        its place when it is whole, by one rename: until then an earlier report stays as it is. Files in it that are no
-        report's are kept.
+        Folder of the report; ``reports/<name of the session's folder>`` unless given. It is written
+        beside it and takes its place when it is whole, by one rename: until then an earlier report
+        stays as it is. Files in it that are no report's are kept.
     jobs : int
         Notebooks executed at the same time.
     notebooks : sequence of path, optional
@@ -94,8 +106,8 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     Returns
     -------
     list of Run
-        In the order of the notebooks. A notebook that fails is reported, the others still run. A SessionError if the
-        session is not sound, or the folder of the report cannot be written.
+        In the order of the notebooks. A notebook that fails is reported, the others still run. A
+        SessionError if the session is not sound, or the folder of the report cannot be written.
     """
     begin = time.monotonic()
     session_path = Path(session_path).resolve()
@@ -105,12 +117,19 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
     # a fresh cache: a report stands for its session
     with in_place_of(out) as new, TemporaryDirectory(prefix="lrfcal-") as cache:
         environment = {"LRFCAL_SESSION": str(session_path), "LRFCAL_REPORT": str(new), CACHE: cache}
-        environment[RECORDINGS] = cache  # what notebook 09 records with the emulated rig goes with the report's cache
+        # what notebook 09 records with the emulated rig goes with the report's cache
+        environment[RECORDINGS] = cache
         runs = _execute_all(paths, environment, jobs)
-        found = {run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs}
-        found |= {part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")}
+        found = {
+            run.name: {"figures": [], "tables": [], "findings": [], "verdicts": []} for run in runs
+        }
+        found |= {
+            part.stem: json.loads(part.read_text()) for part in (new / "parts").glob("*.json")
+        }
         shutil.rmtree(new / "parts")
-        findings = [{"notebook": run.name, **entry} for run in runs for entry in found[run.name]["findings"]]
+        findings = [
+            {"notebook": run.name, **entry} for run in runs for entry in found[run.name]["findings"]
+        ]
         (new / "findings.json").write_text(json.dumps(findings, indent=1) + "\n")
         write_pages(new, session, runs, found, time.monotonic() - begin)
     return runs
@@ -119,17 +138,24 @@ def make_report(session_path, out=None, jobs=2, notebooks=None):
 def execute(path, environment):
     """Execute a notebook in a fresh kernel with variables on top of this process's own.
 
-    Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback of that cell or ''.
+    Returns the NotebookNode with outputs, up to the cell that failed if one did, and the traceback
+    of that cell or ''.
     """
-    notebook, error = nbformat.read(path, as_version=4), ""
+    notebook = nbformat.read(path, as_version=4)
+    error = ""
     place = {"metadata": {"path": str(Path(path).parent)}}
-    options = {"kernel_name": "python3", "record_timing": False, "extra_arguments": ["--log-level=ERROR"]}
+    options = {
+        "kernel_name": "python3",
+        "record_timing": False,
+        "extra_arguments": ["--log-level=ERROR"],
+    }
     client = NotebookClient(notebook, timeout=CELL_SECONDS, resources=place, **options)
     _CLIENTS.add(client)
     try:
         client.execute(env={**os.environ, "MPLBACKEND": "", **environment})  # that of notebooks
     except (CellExecutionError, CellTimeoutError, DeadKernelError) as problem:
-        error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__  # no colours of a terminal
+        # no colours of a terminal
+        error = re.sub(r"\x1b\[[0-9;]*m", "", str(problem)) or type(problem).__name__
     finally:
         _CLIENTS.discard(client)
     # without their kernel live widgets show an error, and pages would load them from elsewhere
@@ -140,11 +166,12 @@ def execute(path, environment):
 
 
 def store(path, session_path, cache=""):
-    """Execute a notebook and store it in place as run from top to bottom; the traceback of a cell that failed, or ''.
+    """Execute a notebook and store it in place as run from top to bottom; the traceback of a cell
+    that failed, or ''.
 
-    A notebook that fails is left alone. Outputs made from a recording that is not simulated are dropped (its pictures
-    may carry no licence), execution counts are kept. `cache` is the folder of stages that other notebooks have worked
-    out.
+    A notebook that fails is left alone. Outputs made from a recording that is not simulated are
+    dropped (its pictures may carry no licence), execution counts are kept. `cache` is the folder of
+    stages that other notebooks have worked out.
     """
     environment = {} if session_path is None else {"LRFCAL_SESSION": str(session_path)}
     with TemporaryDirectory(prefix="lrfcal-") as recordings:
@@ -152,17 +179,23 @@ def store(path, session_path, cache=""):
     if error:
         return error
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    if any("notebook.start(" in cell.source for cell in codes) and not open_session(session_path).simulated:
+    if (
+        any("notebook.start(" in cell.source for cell in codes)
+        and not open_session(session_path).simulated
+    ):
         for cell in codes:
             cell.outputs = []
     kernel = {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"}
-    notebook.metadata = nbformat.from_dict({"kernelspec": kernel, "language_info": {"name": "python"}})
+    notebook.metadata = nbformat.from_dict(
+        {"kernelspec": kernel, "language_info": {"name": "python"}}
+    )
     nbformat.write(notebook, path)
     return ""
 
 
 def main(sessions=(), out=None, jobs=2, stored=False):
-    """Report on sessions, or store the notebooks as run on them; the shipped one where none is named.
+    """Report on sessions, or store the notebooks as run on them; the shipped one where none is
+    named.
 
     0, 1 if a notebook failed, 2 without a sound session, 128 + a signal that ended it.
     """
@@ -170,13 +203,18 @@ def main(sessions=(), out=None, jobs=2, stored=False):
     before = [(n, signal.signal(n, _stop)) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN]
     try:
         sessions = [Path(path) for path in sessions] or [SHIPPED]
-        return max(_store_all(session) if stored else _report(session, out, jobs) for session in sessions)
+        return max(
+            _store_all(session) if stored else _report(session, out, jobs) for session in sessions
+        )
     except SessionError as problem:
         print(f"lrfcal: {problem}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stopped:
         number = signal.Signals((*stopped.args, signal.SIGINT)[0])
-        print(f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was", file=sys.stderr)
+        print(
+            f"\nlrfcal: stopped by {number.name}; an earlier report stays as it was",
+            file=sys.stderr,
+        )
         return 128 + number
     finally:
         for pair in before:
@@ -191,12 +229,14 @@ def _stop(number, frame):
 
 
 def _report(session, out, jobs):
-    begin, out = time.monotonic(), Path(out or ROOT / "reports" / session.resolve().name).resolve()
+    begin = time.monotonic()
+    out = Path(out or ROOT / "reports" / session.resolve().name).resolve()
     runs = make_report(session, out, jobs)
     failed = [run for run in runs if run.error]
     for run in failed:
         print(f"{run.name} failed: {run.error.strip().splitlines()[-1]}", file=sys.stderr)
-    good, seconds = len(runs) - len(failed), time.monotonic() - begin
+    good = len(runs) - len(failed)
+    seconds = time.monotonic() - begin
     print(f"{good} of {len(runs)} notebooks in {seconds:.0f} s: {out / 'index.html'}")
     return int(bool(failed))
 
@@ -208,13 +248,19 @@ def _store_all(session):
         for path in sorted(NOTEBOOKS.glob(NUMBERED)):
             error = store(path, session.resolve(), cache)
             failed = failed or bool(error)
-            print(f"{path.name}: {error or 'stored'}", file=sys.stderr if error else sys.stdout, flush=True)
+            print(
+                f"{path.name}: {error or 'stored'}",
+                file=sys.stderr if error else sys.stdout,
+                flush=True,
+            )
     return int(failed)
 
 
 @contextmanager
 def in_place_of(out):
-    """A new folder of one's own that takes the place of `out` at the end, unless something is raised before."""
+    """A new folder of one's own that takes the place of `out` at the end, unless something is
+    raised before.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=PART, dir=out.parent, ignore_cleanup_errors=True) as box:
@@ -223,15 +269,17 @@ def in_place_of(out):
             yield new
             _take_place(new, out)
     except OSError as error:
-        raise SessionError(f"{out}: cannot write the report ({error}); --out names another folder") from error
+        raise SessionError(
+            f"{out}: cannot write the report ({error}); --out names another folder"
+        ) from error
 
 
 def _take_place(new, out):
     """Exchange two folders; files in the old one that are no report's come along.
 
     At every moment, also that of a kill, there is a report: the old one or the new one. Where the
-    system cannot exchange folders (file systems over a network, macOS), each file of the new one
-    takes the place of an old one.
+    system cannot exchange folders (file systems over a network, macOS), there is none for the
+    moment between two renames, and a kill in that moment leaves the old one beside it.
     """
 
     def ours(folder, names):
@@ -240,7 +288,13 @@ def _take_place(new, out):
     out.mkdir(exist_ok=True)
     shutil.copytree(out, new, symlinks=True, ignore=ours, dirs_exist_ok=True)
     if not _exchanged(new, out):
-        _move_files(new, out)
+        old = new.with_name("old")
+        try:
+            out.replace(old)
+            new.replace(out)
+        finally:
+            if not out.exists():  # interrupted in between
+                old.replace(out)
 
 
 def _is_ours(name):
@@ -255,17 +309,6 @@ def _exchanged(one, other):
         return False
     here = AT_WORKING_FOLDER
     return rename(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0
-
-
-def _move_files(new, out):
-    """Move every file of a folder into another one, first page last; then remove a report's old files."""
-    files = sorted(file.relative_to(new) for file in new.rglob("*") if not file.is_dir())
-    for file in sorted(files, key=lambda file: file == Path("index.html")):
-        (out / file.parent).mkdir(parents=True, exist_ok=True)
-        (new / file).replace(out / file)
-    for file in (file.relative_to(out) for file in out.rglob("*") if not file.is_dir()):
-        if _is_ours(file.parts[0]) and file not in files:
-            (out / file).unlink(missing_ok=True)
 
 
 def _execute_all(paths, environment, jobs):
@@ -360,7 +403,9 @@ def write_pages(out, session, runs, found, seconds):
         body, *drawn[run.name] = page.render(run.notebook, found[run.name], numbers[run.name], out)
         file = out / f"{run.name}.html"
         around = {"before": before, "after": after}
-        _write_page(jinja, file, "notebook.html.jinja", session=session, run=run, body=body, **around)
+        _write_page(
+            jinja, file, "notebook.html.jinja", session=session, run=run, body=body, **around
+        )
 
     verdicts = [entry for run in runs for entry in found[run.name]["verdicts"]]
     main = _main_verdict(verdicts)
@@ -462,9 +507,20 @@ def _edge_numbers(lengths):
 
 
 def _provenance(session):
-    """Pairs of name and value that tell what the report was made from; the commit where git knows one."""
+    """Pairs of name and value that tell what the report was made from; the commit where git knows
+    one.
+    """
     digest = hashlib.sha256((Path(session.path) / "session.json").read_bytes()).hexdigest()
-    describe = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    describe = [
+        "git",
+        "-C",
+        str(ROOT),
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=12",
+        "--exclude=*",
+    ]
     try:
         commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
     except FileNotFoundError:

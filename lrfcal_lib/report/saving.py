@@ -5,7 +5,8 @@ from pathlib import Path
 import nbformat
 from jupyter_server.services.contents.largefilemanager import AsyncLargeFileManager
 
-RECORDING = "09_acquire_session.ipynb"  # its outputs are somebody's recording, which has its own folder
+# its outputs are somebody's recording, which has its own folder
+RECORDING = "09_acquire_session.ipynb"
 
 
 class Contents(AsyncLargeFileManager):
@@ -21,7 +22,8 @@ class Contents(AsyncLargeFileManager):
 
 
 def with_stored_outputs(notebook, stored):
-    """A notebook whose unchanged cells are the stored ones; cells that were changed have no outputs.
+    """A notebook whose unchanged cells are the stored ones; cells that were changed have no
+    outputs.
 
     Both are notebooks as JSON has them, and so is what comes back.
     """

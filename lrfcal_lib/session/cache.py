@@ -1,17 +1,18 @@
 """Stages that several notebooks begin with, worked out once; loops that several processes share.
 
-Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is kept there for
-whoever asks for the same again. A report and a test run use a fresh folder each, ``make lab`` one for the time it runs.
-Results are pickles: they hold nested dataclasses with arrays and transforms of SciPy, for which no plain format is as
-short. A pickle can run code when it is read, so a folder is refused that others may write to, or own (but for root), or
-may put another one in the place of; so is a file in it, and a link.
+Where the environment variable ``LRFCAL_CACHE`` names a folder, what a stage makes of a session is
+kept there for whoever asks for the same again. A report and a test run use a fresh folder each,
+``make lab`` one for the time it runs. Results are pickles: they hold nested dataclasses with arrays
+and transforms of SciPy, for which no plain format is as short. A pickle can run code when it is
+read, so a folder is refused that others may write to, or own (but for root), or may put another one
+in the place of; so is a file in it, and a link.
 """
 
 import fcntl
 import hashlib
+import multiprocessing
 import os
 import pickle
-import signal
 import stat
 import sys
 import threading
@@ -38,15 +39,15 @@ def cached(stage):
     Parameters
     ----------
     stage : callable
-        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments always give the same
-        result, and nobody changes it in place.
+        ``stage(session, ...)``, or of what has a `session` or is `prepared`; the same arguments
+        always give the same result, and nobody changes it in place.
 
     Returns
     -------
     callable
-        Looks in the folder first. The same session are the same statements, scans and images; results of another
-        version of this library or of numpy, scipy or OpenCV do not count. It raises ValueError for a folder that others
-        may write to.
+        Looks in the folder first. The same session are the same statements, scans and images;
+        results of another version of this library or of numpy, scipy or OpenCV do not count. It
+        raises ValueError for a folder that others may write to.
     """
 
     @wraps(stage)
@@ -65,7 +66,8 @@ def cached(stage):
         file = folder / f"{stage.__name__}-{key.hexdigest()}.pickle"
         if not file.is_file():
             with opened(file.with_suffix(".lock"), folder, os.O_WRONLY | os.O_CREAT) as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)  # of two notebooks at the same time the second waits
+                # of two notebooks at the same time the second waits
+                fcntl.flock(lock, fcntl.LOCK_EX)
                 if not file.is_file():
                     result = pickle.dumps(stage(of, *args, **options))
                     with NamedTemporaryFile(dir=folder, delete=False) as part:
@@ -108,7 +110,9 @@ def library():
 
 @contextmanager
 def all_processors():
-    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays alone."""
+    """Let :func:`spread` use every processor; a process with threads, as that of a notebook, stays
+    alone.
+    """
     global _processes
     alone = not hasattr(os, "sched_getaffinity") or threading.active_count() > 1
     before = _processes
@@ -123,55 +127,61 @@ def all_processors():
 
 
 def spread(work, items):
-    """``[work(item) for item in items]``, shared with forked processes within :func:`all_processors`.
+    """``[work(item) for item in items]``, shared with forked processes within
+    :func:`all_processors`.
 
-    Whoever is free takes the next item; what another process could not do (it died, or `work` raised) is done here.
-    Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory differ in the last digit.
-    Pickles are read from the pipes of our own children only.
+    Whoever is free takes the next item; what another process could not do (it died, or `work`
+    raised) is done here. Every result is a copy, as a pickle makes it: sums over arrays of another
+    layout in memory differ in the last digit. Pickles are read from the pipes of our own children
+    only. No executor does this: one whose parent is killed leaves processes behind that wait for
+    ever, and here they end with the items.
     """
     global _processes
     items = list(items)
-    count = _processes
-    done = {}  # results by number of the item
-    others = []  # processes, and the files that their results come from
-    if min(count, len(items)) < 2:
+    count = min(_processes, len(items))
+    if count < 2:
         return [pickle.loads(pickle.dumps(work(item))) for item in items]
+    before = _processes
+    _processes = 1  # of loops within
     queue, end = os.pipe()  # of the numbers of items
     os.write(end, np.arange(len(items), dtype=np.uint16).tobytes())
     os.close(end)
-    _processes = 1  # of loops within
 
-    def take():
-        """Work on what nobody works on."""
+    def take(send):
+        """Work on what nobody works on, and send pickles of the results by number."""
+        done = {}
         with suppress(Exception):
             while number := os.read(queue, 2):
                 number = int.from_bytes(number, sys.byteorder)
-                done[number] = work(items[number])
+                done[number] = pickle.dumps(work(items[number]))
+        send(done)
 
+    def quietly(send):
+        """The same in a process of its own, which tells nobody that it was interrupted."""
+        with suppress(BaseException):
+            take(send)
+
+    results = {}
+    others = []  # processes, and the pipes that their results come from
+    fork = multiprocessing.get_context("fork")
     try:
-        for _ in range(min(count, len(items)) - 1):
-            end, own = os.pipe()
-            child = os.fork()
-            if not child:
-                with suppress(BaseException), open(own, "wb") as file:
-                    take()
-                    pickle.dump(done, file)
-                os._exit(0)
-            os.close(own)
-            others.append((child, open(end, "rb")))
-        take()
-        done = pickle.loads(pickle.dumps(done))
-        for _, file in others:
-            with suppress(EOFError, pickle.UnpicklingError):
-                done |= pickle.load(file)
+        for _ in range(count - 1):
+            receiver, sender = fork.Pipe(duplex=False)
+            process = fork.Process(target=quietly, args=(sender.send,), daemon=True)
+            process.start()
+            sender.close()
+            others.append((process, receiver))
+        take(results.update)
+        for _, receiver in others:
+            with suppress(EOFError):
+                results |= receiver.recv()
     finally:
-        _processes = count
+        _processes = before
         os.close(queue)
-        for child, file in others:
-            file.close()
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+        for process, _ in others:
+            process.kill()
+            process.join()
     for number, item in enumerate(items):
-        if number not in done:
-            done[number] = pickle.loads(pickle.dumps(work(item)))
-    return [done[number] for number in range(len(items))]
+        if number not in results:
+            results[number] = pickle.dumps(work(item))
+    return [pickle.loads(results[number]) for number in range(len(items))]

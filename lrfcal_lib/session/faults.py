@@ -145,7 +145,8 @@ def ranges_beyond(session):
 
 def bearings_beyond(session):
     """Bearings, or steps between them, that are not those which session.json states."""
-    lrf, bearings = session.lrf, session.scans["bearings"]
+    lrf = session.lrf
+    bearings = session.scans["bearings"]
     if session.telegrams is not None:
         return [Fault("field of view", words) for words in other_than_stated(session.scans, lrf)]
     if len(bearings) < 2:

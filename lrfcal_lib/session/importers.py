@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.session.read import image_size
+from lrfcal_lib.session.images import image_size
 from lrfcal_lib.session.stated import (
     LARGEST_TEXT,
     CameraInfo,
@@ -25,16 +25,23 @@ from lrfcal_lib.session.stated import (
 )
 from lrfcal_lib.session.write import SessionWriter
 
-# LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder ZED_STEREO_LASER_SWEEP.
-# The authors' platform: pitch axis along x through (y = 0, z = 0.2 m) of their cloud frame; at the angle p = 90 deg
-# the LRF looks along +y. Ours is the same platform with the origin on the axis and pitch = p - 90 deg.
+# LaserSeteroCalibration (https://github.com/suijingfeng/LaserSeteroCalibration), folder
+# ZED_STEREO_LASER_SWEEP. The authors' platform: pitch axis along x through (y = 0, z = 0.2 m) of
+# their cloud frame; at the angle p = 90 deg the LRF looks along +y. Ours is the same platform with
+# the origin on the axis and pitch = p - 90 deg.
 LASERSETERO_HEAD = RigidTransform.from_translation([-0.038, 0.0045, 0.157])
 LASERSETERO_CLOUD = RigidTransform.from_translation([0.0, 0.0, 0.2])  # T_cloud_platform
-# The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of bolted plates.
+# The authors state dimensions to half a millimetre, and axis and scan plane parallel: assumed of
+# bolted plates.
 LASERSETERO_PLATFORM_SIGMA = (np.radians(0.1), 0.005)
-STEP_DEG, FIRST, LAST = 0.1, 550, 1250  # the LMS400 sees 70 deg: from the first to the last of these steps
+# the LMS400 sees 70 deg: from the first to the last of these steps
+STEP_DEG = 0.1
+FIRST = 550
+LAST = 1250
 COUNT = 0.001  # metres, one count of the LMS400
-LASERSETERO = "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+LASERSETERO = (
+    "LaserSeteroCalibration, ZED_STEREO_LASER_SWEEP (github.com/suijingfeng/LaserSeteroCalibration)"
+)
 # radians of pitch between points of two scan lines; rounding to a micrometre makes less than 1e-5
 LINE_JUMP = 1e-4
 LARGEST_MISS = 1e-5  # metres between published points and those rebuilt from what was recovered
@@ -46,20 +53,24 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
     Parameters
     ----------
     src : path-like
-        Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and ``Calib_Results_{left,right}.m``.
+        Folder with ``plane_NN.pcd``, ``left_NN.png``, ``right_NN.png`` and
+        ``Calib_Results_{left,right}.m``.
     intrinsics : {'own', 'published'}
-        'own' leaves the intrinsics open, so that they are estimated from the session's images; 'published' takes them
-        from the Bouguet results. Either way the published ones are kept in the session's reference.
+        'own' leaves the intrinsics open, so that they are estimated from the session's images;
+        'published' takes them from the Bouguet results. Either way the published ones are kept in
+        the session's reference.
 
     Returns
     -------
     largest_miss : float
-        Metres between the published points and those rebuilt from range, bearing and pitch, at most.
+        Metres between the published points and those rebuilt from range, bearing and pitch, at
+        most.
 
     Raises
     ------
     SessionError
-        For missing or truncated files, an existing target, or if rebuilding misses by more than 0.01 mm.
+        For missing or truncated files, an existing target, or if rebuilding misses by more than
+        0.01 mm.
     """
     if intrinsics not in ("own", "published"):
         raise SessionError(f"intrinsics is 'own' or 'published', got '{intrinsics}'")
@@ -89,11 +100,14 @@ def import_lasersetero(src, dst, *, intrinsics="own"):
         max_range=3.0,
     )
     # the authors' result is printed with four digits, so made orthonormal again
-    turn = Rotation.from_matrix([[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]])
+    turn = Rotation.from_matrix(
+        [[0.9990, -0.0431, 0.0149], [0.0157, 0.0168, -0.9997], [0.0429, 0.9989, 0.0175]]
+    )
     T_left_cloud = RigidTransform.from_components([0.1169, -0.0500, -0.2737], turn)
     reference = {
-        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, their bearing b is "
-        "90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms over the boards' planes).",
+        "note": "p_cloud = T_cloud_platform p_platform; the authors' pitch p is ours + 90 deg, "
+        "their bearing b is 90 deg - ours. T_left_platform is the authors' optimum (6.7 mm rms "
+        "over the boards' planes).",
         "T_cloud_platform": transform_to_json(LASERSETERO_CLOUD),
         "T_left_platform": transform_to_json(T_left_cloud * LASERSETERO_CLOUD),
         "cameras": {name: result["reference"] for name, result in published.items()},
@@ -128,7 +142,9 @@ def numbered(folder, pattern):
         if number:
             files[int(number[1])] = file
     if not files:
-        raise SessionError(f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?")
+        raise SessionError(
+            f"{folder}: no {pattern.replace('*', 'NN')}; is this the folder ZED_STEREO_LASER_SWEEP?"
+        )
     return files
 
 
@@ -145,15 +161,17 @@ def recover_polar(points, name="points"):
     Returns
     -------
     ranges, bearings, pitch : ndarray, shapes (L, B), (B,) and (L,)
-        Metres on the sensor's grid of 1 mm, NaN outside the published part; ours, radians, in steps of 0.1 deg.
+        Metres on the sensor's grid of 1 mm, NaN outside the published part; ours, radians, in steps
+        of 0.1 deg.
     miss : float
-        Largest distance between published and rebuilt points, metres; SessionError for more than 0.01 mm.
+        Largest distance between published and rebuilt points, metres; SessionError for more than
+        0.01 mm.
 
     Notes
     -----
-    With n the offset of the scan plane from the axis, S the distance ahead inside it and p the authors' angle,
-    ``y + i z = (n - i S) exp(i p)``: the modulus gives S, the argument p. A new scan line starts where the
-    bearing restarts or the pitch jumps.
+    With n the offset of the scan plane from the axis, S the distance ahead inside it and p the
+    authors' angle, ``y + i z = (n - i S) exp(i p)``: the modulus gives S, the argument p. A new
+    scan line starts where the bearing restarts or the pitch jumps.
     """
     x, ahead, offset = LASERSETERO_HEAD.translation
     p_platform = LASERSETERO_CLOUD.inv().apply(points)
@@ -163,7 +181,8 @@ def recover_polar(points, name="points"):
     ranges = np.round(np.hypot(across, along) / COUNT) * COUNT
     steps = np.round(np.degrees(np.arctan2(along, across)) / STEP_DEG)  # 0.1 deg, so no .5 to round
     bearing = np.radians(steps * STEP_DEG)
-    # Once more with the exact range and bearing: now the pitch carries the rounding of the published points only.
+    # Once more with the exact range and bearing: now the pitch carries the rounding of the
+    # published points only.
     S = ranges * np.sin(bearing) + ahead
     pitch = np.arctan2(p_platform[:, 2], p_platform[:, 1]) + np.arctan2(S, offset) - np.pi / 2
     restarts = np.diff(steps) >= 0
@@ -196,10 +215,13 @@ def source_text(file):
 def read_pcd(file):
     """Points of an ASCII PCD file with the fields x y z, shape (n, 3).
 
-    SessionError for a missing file, other fields, binary data, or fewer points than the header states.
+    SessionError for a missing file, other fields, binary data, or fewer points than the header
+    states.
     """
     head, _, body = source_text(file).partition("DATA ascii")
-    fields, count = (re.search(rf"^{key} (.*)$", head, re.MULTILINE) for key in ("FIELDS", "POINTS"))
+    fields, count = (
+        re.search(rf"^{key} (.*)$", head, re.MULTILINE) for key in ("FIELDS", "POINTS")
+    )
     if not body or not fields or not count or fields[1].split() != ["x", "y", "z"]:
         raise SessionError(f"{file}: expected an ASCII PCD file with the fields x y z")
     with reading(file, "{}; damaged?"):
@@ -214,12 +236,16 @@ def read_pcd(file):
 
 
 def read_bouguet(file):
-    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if something is missing.
+    """Intrinsics and board poses of a ``Calib_Results.m`` of Bouguet's toolbox; SessionError if
+    something is missing.
 
-    A dict: ``model``, a CameraModel (the toolbox prints three standard deviations, which its covariance holds squared),
-    and ``reference``, the same as plain numbers, with ``T_camera_board`` by image number (millimetres became metres).
+    A dict: ``model``, a CameraModel (the toolbox prints three standard deviations, which its
+    covariance holds squared), and ``reference``, the same as plain numbers, with ``T_camera_board``
+    by image number (millimetres became metres).
     """
-    found = re.findall(r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE)
+    found = re.findall(
+        r"^(\w+)\s*=\s*(?:\[([-+.\deE;\s]+)\]|([-+.\deE]+))\s*;", source_text(file), re.MULTILINE
+    )
     with naming(file):
         values = {}
         for key, many, one in found:
@@ -251,4 +277,7 @@ def _from_bouguet(values):
     both = {"intrinsics": intrinsics, "intrinsics_sigma": sigma / 3}
     reference = {k: dict(zip(INTRINSIC_NAMES, v.tolist(), strict=True)) for k, v in both.items()}
     reference["T_camera_board"] = poses
-    return {"model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)), "reference": reference}
+    return {
+        "model": model.with_parameters(intrinsics, np.diag((sigma / 3) ** 2)),
+        "reference": reference,
+    }

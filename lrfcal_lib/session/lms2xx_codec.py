@@ -6,7 +6,9 @@ from functools import lru_cache
 import numpy as np
 
 STX = 0x02
-HOST, DEVICE = 0x00, 0x80  # address byte of telegrams to and from a device with the factory's address
+# address bytes of telegrams to and from a device with the address of the factory
+HOST = 0x00
+DEVICE = 0x80
 LONGEST = 812 + 2  # bytes of the longest reply, 401 values, with real-time indices
 OVERHEAD = 6  # start, address, length, CRC
 CHUNK = 512  # telegrams worked on at once: what fits into the cache of a processor
@@ -20,8 +22,8 @@ class TelegramError(ValueError):
 class Telegram:
     """A telegram without its frame.
 
-    `code` is the command, or command + 0x80 in replies; `data` without code and status; `status` the last byte of a
-    reply, None in telegrams to the device.
+    `code` is the command, or command + 0x80 in replies; `data` without code and status; `status`
+    the last byte of a reply, None in telegrams to the device.
     """
 
     code: int
@@ -41,7 +43,8 @@ class Stream:
     rejected : ndarray of int, shape (m,)
         Offsets outside of those where a telegram seems to begin whose CRC is wrong.
     pending : int
-        Where a telegram may begin whose end has not come yet (the bytes from there on must be kept), or the end.
+        Where a telegram may begin whose end has not come yet (the bytes from there on must be
+        kept), or the end.
     """
 
     offset: np.ndarray
@@ -52,24 +55,31 @@ class Stream:
 
 
 def crc16(data):
-    """The device's checksum of one byte string (int), or of each row of an array of uint8, shape (n, L).
+    """The device's checksum of one byte string (int), or of each row of an array of uint8, shape
+    (n, L).
 
     Notes
     -----
-    One shift for each byte, which enters together with the byte before it: ``crc <- x crc + (b[k-1] << 8 | b[k])``
-    modulo ``x^16 + x^15 + x^2 + 1`` over GF(2). That is linear, ``crc = sum_k x^(L-1-k) w_k``, so the words before the
-    last h (h a power of two) are multiplied by ``x^h`` and added to those, until one word is left.
-    It is weaker than other checksums of 16 bits: bit j of byte k enters as ``x^(L-1-k+j) (x^7 + 1)``, the same as bit
-    j + 1 of the next byte, so two flips on such a diagonal go unseen (one in L of all pairs or so).
+    One shift for each byte, which enters together with the byte before it: ``crc <- x crc + (b[k-1]
+    << 8 | b[k])`` modulo ``x^16 + x^15 + x^2 + 1`` over GF(2). That is linear, ``crc = sum_k
+    x^(L-1-k) w_k``, so the words before the last h (h a power of two) are multiplied by ``x^h`` and
+    added to those, until one word is left. It is weaker than other checksums of 16 bits: bit j of
+    byte k enters as ``x^(L-1-k+j) (x^7 + 1)``, the same as bit j + 1 of the next byte, so two flips
+    on such a diagonal go unseen (one in L of all pairs or so).
     """
     if not isinstance(data, np.ndarray):
         return int(crc16(np.frombuffer(data, np.uint8)[None])[0])
     if data.shape[1] == 0:
         return np.zeros(len(data), np.uint16)
-    raw = np.zeros((len(data), 1 + data.shape[1] + data.shape[1] % 2), np.uint8)  # zeros in front change nothing
+    # zeros in front change nothing
+    raw = np.zeros((len(data), 1 + data.shape[1] + data.shape[1] % 2), np.uint8)
     raw[:, raw.shape[1] - data.shape[1] :] = data
-    high, low = (np.ascontiguousarray(part).view(">u2").astype(np.uint16) for part in (raw[:, :-1], raw[:, 1:]))
-    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ low  # neighbours, by shifts: twice as fast
+    high, low = (
+        np.ascontiguousarray(part).view(">u2").astype(np.uint16)
+        for part in (raw[:, :-1], raw[:, 1:])
+    )
+    # neighbours, by shifts: twice as fast
+    words = high << 1 ^ (high >> 15) * np.uint16(0x8005) ^ low
     while (n := words.shape[1]) > 1:
         last = 1 << ((n - 1).bit_length() - 1)
         rest = words[:, n - last :].copy()
@@ -89,7 +99,8 @@ def times_power(power):
 
 
 def encode_telegram(code, data=b"", *, status=None, address=None):
-    """Bytes of a telegram; `status` makes it a reply, addresses are 0x00 to the device and 0x80 for replies by default.
+    """Bytes of a telegram; `status` makes it a reply, addresses are 0x00 to the device and 0x80 for
+    replies by default.
 
     ValueError for numbers that are no bytes.
     """
@@ -100,16 +111,25 @@ def encode_telegram(code, data=b"", *, status=None, address=None):
 
 
 def parse_telegram(raw):
-    """The Telegram in bytes from the start byte to the CRC; TelegramError if start, length or CRC is wrong."""
+    """The Telegram in bytes from the start byte to the CRC; TelegramError if start, length or CRC
+    is wrong.
+    """
     raw = bytes(raw)
     if len(raw) < OVERHEAD + 1 or raw[0] != STX:
-        raise TelegramError(f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}")
+        raise TelegramError(
+            f"a telegram begins with 02 and has 7 or more bytes, got {raw[:8].hex(' ') or 'none'}"
+        )
     stated = int.from_bytes(raw[2:4], "little") + OVERHEAD
     if stated != len(raw):
-        raise TelegramError(f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream")
-    sent, computed = int.from_bytes(raw[-2:], "little"), crc16(raw[:-2])
+        raise TelegramError(
+            f"the telegram states {stated} bytes, got {len(raw)}: cut it with split_stream"
+        )
+    sent = int.from_bytes(raw[-2:], "little")
+    computed = crc16(raw[:-2])
     if sent != computed:
-        raise TelegramError(f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again")
+        raise TelegramError(
+            f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again"
+        )
     reply = raw[1] >= DEVICE and len(raw) > OVERHEAD + 1
     return Telegram(raw[4], raw[5:-3] if reply else raw[5:-2], raw[-3] if reply else None, raw[1])
 
@@ -129,15 +149,16 @@ def split_stream(data, *, replies=True):
 
     Notes
     -----
-    Every place that looks like a beginning is checked by its CRC; of overlapping ones the first counts. By chance one
-    in 65536 of the places inside other bytes passes.
+    Every place that looks like a beginning is checked by its CRC; of overlapping ones the first
+    counts. By chance one in 65536 of the places inside other bytes passes.
     """
     data = np.frombuffer(data, np.uint8)
     offset = np.flatnonzero(data[: max(len(data) - 3, 0)] == STX)
     offset = offset[(data[offset + 1] >= DEVICE) == replies]
     length = word(data, offset + 2) + OVERHEAD
     plausible = (length > OVERHEAD) & (length <= LONGEST)
-    offset, length = offset[plausible], length[plausible]
+    offset = offset[plausible]
+    length = length[plausible]
     ends = offset + length
     whole = ends <= len(data)
     good = np.zeros(len(offset), bool)
@@ -147,12 +168,15 @@ def split_stream(data, *, replies=True):
         for row in np.flatnonzero(good):
             good[row] = offset[row] >= free
             free = ends[row] if good[row] else free
-    used, before = ends[good].max(initial=0), np.searchsorted(offset[good], offset, side="right") - 1
+    used = ends[good].max(initial=0)
+    before = np.searchsorted(offset[good], offset, side="right") - 1
     inside = (before >= 0) & (offset < np.append(ends[good], 0)[before])
     begun = offset[~whole & (offset >= used)]
     tail = max(len(data) - 3, int(used))  # too few bytes to state a length
     begun = [*begun.tolist(), *(tail + np.flatnonzero(data[tail:] == STX)).tolist(), len(data)][0]
-    return Stream(offset[good], length[good], data[offset[good] + 4], offset[whole & ~good & ~inside], begun)
+    return Stream(
+        offset[good], length[good], data[offset[good] + 4], offset[whole & ~good & ~inside], begun
+    )
 
 
 def word(data, at):
@@ -192,24 +216,43 @@ SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
 UNITS = ("cm", "mm")
 REASONS = (
-    "valid", "not valid", "dazzled", "overflow", "noise", "channel error", "larger than maximum", "reserved",
-)  # fmt: skip
+    "valid",
+    "not valid",
+    "dazzled",
+    "overflow",
+    "noise",
+    "channel error",
+    "larger than maximum",
+    "reserved",
+)
 BEYOND = REASONS.index("larger than maximum")
 # index: how far a value is below the largest one its bits can hold
 REASON_BELOW_TOP = np.array([1, 2, 3, 7, 4, 5, 7, 7, BEYOND], np.uint8)
-BELOW_TOP = np.array([np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)])  # the other way
+# the other way
+BELOW_TOP = np.array([np.argmax(REASON_BELOW_TOP == reason) for reason in range(1 + BEYOND)])
 
 
 @dataclass(frozen=True)
 class Mode:
-    """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper ones flags."""
+    """How a measuring mode shares the 16 bits of a value: the lower `bits` are the range, the upper
+    ones flags.
+    """
 
     bits: int
-    top = property(lambda self: (1 << self.bits) - 1, doc="Largest number the range bits hold: 'not valid'.")
-    largest = property(lambda self: self.top - 9, doc="Largest number that is a range; the nine above are special.")
+
+    @property
+    def top(self):
+        """Largest number the range bits hold: 'not valid'."""
+        return (1 << self.bits) - 1
+
+    @property
+    def largest(self):
+        """Largest number that is a range; the nine above are special."""
+        return self.top - 9
 
 
-# flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others: level of a reflector
+# flags of modes 0, 2, 4 and 6: hits of the fields A, B and C (0: A, B, dazzled); of the others:
+# level of a reflector
 MODES = dict(enumerate(map(Mode, (13, 13, 13, 14, 14, 15, 15))))
 
 
@@ -229,7 +272,6 @@ class Scans:
         Quarter degrees by which an interlaced scan of 1 deg steps is turned; -1 for a whole scan.
     scan_index, telegram_index : ndarray of int, shape (n,)
         Real-time indices, modulo 256; -1 where the device does not send them.
-    status, address : ndarray of uint8, shape (n,)
     """
 
     rows: np.ndarray
@@ -240,8 +282,6 @@ class Scans:
     partial: np.ndarray
     scan_index: np.ndarray
     telegram_index: np.ndarray
-    status: np.ndarray
-    address: np.ndarray
 
     @property
     def reasons(self):
@@ -255,7 +295,8 @@ def special_values(words, mode):
     """Where values are no ranges, and why; they are few."""
     mode = MODES[mode]
     counts = words & np.uint16(mode.top)
-    special = np.unravel_index(np.flatnonzero(counts > mode.largest), counts.shape)  # ten times as fast as nonzero
+    # ten times as fast as nonzero
+    special = np.unravel_index(np.flatnonzero(counts > mode.largest), counts.shape)
     return special, REASON_BELOW_TOP[mode.top - counts[special]]
 
 
@@ -265,23 +306,29 @@ def encode_values(ranges, *, unit="mm", mode=0, reasons=None):
     Parameters
     ----------
     ranges : array_like
-        Metres, rounded to the unit. Whatever is larger than the mode can hold, inf included, becomes 'larger than
-        maximum'; NaN becomes 'not valid'.
+        Metres, rounded to the unit. Whatever is larger than the mode can hold, inf included,
+        becomes 'larger than maximum'; NaN becomes 'not valid'.
     unit : {'cm', 'mm'}
     mode : int
         Measuring mode, 0 to 6.
     reasons : array_like of int, optional
         Index into `REASONS` for each value; where it is not 0 the range does not count.
     """
-    ranges, mode = np.asarray(ranges, float), MODES[mode]
+    ranges = np.asarray(ranges, float)
+    mode = MODES[mode]
     reasons = np.zeros(ranges.shape, int) if reasons is None else np.asarray(reasons, int)
     counts = np.rint(np.nan_to_num(ranges, nan=0, posinf=1e9) / METRES[unit])
-    reasons = np.where(reasons > 0, reasons, np.where(np.isnan(ranges), 1, BEYOND * (counts > mode.largest)))
+    reasons = np.where(
+        reasons > 0, reasons, np.where(np.isnan(ranges), 1, BEYOND * (counts > mode.largest))
+    )
     return np.where(reasons > 0, mode.top - BELOW_TOP[reasons], counts).astype(np.uint16)
 
 
-def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE, code=SCAN, head=b""):
-    """Telegram 0xB0 of values that are encoded already, or one of another code, with bytes before the values.
+def encode_words(
+    words, *, unit="mm", partial=-1, indices=None, status=0x10, address=DEVICE, code=SCAN, head=b""
+):
+    """Telegram 0xB0 of values that are encoded already, or one of another code, with bytes before
+    the values.
 
     Parameters
     ----------
@@ -298,28 +345,22 @@ def encode_words(words, *, unit="mm", partial=-1, indices=None, status=0x10, add
     return encode_telegram(code, data, status=status, address=address)
 
 
-def encode_scan(ranges, *, unit="mm", mode=0, reasons=None, **options):
-    """Telegram 0xB0 of a scan: :func:`encode_values`, then :func:`encode_words` with the other options.
-
-    Examples
-    --------
-    >>> encode_scan([4.0, np.inf, np.nan], unit="cm").hex(" ")
-    '02 80 0a 00 b0 03 00 90 01 f7 1f ff 1f 10 a2 f5'
-    """
-    return encode_words(encode_values(ranges, unit=unit, mode=mode, reasons=reasons), unit=unit, **options)
-
-
 def decode_scan(raw, mode=0):
-    """One scan out of the whole telegram 0xB0, Scans with one row, in a measuring mode that the telegram does not tell.
+    """One scan out of the whole telegram 0xB0, Scans with one row, in a measuring mode that the
+    telegram does not tell.
 
-    TelegramError if it is damaged, another telegram, or its number of values does not fit its length.
+    TelegramError if it is damaged, another telegram, or its number of values does not fit its
+    length.
     """
     telegram = parse_telegram(raw)
     if telegram.code != SCAN:
         raise TelegramError(f"code {telegram.code:02X} is no scan (B0)")
     found = decode_scans(raw, np.array([0]), np.array([len(raw)]), mode)
     if not found:
-        raise TelegramError(f"{len(raw)} bytes do not fit the number of values {telegram.data[:2].hex(' ') or 'none'}")
+        raise TelegramError(
+            f"{len(raw)} bytes do not fit the number of values "
+            f"{telegram.data[:2].hex(' ') or 'none'}"
+        )
     return found[0]
 
 
@@ -337,22 +378,33 @@ def decode_scans(data, offset, length, mode=0):
     Returns
     -------
     list of Scans
-        One for each number of values, unit, and kind (whole or partial, with or without indices). Telegrams with
-        another code, or with a length that does not fit the number of values, are in none of them.
+        One for each number of values, unit, and kind (whole or partial, with or without indices).
+        Telegrams with another code, or with a length that does not fit the number of values, are in
+        none of them.
     """
     if mode not in MODES:  # others send no range with special values
-        raise ValueError(f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)")
-    data, length = np.frombuffer(data, np.uint8), np.asarray(length)
+        raise ValueError(
+            f"measuring mode {mode:#04x} is none of 0x00 to 0x06: set one of those (command 77)"
+        )
+    data = np.frombuffer(data, np.uint8)
+    length = np.asarray(length)
     rows = np.flatnonzero(length >= 10)
     rows = rows[data[offset[rows] + 4] == SCAN]
     head = word(data, offset[rows] + 5)
     extra = length[rows] - 10 - 2 * (head & 0x3FF)
     sound = np.isin(extra, (0, 2)) & (head < 1 << 15)
-    rows, head, extra, out = rows[sound], head[sound], extra[sound], []
+    rows = rows[sound]
+    head = head[sound]
+    extra = extra[sound]
+    out = []
     for group in alike(head & 0xE3FF, extra):
-        at, head_of, indexed = offset[rows[group]], head[group], extra[group[0]] > 0
-        values, unit = int(head_of[0] & 0x3FF), UNITS[head_of[0] >> 14]
-        words, ranges = np.empty((len(at), values), np.uint16), np.empty((len(at), values))
+        at = offset[rows[group]]
+        head_of = head[group]
+        indexed = extra[group[0]] > 0
+        values = int(head_of[0] & 0x3FF)
+        unit = UNITS[head_of[0] >> 14]
+        words = np.empty((len(at), values), np.uint16)
+        ranges = np.empty((len(at), values))
         for first in range(0, len(at), CHUNK):
             some = slice(first, first + CHUNK)
             words[some] = cut(data, at[some] + 7, 2 * values).view("<u2")
@@ -362,7 +414,7 @@ def decode_scans(data, offset, length, mode=0):
         last = at + 7 + 2 * values + 2 * indexed
         indices = (data[last - k].astype(int) if indexed else np.full(len(at), -1) for k in (2, 1))
         partial = np.where(head_of >> 13 & 1, head_of >> 11 & 3, -1)
-        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices, data[last], data[at + 1]))
+        out.append(Scans(rows[group], words, ranges, unit, mode, partial, *indices))
     return out
 
 
@@ -371,20 +423,30 @@ GRIDS = {101: (160, 4), 201: (160, 2), 401: (160, 1), 181: (0, 4), 361: (0, 2)}
 
 
 def scan_quarters(values, partial=-1):
-    """Bearings of the values of a scan in quarters of a degree, shape (values,): 0 at the right, 360 ahead; ascending.
+    """Bearings of the values of a scan in quarters of a degree, shape (values,): 0 at the right,
+    360 ahead; ascending.
 
-    The number of values tells the variant (angle and resolution) of the device. TelegramError if none sends that many.
+    The number of values tells the variant (angle and resolution) of the device. TelegramError if
+    none sends that many.
     """
     if partial >= 0 and values != 181 - (partial > 0):
-        raise TelegramError(f"partial scan {partial} has {181 - (partial > 0)} values, got {values}")
+        raise TelegramError(
+            f"partial scan {partial} has {181 - (partial > 0)} values, got {values}"
+        )
     if partial < 0 and values not in GRIDS:
         known = ", ".join(map(str, sorted(GRIDS)))
-        raise TelegramError(f"a whole scan has {known} values, got {values}: only a sub-range was asked for?")
+        raise TelegramError(
+            f"a whole scan has {known} values, got {values}: only a sub-range was asked for?"
+        )
     first, step = GRIDS[values] if partial < 0 else (partial, 4)
     return first + step * np.arange(values)
 
 
-STATUS, TYPE, VARIANT, CONFIGURATION, CONFIGURED = 0xB1, 0xBA, 0xBB, 0xF4, 0xF7
+STATUS = 0xB1
+TYPE = 0xBA
+VARIANT = 0xBB
+CONFIGURATION = 0xF4
+CONFIGURED = 0xF7
 CONFIGURATION_BYTES = 34
 
 
@@ -401,7 +463,9 @@ def text(raw):
 def unit_of(raw):
     """'cm' or 'mm'."""
     if raw[0] >= len(UNITS):
-        raise TelegramError(f"unit {raw[0]} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)")
+        raise TelegramError(
+            f"unit {raw[0]} is neither 0 (cm) nor 1 (mm): set one of those (block E, command 77)"
+        )
     return UNITS[raw[0]]
 
 
@@ -410,8 +474,6 @@ class DeviceStatus:
     """The parts of the status reply 0xB1 that a recording needs."""
 
     firmware: str
-    serial: str
-    fault: int  # 0 for a sound device
     measuring_mode: int
     scan_angle_deg: float
     resolution_deg: float
@@ -425,9 +487,20 @@ class Configuration:
 
     block: bytes = bytes(9) + b"\x02\x02" + bytes(21) + b"\x02\x00"
 
-    realtime_indices = property(lambda self: bool(self.block[4] & 2), doc="Whether scans carry their indices.")
-    measuring_mode = property(lambda self: self.block[5], doc="Key of `MODES`.")
-    unit = property(lambda self: unit_of(self.block[6:]), doc="'cm' or 'mm'.")
+    @property
+    def realtime_indices(self):
+        """Whether scans carry their indices."""
+        return bool(self.block[4] & 2)
+
+    @property
+    def measuring_mode(self):
+        """Key of `MODES`."""
+        return self.block[5]
+
+    @property
+    def unit(self):
+        """'cm' or 'mm'."""
+        return unit_of(self.block[6:])
 
     def changed(self, *, measuring_mode=None, unit=None, realtime_indices=None):
         """The same Configuration with other values; what is None stays."""
@@ -439,38 +512,57 @@ class Configuration:
         return Configuration(bytes(block))
 
 
-def encode_configuration(configuration, status=0x10):
-    """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring mode)."""
-    return encode_telegram(CONFIGURATION, configuration.block, status=status)
+def encode_configuration(configuration):
+    """Reply 0xF4, as a device sends it; a recorded session begins with it (it states the measuring
+    mode).
+    """
+    return encode_telegram(CONFIGURATION, configuration.block, status=0x10)
 
 
 def reply_data(raw, code, shortest):
-    """Data of a reply that must have a code and a least number of bytes; TelegramError otherwise."""
+    """Data of a reply that must have a code and a least number of bytes; TelegramError
+    otherwise.
+    """
     telegram = parse_telegram(raw)
     if telegram.code != code:
         raise TelegramError(f"code {telegram.code:02X} is not the reply {code:02X} asked for")
     if len(telegram.data) < shortest:
-        raise TelegramError(f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}")
+        raise TelegramError(
+            f"reply {code:02X} has {len(telegram.data)} bytes of data, needs {shortest}"
+        )
     return telegram.data
 
 
 def parse_status(raw):
-    """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or too short."""
-    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)  # counted as in the manual, which calls the code 0
-    variant = float(whole(data[107:109])), whole(data[109:111]) / 100
-    words = text(data[1:8]), text(data[10:18])
-    return DeviceStatus(*words, data[9], data[102], *variant, data[120], unit_of(data[122:]))
+    """DeviceStatus of the whole telegram 0xB1; TelegramError if it is damaged, another reply, or
+    too short.
+    """
+    # counted as in the manual, which calls the code 0
+    data = bytes([STATUS]) + reply_data(raw, STATUS, 123)
+    return DeviceStatus(
+        firmware=text(data[1:8]),
+        measuring_mode=data[102],
+        scan_angle_deg=float(whole(data[107:109])),
+        resolution_deg=whole(data[109:111]) / 100,
+        address=data[120],
+        unit=unit_of(data[122:]),
+    )
 
 
 def parse_type(raw):
-    """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063', 'V02.10')."""
+    """Model, order number and firmware out of the type reply 0xBA, such as ('LMS200', '301063',
+    'V02.10').
+    """
     return tuple(part.strip() for part in text(reply_data(raw, TYPE, 1)).split(";"))
 
 
 def parse_configuration(raw):
     """Configuration out of the replies 0xF4 (read) or 0xF7 (written).
 
-    TelegramError if it is damaged, another reply, or shorter than the measuring mode and the unit need.
+    TelegramError if it is damaged, another reply, or shorter than the measuring mode and the unit
+    need.
     """
     written = bytes(raw[4:5]) == bytes([CONFIGURED])
-    return Configuration(reply_data(raw, CONFIGURED, 8)[1:] if written else reply_data(raw, CONFIGURATION, 7))
+    return Configuration(
+        reply_data(raw, CONFIGURED, 8)[1:] if written else reply_data(raw, CONFIGURATION, 7)
+    )

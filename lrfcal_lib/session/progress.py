@@ -2,7 +2,8 @@
 
 import time
 
-LINE_S = 10.0  # between lines where none can be written over: a file or a pipe instead of a terminal
+# between lines where none can be written over: a file or a pipe instead of a terminal
+LINE_S = 10.0
 
 
 class Progress:
@@ -25,7 +26,9 @@ class Progress:
         return self._clock() - self._begun
 
     def left(self, share):
-        """How long it will still take where this share is done, as text; '' where none is, or all."""
+        """How long it will still take where this share is done, as text; '' where none
+        is, or all.
+        """
         if not 0 < share < 1:
             return ""
         return f"about {duration(self.seconds * (1 - share) / share)} left"

@@ -2,7 +2,6 @@
 
 import math
 import os
-import struct
 from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO
@@ -16,6 +15,8 @@ from scipy.spatial.transform import RigidTransform
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.session import stated
 from lrfcal_lib.session.faults import dark_image, faults_of_dark, faults_of_files
+from lrfcal_lib.session.images import check_image_size
+from lrfcal_lib.session.shown import printable
 from lrfcal_lib.session.stated import (
     CameraInfo,
     LrfInfo,
@@ -24,9 +25,14 @@ from lrfcal_lib.session.stated import (
     opened,
     reading,
     short,
-    whole_number,
 )
-from lrfcal_lib.session.telegrams import INDEX_COLUMNS, TelegramLog, other_than_stated, read_telegrams
+from lrfcal_lib.session.tables import read_table, whole_number
+from lrfcal_lib.session.telegrams import (
+    INDEX_COLUMNS,
+    TelegramLog,
+    other_than_stated,
+    read_telegrams,
+)
 
 IMAGE_COLUMNS = ("t_s", "camera", "file", "placement", "pitch_deg", "purpose")
 EDGE_COLUMNS = ("camera", "file", "edge", "u1", "v1", "u2", "v2")
@@ -38,15 +44,17 @@ ENTRY = b"PK\1\2"  # begins each line of an archive's table of contents
 MOST_ENTRIES = 100  # of an archive; a session's has the six arrays
 PACKED = (ZIP_STORED, ZIP_DEFLATED)  # as numpy packs; bzip2 and LZMA are not unpacked in steps
 LONGEST_HEADER = 10_000  # bytes before the values of an array; numpy refuses more, once it has them
-LONGEST_MEDIAN_RANGE = 200.0  # metres; no pitching 2D scanner sees half of its scene farther away than that
+# metres; no pitching 2D scanner sees half of its scene farther away than that
+LONGEST_MEDIAN_RANGE = 200.0
 
 
 @dataclass(frozen=True)
 class ImageRecord:
     """One row of images.csv.
 
-    `file` is where the image is now; `placement` -1 where it belongs to none; `pitch` of the platform (radians) and
-    `time_s` are NaN where unknown; `purpose` one of 'intrinsics', 'board', 'scene'.
+    `file` is where the image is now; `placement` -1 where it belongs to none; `pitch` of the
+    platform (radians) and `time_s` are NaN where unknown; `purpose` one of 'intrinsics', 'board',
+    'scene'.
     """
 
     camera: str
@@ -74,7 +82,9 @@ SOURCES = ("lrf/scans.npz", "lrf/telegrams.bin")
 
 
 def read_scans(path):
-    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or None)."""
+    """The recording of the LRF, whichever kind of file holds it, and the log of its telegrams (or
+    None).
+    """
     arrays, telegrams = (path / name for name in SOURCES)
     if os.path.lexists(arrays):
         return read_npz(arrays, path), None
@@ -94,7 +104,9 @@ def parts_of(path):
 
 
 def read_npz(file, within):
-    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is unpacked."""
+    """The arrays of a scans.npz (or of one part of it), checked by :func:`check_scans`; no other is
+    unpacked.
+    """
     with reading(file, "cannot be read ({}); truncated?"), opened(file, within) as stream:
         _check_entries(file, stream)
         with ZipFile(stream) as archive:
@@ -142,9 +154,10 @@ def _read_arrays(file, archive):
 def check_scans(scans):
     """Scan lines with consistent shapes and credible units.
 
-    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,), time_s (N,), and
-    intensities (N, B) where there are any; gives the same as floats (placement: integers), zero or infinite ranges NaN.
-    KeyError or ValueError for a missing array, wrong shapes or units, bearings that do not ascend, no range at all.
+    Takes a dict of ranges (N, B) metres, bearings (B,) and pitch (N,) radians, placement (N,),
+    time_s (N,), and intensities (N, B) where there are any; gives the same as floats (placement:
+    integers), zero or infinite ranges NaN. KeyError or ValueError for a missing array, wrong shapes
+    or units, bearings that do not ascend, no range at all.
     """
     ranges = np.asarray(scans["ranges"], float)
     if ranges.ndim != 2:
@@ -154,7 +167,9 @@ def check_scans(scans):
     shapes |= {"intensities": (lines, beams)} if "intensities" in scans else {}
     for key, shape in shapes.items():
         if scans[key].shape != shape:
-            raise ValueError(f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}")
+            raise ValueError(
+                f"{key} has shape {scans[key].shape}, the ranges {ranges.shape} ask for {shape}"
+            )
     scans = {key: np.asarray(scans[key], int if key == "placement" else float) for key in shapes}
     seen = ranges[np.isfinite(ranges)]
     if seen.size == 0:
@@ -163,14 +178,23 @@ def check_scans(scans):
         units = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
         raise ValueError(f"the median range is {np.median(seen):g} m: {units}")
     if seen.min() < 0:
-        raise ValueError(f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN")
-    for name, angles, limit in (("bearing", scans["bearings"], 2 * np.pi), ("pitch", scans["pitch"], np.pi)):
+        raise ValueError(
+            f"a range is {seen.min():g} m: negative ranges are no measurements, use NaN"
+        )
+    for name, angles, limit in (
+        ("bearing", scans["bearings"], 2 * np.pi),
+        ("pitch", scans["pitch"], np.pi),
+    ):
         if not np.isfinite(angles).all():
             raise ValueError(f"{np.sum(~np.isfinite(angles))} values of {name} are not finite")
         if np.abs(angles).max(initial=0) > limit + 1e-6:
-            raise ValueError(f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians")
+            raise ValueError(
+                f"a {name} is {np.abs(angles).max():g} rad: degrees? Convert to radians"
+            )
     if np.any(np.diff(scans["bearings"]) <= 0):
-        raise ValueError("bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round")
+        raise ValueError(
+            "bearings must ascend (0 right, pi/2 ahead): turn the columns of the ranges round"
+        )
     ranges[~(ranges > 0) | np.isinf(ranges)] = np.nan
     return {**scans, "ranges": ranges}
 
@@ -198,9 +222,18 @@ def missing_parts(placements, scans, records, cameras, unfinished=None):
 
 
 def inside(path, name, where):
-    """The file a session names; it must lie inside the session's folder (no ``..`` or absolute path)."""
-    windows, posix = PureWindowsPath(name), PurePosixPath(name)
-    if windows.drive or windows.root or posix.is_absolute() or ".." in windows.parts or not posix.parts:
+    """The file a session names; it must lie inside the session's folder (no ``..`` or absolute
+    path).
+    """
+    windows = PureWindowsPath(name)
+    posix = PurePosixPath(name)
+    if (
+        windows.drive
+        or windows.root
+        or posix.is_absolute()
+        or ".." in windows.parts
+        or not posix.parts
+    ):
         raise SessionError(f"{path}: {where} must stay inside the session's folder, got '{name}'")
     if not name.isprintable():
         raise SessionError(f"{path}: {where} must be printable, got '{name}': rename it")
@@ -210,21 +243,25 @@ def inside(path, name, where):
 def read_images(path, facts, unfinished=None):
     """The records of images.csv; every image must exist, be complete and have its camera's size.
 
-    Images of unfinished placements and dropped ones are left out, and a last row that is cut off while recording.
+    Images of unfinished placements and dropped ones are left out, and a last row that is cut off
+    while recording.
     """
-    file, cameras = path / "images.csv", facts["cameras"]
+    file = path / "images.csv"
+    cameras = facts["cameras"]
     if not cameras and not os.path.lexists(file):
         return ()
     out = []
     lines = {}  # in which each file stands
     skipped = {str(placement) for placement in unfinished or ()}
-    rows = stated.read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
+    rows = read_table(file, IMAGE_COLUMNS, path, torn=unfinished is not None)[0]
     for number, row in enumerate(rows, start=2):
         if row["purpose"] == DROPPED or row["placement"] in skipped:
             continue
         with naming(f"{file} line {number}"):
             if row["camera"] not in cameras:
-                raise ValueError(f"no camera '{row['camera']}' in session.json, which has {short(cameras)}")
+                raise ValueError(
+                    f"no camera '{row['camera']}' in session.json, which has {short(cameras)}"
+                )
             if row["purpose"] not in PURPOSES:
                 raise ValueError(f"purpose is one of {short(PURPOSES)}, got '{row['purpose']}'")
             placement = whole_number(row["placement"], "placement")
@@ -236,7 +273,11 @@ def read_images(path, facts, unfinished=None):
             if first < number:
                 already = f"stands in line {first} already; remove one of the two rows"
                 raise ValueError(f"'{row['file']}' {already}")
-            out.append(ImageRecord(row["camera"], target, placement, math.radians(pitch), time, row["purpose"]))
+            out.append(
+                ImageRecord(
+                    row["camera"], target, placement, math.radians(pitch), time, row["purpose"]
+                )
+            )
             check_image_size(target, stated.read_bytes(target, path), cameras[row["camera"]])
     return tuple(out)
 
@@ -249,7 +290,7 @@ def read_edges(path, facts, records):
     out = []
     known = {(record.camera, record.file) for record in records}
     edges = facts["board"].edges
-    rows = stated.read_table(file, EDGE_COLUMNS, path)[0]
+    rows = read_table(file, EDGE_COLUMNS, path)[0]
     for number, row in enumerate(rows, start=2):
         with naming(f"{file} line {number}"):
             target = inside(path, row["file"], "edges.csv: file")
@@ -259,76 +300,22 @@ def read_edges(path, facts, records):
                 raise ValueError(f"edge is one of {short(edges)}, got '{row['edge']}'")
             ends = np.array([float(row[k]) for k in EDGE_COLUMNS[3:]]).reshape(2, 2)
             if not np.isfinite(ends).all():
-                raise ValueError(f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}")
+                raise ValueError(
+                    f"u1, v1, u2, v2 must be 4 finite numbers, got {ends.ravel().tolist()}"
+                )
             if np.linalg.norm(ends[1] - ends[0]) < 5:
-                raise ValueError(f"the two pixels {ends.tolist()} are too close for a direction: pick them far apart")
+                raise ValueError(
+                    f"the two pixels {ends.tolist()} are too close for a direction: pick them "
+                    "far apart"
+                )
             out.append(EdgePick(row["camera"], target, row["edge"], ends))
     return tuple(out)
 
 
-def image_size(file, data):
-    """Width and height of a PNG or JPEG image from its header.
-
-    SessionError if it is cut off, or neither; also for a JPEG that would take long to decode, or
-    much memory, by its number of scans or of segments with remarks.
-    """
-    size = None
-    if data.startswith(PNG):
-        if data[12:16] == b"IHDR" and len(data) >= 24:
-            size = struct.unpack(">II", data[16:24])
-        end = b"IEND"
-    elif data.startswith(JPEG):
-        limits = ((SCAN, MOST_SCANS, "scans"), (REMARK, MOST_SEGMENTS, "segments of remarks"))
-        for mark, most, things in limits:
-            count = data.count(mark)
-            if count > most:
-                found = f"a JPEG of {count} {things}, more than {most}"
-                raise SessionError(f"{file}: {found}; write the image again")
-        size = _jpeg_size(data)
-        end = b"\xff\xd9"
-    else:
-        raise SessionError(f"{file}: neither PNG nor JPEG; convert the image")
-    if size is None or end not in data[-64:]:
-        raise SessionError(f"{file}: the image is truncated after {len(data)} bytes; restore it or remove its row")
-    return size
-
-
-def _jpeg_size(data):
-    """Width and height from the frame header of a JPEG, None where it does not come soon."""
-    at = len(JPEG)
-    for _ in range(MOST_SEGMENTS):
-        if len(data) < at + 9 or data[at] != 0xFF:
-            return None
-        if data[at + 1] in FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        if data[at + 1] == 0xFF:  # a byte that fills up
-            at += 1
-        else:
-            (length,) = struct.unpack_from(">H", data, at + 2)
-            at += 2 + length
-    return None
-
-
-def check_image_size(file, data, camera, size=None):
-    """Refuse an image of another size than its camera's; `size` is that of the decoded image."""
-    width, height = size or image_size(file, data)
-    if (width, height) != (camera.width, camera.height):
-        found = f"{width} x {height} pixels, but camera '{camera.name}' has {camera.width} x {camera.height}"
-        raise SessionError(f"{file}: {found}; intrinsics hold for one image size only")
-
-
 # radians from the first to the last quarter of a sweep; 0.006 deg, below the step of any head
 SMALLEST_MOVE = 1e-4
-PNG = b"\x89PNG\r\n\x1a\n"
-JPEG = b"\xff\xd8"
-FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # second bytes of the markers of frame headers
-SCAN, REMARK = b"\xff\xda", b"\xff\xe1"  # markers, which do not occur within coded pixels
-MOST_SCANS = 100  # of a JPEG, each up to 30 ms at 30 megapixels; programs write about ten
-# of a JPEG; programs write about twenty, and large remarks may hold the marker by chance
-MOST_SEGMENTS = 10_000
-
-# tables of a session: columns, rows of the same ... follow each other in time, ... stands there once
+# tables of a session: columns, rows of the same ... follow each other in time, ... stands there
+# once
 ORDERED = {
     "lrf/index.csv": (INDEX_COLUMNS, ("placement",), ("offset",)),
     "images.csv": (IMAGE_COLUMNS, ("camera", "placement", "purpose"), ("file",)),
@@ -361,7 +348,8 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Session:
-    """A recorded session; the arrays are read when it is opened, the images when they are asked for.
+    """A recorded session; the arrays are read when it is opened, the images when they are asked
+    for.
 
     Attributes
     ----------
@@ -372,8 +360,8 @@ class Session:
     T_head_lrf : RigidTransform or None
         The platform as its maker or a tape measure states it.
     platform_sigma : tuple of float
-        How well: standard deviations of the axis' direction (radians) and offset (metres). Where nobody states them,
-        0.5 deg and 10 mm are assumed: what a set square and a ruler give.
+        How well: standard deviations of the axis' direction (radians) and offset (metres). Where
+        nobody states them, 0.5 deg and 10 mm are assumed: what a set square and a ruler give.
     cameras : dict of str to CameraInfo
     placements : tuple of int
         All that the session states, also those without data.
@@ -406,13 +394,20 @@ class Session:
     telegrams: TelegramLog | None = field(default=None, repr=False)
 
     def sweep(self, placement):
-        """The Sweep of a placement; SessionError if it is not in the session, or has no scan line with a range."""
+        """The Sweep of a placement; SessionError if it is not in the session, or has no scan line
+        with a range.
+        """
         if placement not in self.placements:
-            raise SessionError(f"{self.path}: no placement {placement}; the session has {short(self.placements)}")
+            raise SessionError(
+                f"{self.path}: no placement {placement}; the session has {short(self.placements)}"
+            )
         rows = self.scans["placement"] == placement
         ranges = self.scans["ranges"][rows]
         if not np.isfinite(ranges).any():
-            raise SessionError(f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in them")
+            raise SessionError(
+                f"{self.path}: placement {placement} has {rows.sum()} scan lines and no range in "
+                "them"
+            )
         intensities = self.scans.get("intensities")
         if intensities is not None:
             intensities = intensities[rows]
@@ -436,14 +431,17 @@ class Session:
         return tuple(records)
 
     def read_image(self, record):
-        """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width, 3).
+        """The pixels of an ImageRecord: blue, green, red, ndarray of uint8, shape (height, width,
+        3).
 
         SessionError if the file cannot be decoded or has another size than the camera.
         """
         camera = self.cameras[record.camera]
         data = stated.read_bytes(record.file, self.path)
         check_image_size(record.file, data, camera)
-        with reading(record.file, "cannot be decoded; remove its row from images.csv or restore the file"):
+        with reading(
+            record.file, "cannot be decoded; remove its row from images.csv or restore the file"
+        ):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             shape = image.shape  # there is none of an image that is None
         check_image_size(record.file, data, camera, shape[1::-1])
@@ -451,7 +449,9 @@ class Session:
 
     @property
     def scene_placements(self):
-        """Placements that show a scene to be rebuilt, not the board: their images have the purpose 'scene'."""
+        """Placements that show a scene to be rebuilt, not the board: their images have the purpose
+        'scene'.
+        """
         return tuple(p for p in self.placements if self.images(placement=p, purpose="scene"))
 
     @property
@@ -461,7 +461,9 @@ class Session:
         return tuple(p for p in self.placements if p not in scenes)
 
     def sweep_direction(self, placement):
-        """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one pitch."""
+        """Sign of the pitch motion over a sweep: +1 upwards, -1 downwards, 0 for scans at one
+        pitch.
+        """
         pitch = self.sweep(placement).pitch
         quarter = len(pitch) // 4 + 1
         moved = np.nanmedian(pitch[-quarter:]) - np.nanmedian(pitch[:quarter])
@@ -480,14 +482,16 @@ def open_session(path):
     Raises
     ------
     SessionError
-        With the file, the value and the remedy, for anything that makes the session unusable. What only takes a part
-        away (a placement without scan lines) is in `Session.problems`.
+        With the file, the value and the remedy, for anything that makes the session unusable. What
+        only takes a part away (a placement without scan lines) is in `Session.problems`.
     """
     path = Path(path)
     data = stated.read_json(path / "session.json", path)
     with naming(path / "session.json"):
         if data.get("schema") != stated.SCHEMA:
-            raise ValueError(f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'")
+            raise ValueError(
+                f"schema is {data.get('schema')!r}, this version reads '{stated.SCHEMA}'"
+            )
         facts = stated.parse_session(data)
         unfinished = facts.pop("unfinished")
     scans, log = read_scans(path)
@@ -495,7 +499,13 @@ def open_session(path):
     picks = read_edges(path, facts, records)
     problems = missing_parts(facts["placements"], scans, records, facts["cameras"], unfinished)
     problems += () if log is None else (*log.problems, *other_than_stated(scans, facts["lrf"]))
-    found = {"image_records": records, "picks": picks, "problems": problems, "scans": scans, "telegrams": log}
+    found = {
+        "image_records": records,
+        "picks": picks,
+        "problems": problems,
+        "scans": scans,
+        "telegrams": log,
+    }
     return Session(path=path, **found, **facts)
 
 
@@ -518,7 +528,7 @@ def validate(path):
         except SessionError as error:
             found.append(str(error))
     found += [fault.words for fault in faults_of_dark(session, dark)]
-    return [stated.printable(problem) for problem in found]
+    return [printable(problem) for problem in found]
 
 
 def _disorder(session):
@@ -526,7 +536,7 @@ def _disorder(session):
     for name, (columns, group, once) in ORDERED.items():
         file = session.path / name
         if os.path.lexists(file):
-            rows = stated.read_table(file, columns, session.path, torn=True)[0]
+            rows = read_table(file, columns, session.path, torn=True)[0]
             yield from _rows_twice(file, rows, once)
             yield from _times_back(file, rows, group)
 

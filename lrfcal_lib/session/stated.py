@@ -1,17 +1,12 @@
-"""session.json and how files of a session are opened: within its folder, bounded, by one writer at a time."""
+"""session.json, and how files of a session are opened: within its folder, and bounded."""
 
-import csv
-import fcntl
-import html
 import json
 import math
 import os
 import re
-import socket
 import stat
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,33 +18,34 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel
-
-
-def escape(text):
-    """Anything as HTML that shows it as text: no tags, entities, or formulas (MathJax finds no pair of signs).
-
-    All that becomes HTML comes through here, see also the report's template: names in a session may be somebody else's.
-    """
-    return re.sub(r"[$\\]", r"<span>\g<0></span>", html.escape(str(text)))
-
+from lrfcal_lib.session.shown import printable
 
 LARGEST_FILE = 64_000_000  # bytes of any file of a session
 SPLIT = "split the recording into several sessions"
-LOCK = "writer.lock"
 FILES = (  # of any session, besides its images
-    "session.json", "lrf/scans.npz", "lrf/telegrams.bin", "lrf/index.csv", "images.csv", "edges.csv", "platform.csv",
+    "session.json",
+    "lrf/scans.npz",
+    "lrf/telegrams.bin",
+    "lrf/index.csv",
+    "images.csv",
+    "edges.csv",
+    "platform.csv",
     "truth.json",
-)  # fmt: skip
-KINDS = {"l": "a link", "d": "a folder", "p": "a named pipe", "s": "a socket", "b": "a device", "c": "a device"}
-
-
-def printable(text):
-    """Text as a terminal may show it: what steers it, or cannot be encoded, stands in letters."""
-    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
+)
+KINDS = {
+    "l": "a link",
+    "d": "a folder",
+    "p": "a named pipe",
+    "s": "a socket",
+    "b": "a device",
+    "c": "a device",
+}
 
 
 class SessionError(ValueError):
-    """A session on disk that cannot be used: the message names the file, the value and what to do about it."""
+    """A session on disk that cannot be used: the message names the file, the value and what to do
+    about it.
+    """
 
     def __init__(self, text):
         text = printable(text)
@@ -98,7 +94,9 @@ def opened(file, within=None, flags=os.O_RDONLY, most=LARGEST_FILE):
         found = os.stat(file, follow_symlinks=within is None)
         _refuse_other(file, found, "-", "a file")
         if not writes and found.st_size > most:
-            raise SessionError(f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}")
+            raise SessionError(
+                f"{file}: {found.st_size / 1e6:.0f} MB, more than {most / 1e6:.0f} MB; {SPLIT}"
+            )
     inner = os.open(file, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     mode = "rb"
     if writes:
@@ -115,70 +113,39 @@ def _refuse_other(file, status, kind, wanted):
     """Refuse what is no plain file (or folder), such as a link."""
     if (found := stat.filemode(status.st_mode)[0]) != kind:
         what = KINDS.get(found, "a file")
-        raise SessionError(f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its place")
-
-
-@contextmanager
-def alone(path):
-    """Keep other writers out of a session as long as this lasts; a process that is killed lets go of it as well."""
-    file = Path(path) / LOCK
-    with ExitStack() as stack:
-        stream = stack.enter_context(_locked(file, path))
-        while not _still_there(file, stream):  # its holder removed the file after we had opened it
-            stack.close()
-            stream = stack.enter_context(_locked(file, path))
-        stream.truncate()
-        stream.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now():%Y-%m-%d %H:%M}".encode())
-        stream.flush()
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # gone with its session?
-                os.unlink(file)
-
-
-def _locked(file, path):
-    """The open lock of a session, which nobody else holds."""
-    stream = opened(file, path, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        with stream:
-            holder = stream.read(200).decode(errors="replace") or "another process"
-        remedy = "end that first, or choose another one"
-        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
-    return stream
-
-
-def _still_there(file, stream):
-    """Whether an open file is the one that has this name now."""
-    try:
-        return os.path.samestat(os.fstat(stream.fileno()), os.lstat(file))
-    except FileNotFoundError:
-        return False
+        raise SessionError(
+            f"{file}: is {what}, not {wanted}: a session holds plain files; put {wanted} in its "
+            "place"
+        )
 
 
 MOST_VALUES = 12_000_000  # of all scan lines, so that reading them takes less than 500 MB
-LARGEST_TEXT, DEEPEST_JSON, MOST_ROWS = 8_000_000, 30, 200_000  # bytes of a JSON or CSV file, levels
+LARGEST_TEXT = 8_000_000  # bytes of a JSON or CSV file
+DEEPEST_JSON = 30  # levels
 
 
 @contextmanager
 def reading(file, remedy):
     """Turn whatever other people's code says about the content of a file into a SessionError.
 
-    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to show its mistakes.
+    Any exception is meant, so nothing but calls of other people's code belongs inside: ours has to
+    show its mistakes.
     """
     try:
         yield
     except SessionError:
         raise
     except Exception as error:
-        raise SessionError(f"{file}: {remedy.format(str(error) or type(error).__name__)}") from error
+        raise SessionError(
+            f"{file}: {remedy.format(str(error) or type(error).__name__)}"
+        ) from error
 
 
 @contextmanager
 def naming(file):
-    """Turn whatever goes wrong with values of a file into a SessionError that begins with the file's name."""
+    """Turn whatever goes wrong with values of a file into a SessionError that begins with the
+    file's name.
+    """
     try:
         yield
     except SessionError:
@@ -190,7 +157,9 @@ def naming(file):
 
 
 def read_bytes(file, within=None, most=LARGEST_FILE):
-    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot be read."""
+    """Content of a file of a session (see :func:`opened`); a SessionError where it cannot
+    be read.
+    """
     try:
         with opened(file, within, most=most) as stream:
             data = stream.read(most + 1)
@@ -207,55 +176,22 @@ def read_json(file, within):
     with reading(file, "not JSON ({}); truncated, or edited by hand?"):
         data = json.loads(text.decode())
     if not isinstance(data, dict):
-        raise SessionError(f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'")
+        raise SessionError(
+            f"{file}: holds a {type(data).__name__}, expected an object with the key 'schema'"
+        )
     inner = [data]
     for _ in range(DEEPEST_JSON):
-        inner = [v for x in inner if isinstance(x, dict | list) for v in (x.values() if isinstance(x, dict) else x)]
+        inner = [
+            v
+            for x in inner
+            if isinstance(x, dict | list)
+            for v in (x.values() if isinstance(x, dict) else x)
+        ]
     if inner:
-        raise SessionError(f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?")
+        raise SessionError(
+            f"{file}: nested deeper than {DEEPEST_JSON} levels; was this written by a program?"
+        )
     return data
-
-
-def read_table(file, columns, within, torn=False):
-    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly `columns`.
-
-    With `torn`, a last row without its line end (cut off by a crash) is left out.
-    """
-    data = read_bytes(file, within, LARGEST_TEXT)
-    with reading(file, "not a CSV file in UTF-8 ({})"):
-        text = data.decode()
-        cut = torn and not text.endswith("\n")
-        lines = (text.rpartition("\n")[0] if cut else text).splitlines()
-        if len(lines) > MOST_ROWS:
-            raise SessionError(f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}")
-        rows = list(csv.reader(lines))
-    if not rows or tuple(rows[0]) != columns:
-        got = ", ".join(rows[0]) if rows else "an empty file"
-        if rows and tuple(rows[0]) == ("", *columns):
-            got = "a first column without a name: write the table without row numbers (index=False in pandas)"
-        raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(columns):
-            raise SessionError(f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?")
-    whole = [key in WHOLE_COLUMNS for key in columns]
-    rows = [map(_without_point, row, whole) for row in rows[1:]]
-    return [dict(zip(columns, row, strict=True)) for row in rows], cut
-
-
-def _without_point(cell, whole):
-    """A cell of a table: 1.0, as programs write whole numbers beside empty cells, is 1."""
-    return cell.removesuffix(".0") if whole else cell
-
-
-def whole_number(text, name):
-    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text."""
-    try:
-        return int(text or -1)
-    except ValueError:
-        raise ValueError(f"{name} is '{text}': a whole number is needed") from None
-
-
-WHOLE_COLUMNS = ("placement", "offset", "length")  # of tables, which hold whole numbers
 
 
 def check_amount(values):
@@ -276,11 +212,20 @@ MOST_CORNERS = 1000  # of a pattern, or of a board's outline
 LONGEST_BOARD = 20.0  # metres
 MOST_CAMERAS = 100
 MILLIMETRES = "millimetres? Divide by 1000; inches? Multiply by 0.0254"
-# metres, by part of the model's name: systematic error of a range up to 10 m according to SICK (technical description
-# of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors LMSxxx"; data sheet of TiM55x and TiM56x)
-SYSTEMATIC_ERROR = {"LMS1": 0.040, "LMS200": 0.015, "LMS211": 0.035, "LMS221": 0.035, "LMS5": 0.025, "TiM5": 0.060}
-# of other models (no sheet of the LMS291 and LMS400 was at hand), and of those that count centimetres: so many standard
-# deviations or steps of a range; the sheets above admit 2 to 4.2, and 4 to 5 steps of a centimetre
+# metres, by part of the model's name: systematic error of a range up to 10 m according to SICK
+# (technical description of LMS200, 211 and 221 in millimetre mode; support page "Measurement Errors
+# LMSxxx"; data sheet of TiM55x and TiM56x)
+SYSTEMATIC_ERROR = {
+    "LMS1": 0.040,
+    "LMS200": 0.015,
+    "LMS211": 0.035,
+    "LMS221": 0.035,
+    "LMS5": 0.025,
+    "TiM5": 0.060,
+}
+# of other models (no sheet of the LMS291 and LMS400 was at hand), and of those that count
+# centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
+# 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
@@ -288,14 +233,20 @@ ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobo
 def in_words(error):
     """The first mistake that pydantic found: where, value, what is needed."""
     first = error.errors(include_url=False)[0]
-    where, kind, value = ".".join(map(str, first["loc"])) or "it", first["type"], ascii(first["input"])
+    where = ".".join(map(str, first["loc"])) or "it"
+    kind = first["type"]
+    value = ascii(first["input"])
     if kind == "missing":
         return f"{where} is missing"
     found = f"{where} is {value if len(value) < 100 else value[:80] + ' ...'}"
     found = where if isinstance(first["input"], dict) else found
     if kind == "value_error":
         return f"{found}: {first['ctx']['error']}"
-    needed = "an object" if kind in ("model_type", "dataclass_type") else first["msg"].removeprefix("Input should be ")
+    needed = (
+        "an object"
+        if kind in ("model_type", "dataclass_type")
+        else first["msg"].removeprefix("Input should be ")
+    )
     large = kind.startswith("less_than") and re.search(r"_m\b", where)  # the key tells the unit
     return f"{found}: {needed} is needed" + f"; {MILLIMETRES}" * bool(large)
 
@@ -325,12 +276,17 @@ def refused(wrong, words):
 NOT_PLAIN = "this becomes a file name: letters, digits, '_', '-' and '.' only"
 TWICE = "placements are different numbers"
 NOT_SHOWN = "names of edges stand in figures: no line ends, no '$' (a formula)"
-Name = Annotated[str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)]
+Name = Annotated[
+    str, refused(lambda name: not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name), NOT_PLAIN)
+]
 EdgeName = Annotated[str, refused(lambda name: "$" in name or not name.isprintable(), NOT_SHOWN)]
 Whole = Annotated[int, Field(ge=0, le=1_000_000)]
 Inner = Annotated[int, Field(ge=3, le=MOST_CORNERS)]
-Positive, Length = Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0, le=1)]
-Angle = Annotated[FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Length = Annotated[FiniteFloat, Field(gt=0, le=1)]
+Angle = Annotated[
+    FiniteFloat, AfterValidator(math.radians), PlainSerializer(lambda a: round(math.degrees(a), 9))
+]
 Step = Annotated[Angle, Field(gt=0)]  # radians here, degrees in the file
 Pair, Triple, Lens, Row = (tuple[(FiniteFloat,) * n] for n in (2, 3, 5, 9))
 
@@ -343,20 +299,18 @@ class TransformStated(BaseModel):
 
     def made(self):
         """As a RigidTransform."""
-        return RigidTransform.from_components(self.translation_m, Rotation.from_rotvec(self.rotation_vector_rad))
+        return RigidTransform.from_components(
+            self.translation_m, Rotation.from_rotvec(self.rotation_vector_rad)
+        )
 
 
 def transform_to_json(transform):
     """A RigidTransform (or None) as rotation vector and translation."""
     if transform is None:
         return None
-    turn, shift = transform.rotation.as_rotvec().tolist(), transform.translation.tolist()
+    turn = transform.rotation.as_rotvec().tolist()
+    shift = transform.translation.tolist()
     return {"rotation_vector_rad": turn, "translation_m": shift}
-
-
-def transform_from_json(data):
-    """Inverse of :func:`transform_to_json`; ValueError for a wrong one."""
-    return None if data is None else from_json(TransformStated, data).made()
 
 
 Transform = Annotated[TransformStated, AfterValidator(TransformStated.made)] | None
@@ -382,7 +336,9 @@ class LensStated(BaseModel):
         """As a CameraModel."""
         covariance = None if self.covariance is None else np.array(self.covariance)
         pinhole = self.fx, self.fy, self.cx, self.cy
-        return CameraModel(width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px)
+        return CameraModel(
+            width, height, *pinhole, np.array(self.distortion), covariance, self.rms_px
+        )
 
 
 def model_to_json(model):
@@ -410,7 +366,9 @@ class BoardStated(BaseModel):
     """A board as it stands in a file."""
 
     name: str
-    edges: Annotated[tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)]
+    edges: Annotated[
+        tuple[EdgeName, ...], Field(fail_fast=True, min_length=3, max_length=MOST_CORNERS)
+    ]
     features: tuple[str, str]
     corners_m: Annotated[tuple[Pair, ...], Field(fail_fast=True)] | None
     pattern: Annotated[PatternStated, AfterValidator(PatternStated.made)] | None
@@ -422,12 +380,19 @@ class BoardStated(BaseModel):
             raise ValueError("the edges need different names")
         if len(set(self.features) & set(self.edges)) != 2:
             given = "none" if not any(self.features) else short(map(repr, self.features))
-            needed = f"features must be two different edges of {short(self.edges)}, at a right angle"
+            needed = (
+                f"features must be two different edges of {short(self.edges)}, at a right angle"
+            )
             raise ValueError(f"{needed}; got {given}")
         if corners is not None and len(corners) != len(self.edges):
-            raise ValueError(f"corners_m must be one corner for each of {len(self.edges)} edges, got {len(corners)}")
+            raise ValueError(
+                f"corners_m must be one corner for each of {len(self.edges)} edges, got "
+                f"{len(corners)}"
+            )
         if corners is not None and np.ptp(corners, axis=0).max() > LONGEST_BOARD:
-            raise ValueError(f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}")
+            raise ValueError(
+                f"the board is {np.ptp(corners, axis=0).max():g} m large: {MILLIMETRES}"
+            )
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
@@ -435,7 +400,12 @@ def board_to_json(board):
     """A board as it stands in session.json."""
     p = board.pattern
     grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
-    named = {"name": board.name, "edges": board.edges, "features": board.features, "corners_m": board.corners}
+    named = {
+        "name": board.name,
+        "edges": board.edges,
+        "features": board.features,
+        "corners_m": board.corners,
+    }
     return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
 
 
@@ -449,7 +419,10 @@ StatedBoard = Annotated[BoardStated, AfterValidator(BoardStated.made)]
 
 View = Annotated[
     tuple[Angle, Angle],
-    refused(lambda v: not v[0] < v[1] <= v[0] + 2 * math.pi + 1e-9, "two ascending bearings within a turn are needed"),
+    refused(
+        lambda v: not v[0] < v[1] <= v[0] + 2 * math.pi + 1e-9,
+        "two ascending bearings within a turn are needed",
+    ),
 ]
 Endless = Annotated[
     float,  # null in the file where there is no limit
@@ -461,7 +434,8 @@ Endless = Annotated[
 
 @dataclass(frozen=True)
 class LrfInfo:
-    """What is known about the laser range finder, read from the device or its data, never from the model's name.
+    """What is known about the laser range finder, read from the device or its data, never from the
+    model's name.
 
     Attributes
     ----------
@@ -477,7 +451,8 @@ class LrfInfo:
     max_range : float
         Metres.
     spot_exit, spot_divergence : float or None
-        Diameter of the spot at the window (metres) and its growth with distance (radians), from the maker's data sheet.
+        Diameter of the spot at the window (metres) and its growth with distance (radians), from the
+        maker's data sheet.
     systematic_error : float or None
         Largest offset of all ranges that the maker admits, metres.
     """
@@ -491,18 +466,24 @@ class LrfInfo:
     max_range: Annotated[Endless, Field(alias="max_range_m")] = math.inf
     systematic_error: Annotated[Positive | None, Field(alias="systematic_error_m")] = None
     spot_exit: Annotated[FiniteFloat | None, Field(alias="spot_exit_m", gt=0, le=0.2)] = None
-    spot_divergence: Annotated[FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)] = None
+    spot_divergence: Annotated[
+        FiniteFloat | None, Field(alias="spot_divergence_rad", ge=0, lt=0.2)
+    ] = None
 
     @property
     def admitted_offset(self):
-        """The largest range offset that the maker admits, metres: stated, or known of the model, or assumed."""
+        """The largest range offset that the maker admits, metres: stated, or known of the model, or
+        assumed.
+        """
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
         if not known or self.range_resolution > 0.005:
             known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
         return self.systematic_error or known[0]
 
     def spot_radius(self, distance):
-        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not stated."""
+        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not
+        stated.
+        """
         if self.spot_exit is None:
             return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
         return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
@@ -537,7 +518,8 @@ class CameraInfo:
     model : CameraModel or None
         None where the intrinsics have to be estimated from the session's own images.
     guess : RigidTransform or None
-        Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform').
+        Roughly measured ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount
+        'platform').
     """
 
     name: Annotated[Name, Field(exclude=True)]  # the key of the object in the file
@@ -545,7 +527,10 @@ class CameraInfo:
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1), AfterValidator(_few_pixels)]
     model: Annotated[
-        LensStated | None, AfterValidator(_lens), PlainSerializer(model_to_json), Field(alias="intrinsics")
+        LensStated | None,
+        AfterValidator(_lens),
+        PlainSerializer(model_to_json),
+        Field(alias="intrinsics"),
     ] = None
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
@@ -558,7 +543,10 @@ def camera_to_json(camera):
 def _with_names(cameras):
     if not isinstance(cameras, dict) or len(cameras) > MOST_CAMERAS:
         raise ValueError(f"an object of at most {MOST_CAMERAS} cameras is needed")
-    return {name: camera | {"name": name} if isinstance(camera, dict) else camera for name, camera in cameras.items()}
+    return {
+        name: camera | {"name": name} if isinstance(camera, dict) else camera
+        for name, camera in cameras.items()
+    }
 
 
 class PlatformStated(BaseModel):
@@ -586,13 +574,17 @@ class SessionStated(BaseModel):
     simulated: bool
     board: StatedBoard
     rig: RigStated
-    placements: Annotated[tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)]
+    placements: Annotated[
+        tuple[Whole, ...], Field(fail_fast=True), refused(lambda p: len(set(p)) < len(p), TWICE)
+    ]
     reference: dict = {}
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
 
 
 def parse_session(data, kind=SessionStated):
-    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for a wrong one."""
+    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for
+    a wrong one.
+    """
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")

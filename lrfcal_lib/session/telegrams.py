@@ -1,4 +1,6 @@
-"""Scan lines out of recorded telegrams: lrf/telegrams.bin (bytes as the device sent them) and lrf/index.csv."""
+"""Scan lines out of recorded telegrams: lrf/telegrams.bin (bytes as the device sent them) and
+lrf/index.csv.
+"""
 
 import math
 from dataclasses import dataclass
@@ -13,10 +15,9 @@ from lrfcal_lib.session.stated import (
     check_amount,
     naming,
     read_bytes,
-    read_table,
     short,
-    whole_number,
 )
+from lrfcal_lib.session.tables import read_table, whole_number
 
 INDEX_COLUMNS = ("t_s", "offset", "length", "placement", "pitch_deg")
 OUTCOMES = ("scan", "other", "wrong CRC", "truncated")
@@ -48,22 +49,21 @@ class TelegramLog:
     values: np.ndarray
     problems: tuple[str, ...]
 
-    def report(self, placement=None):
-        """What became of the recorded telegrams, of a placement or (by default) of all.
+    def report(self):
+        """What became of the recorded telegrams.
 
         Returns
         -------
         dict
-            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by reason;
-            'wrong_crc_offsets' : tuple of int.
+            'telegrams' : int; 'outcomes' : dict of str to int; 'values' : dict of str to int, by
+            reason; 'wrong_crc_offsets' : tuple of int.
         """
-        rows = np.ones(len(self.offset), bool) if placement is None else self.placement == placement
-        outcomes = np.bincount(self.outcome[rows], minlength=len(OUTCOMES)).tolist()
+        outcomes = np.bincount(self.outcome, minlength=len(OUTCOMES)).tolist()
         return {
-            "telegrams": int(rows.sum()),
+            "telegrams": len(self.offset),
             "outcomes": dict(zip(OUTCOMES, outcomes, strict=True)),
-            "values": dict(zip(codec.REASONS, self.values[rows].sum(axis=0).tolist(), strict=True)),
-            "wrong_crc_offsets": tuple(self.offset[rows & (self.outcome == WRONG)].tolist()),
+            "values": dict(zip(codec.REASONS, self.values.sum(axis=0).tolist(), strict=True)),
+            "wrong_crc_offsets": tuple(self.offset[self.outcome == WRONG].tolist()),
         }
 
 
@@ -86,22 +86,28 @@ def read_telegrams(file, within):
     Raises
     ------
     SessionError
-        If the two files do not belong together, or scans of different variants of the device are mixed.
+        If the two files do not belong together, or scans of different variants of the device are
+        mixed.
 
     Notes
     -----
-    The measuring mode, which a scan does not tell, is taken from the last status or configuration reply before it.
-    Interlaced scans of 1 deg steps, each turned by quarters of a degree, become one line where they follow each other
-    in rising order at the same placement and the same pitch; a part that is missing stays NaN. What the device calls
-    larger than its maximum is NaN here.
+    The measuring mode, which a scan does not tell, is taken from the last status or configuration
+    reply before it. Interlaced scans of 1 deg steps, each turned by quarters of a degree, become
+    one line where they follow each other in rising order at the same placement and the same pitch;
+    a part that is missing stays NaN. What the device calls larger than its maximum is NaN here.
     """
     data = np.frombuffer(read_bytes(file, within), np.uint8)
     path = file.with_name("index.csv")
     rows, torn = read_table(path, INDEX_COLUMNS, within, torn=True)
     with naming(path):
-        index = {key: np.array([float(row[key] or "nan") for row in rows]) for key in ("t_s", "pitch_deg")}
+        index = {
+            key: np.array([float(row[key] or "nan") for row in rows])
+            for key in ("t_s", "pitch_deg")
+        }
         for key in INDEX_COLUMNS[1:4]:
-            numbers = [whole_number(row[key], f"line {n}: {key}") for n, row in enumerate(rows, start=2)]
+            numbers = [
+                whole_number(row[key], f"line {n}: {key}") for n, row in enumerate(rows, start=2)
+            ]
             index[key] = np.array(numbers, int)
         _check_index(index, len(data), file)
         check_amount(len(data) // 2)
@@ -145,21 +151,35 @@ def _sound(data, offset, length):
 
 
 def _check_index(index, size, file):
-    """Telegrams lie one after the other in the file, but for a last one that is cut off, and every scan has a pitch."""
+    """Telegrams lie one after the other in the file, but for a last one that is cut off, and every
+    scan has a pitch.
+    """
     offset, length, placement = (index[key] for key in ("offset", "length", "placement"))
     ends = offset + length
     if len(offset) == 0:
-        raise ValueError(f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded")
-    bad = (length < 7) | (length > LONGEST) | (offset > LARGEST_FILE) | (offset < np.r_[0, ends[:-1]])
+        raise ValueError(
+            f"no telegram in the index, {size} bytes in {file.name}: nothing was recorded"
+        )
+    bad = (
+        (length < 7) | (length > LONGEST) | (offset > LARGEST_FILE) | (offset < np.r_[0, ends[:-1]])
+    )
     for row in np.flatnonzero(bad)[:1]:
         where = _place(index, row)
-        raise ValueError(f"{where}: telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file")
+        raise ValueError(
+            f"{where}: telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file"
+        )
     for row in np.flatnonzero(ends[:-1] > size)[:1]:
         where = _place(index, row)
-        raise ValueError(f"{where}, but {file.name} has {size} bytes: restore it, or remove the rows from this one on")
+        raise ValueError(
+            f"{where}, but {file.name} has {size} bytes: restore it, or remove the rows from "
+            "this one on"
+        )
     for row in np.flatnonzero((placement >= 0) & ~np.isfinite(index["pitch_deg"]))[:1]:
         where = f"{_place(index, row)}, placement {placement[row]}"
-        raise ValueError(f"{where}: pitch_deg is missing; fill it in, or empty the placement to ignore the telegram")
+        raise ValueError(
+            f"{where}: pitch_deg is missing; fill it in, or empty the placement to ignore the "
+            "telegram"
+        )
 
 
 def _place(index, row):
@@ -167,12 +187,16 @@ def _place(index, row):
 
 
 def _modes(data, index, rows):
-    """Measuring mode at each row: that of the last telegram that states it, before it the first. Also notes."""
+    """Measuring mode at each row: that of the last telegram that states it, before it the first.
+    Also notes.
+    """
     codes = data[index["offset"][rows] + 4]
     telling = []
     stated = []
     notes = []
-    for row in np.flatnonzero(np.isin(codes, (codec.CONFIGURATION, codec.CONFIGURED, codec.STATUS))):
+    for row in np.flatnonzero(
+        np.isin(codes, (codec.CONFIGURATION, codec.CONFIGURED, codec.STATUS))
+    ):
         first = index["offset"][rows[row]]
         end = first + index["length"][rows[row]]
         parse = codec.parse_configuration
@@ -184,7 +208,10 @@ def _modes(data, index, rows):
         except codec.TelegramError as error:
             notes.append(f"{_place(index, rows[row])}: {error}; ignored")
     if not telling:
-        notes.append(f"no status or configuration telegram: measuring mode {FACTORY_MODE:02X} (factory) assumed")
+        notes.append(
+            f"no status or configuration telegram: measuring mode {FACTORY_MODE:02X} (factory) "
+            "assumed"
+        )
         return np.full(len(rows), FACTORY_MODE), notes
     last = np.searchsorted(telling, np.arange(len(rows)), side="right") - 1
     return np.array(stated)[np.maximum(last, 0)], notes
@@ -201,7 +228,9 @@ def _lines(groups, index):
         number[rows] = group.telegram_index
     rows = np.flatnonzero((partial > -2) & (index["placement"] >= 0))
     if not len(rows):
-        raise ValueError("no telegram with a scan belongs to a placement: was the device streaming?")
+        raise ValueError(
+            "no telegram with a scan belongs to a placement: was the device streaming?"
+        )
     line = np.full(n, -1)
     line[rows] = np.cumsum(np.r_[True, ~_goes_on(partial[rows], number[rows], index, rows)]) - 1
     kinds = set()
@@ -210,7 +239,9 @@ def _lines(groups, index):
             kinds.add((group.words.shape[1], int(part)))
     if len(kinds) > 1 and any(part < 0 for _, part in kinds):
         counts = short(sorted({values for values, _ in kinds}))
-        raise ValueError(f"scans of {counts} values are mixed: a session holds one variant, split the recording")
+        raise ValueError(
+            f"scans of {counts} values are mixed: a session holds one variant, split the recording"
+        )
     quarters = np.unique(np.concatenate([codec.scan_quarters(*kind) for kind in sorted(kinds)]))
     lines = line.max() + 1
     check_amount(lines * len(quarters))
@@ -224,7 +255,11 @@ def _lines(groups, index):
     first = rows[np.searchsorted(line[rows], np.arange(len(ranges)))]
     time = np.bincount(line[rows], index["t_s"][rows]) / np.bincount(line[rows])
     scans = {"ranges": ranges, "bearings": np.radians(quarters / 4), "time_s": time}
-    return {**scans, "placement": index["placement"][first], "pitch": np.radians(index["pitch_deg"][first])}
+    return {
+        **scans,
+        "placement": index["placement"][first],
+        "pitch": np.radians(index["pitch_deg"][first]),
+    }
 
 
 def _goes_on(partial, number, index, rows):
@@ -242,15 +277,26 @@ def _damage(index, outcome, size):
     last = int(index["offset"][-1])
     tail = size - last - int(index["length"][-1])
     if wrong:
-        yield f"{len(wrong)} of {len(outcome)} telegrams have a wrong CRC, left out, at {short(wrong)}"
+        yield (
+            f"{len(wrong)} of {len(outcome)} telegrams have a wrong CRC, left out, at "
+            f"{short(wrong)}"
+        )
     if outcome[-1] == TRUNCATED:
-        yield f"the last telegram, at {last}, is cut off after {max(size - last, 0)} bytes and left out"
+        yield (
+            f"the last telegram, at {last}, is cut off after {max(size - last, 0)} bytes and "
+            "left out"
+        )
     if tail > 0:
-        yield f"{tail} bytes after the last telegram in index.csv are not used; was the recording killed?"
+        yield (
+            f"{tail} bytes after the last telegram in index.csv are not used; was the recording "
+            "killed?"
+        )
 
 
 def other_than_stated(scans, lrf):
-    """Sentences about telegrams that cover other bearings than the LrfInfo; they count, not session.json."""
+    """Sentences about telegrams that cover other bearings than the LrfInfo; they count, not
+    session.json.
+    """
     bearings = scans["bearings"]
     step = (bearings[-1] - bearings[0]) / (len(bearings) - 1)
     seen = (*np.degrees(bearings[[0, -1]]), math.degrees(step))

@@ -12,14 +12,19 @@ import cv2
 import numpy as np
 
 from lrfcal_lib.session import read, stated
+from lrfcal_lib.session.images import JPEG, check_image_size
+from lrfcal_lib.session.lock import LOCK, alone
 from lrfcal_lib.session.stated import SessionError, naming, short
+from lrfcal_lib.session.tables import read_table
 from lrfcal_lib.session.telegrams import INDEX_COLUMNS
 
 RECORDINGS = "LRFCAL_RECORDINGS"  # environment variable: where new recordings go
 
 
 def new_session_path():
-    """Where a recording goes whose place nobody names: a folder by date in ``~/lrfcal_sessions``."""
+    """Where a recording goes whose place nobody names: a folder by date in
+    ``~/lrfcal_sessions``.
+    """
     folder = os.environ.get(RECORDINGS) or Path.home() / "lrfcal_sessions"
     return Path(folder, time.strftime("%Y-%m-%d_%H%M%S")).absolute()
 
@@ -27,9 +32,10 @@ def new_session_path():
 class SessionWriter:
     """Write a session so that a crash loses at most what was being written.
 
-    Every sweep and every image is on the disk (fsync) before the table that names it is; at the end, or by
-    ``finish(path)`` after an interruption, sweeps become the one scans.npz.
-    A session holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never both.
+    Every sweep and every image is on the disk (fsync) before the table that names it is; at the
+    end, or by ``finish(path)`` after an interruption, sweeps become the one scans.npz. A session
+    holds scan lines (:meth:`add_sweep`) or the telegrams of a device (:meth:`add_telegrams`), never
+    both.
 
     Parameters
     ----------
@@ -45,7 +51,8 @@ class SessionWriter:
 
     Examples
     --------
-    ``with SessionWriter(path, board, lrf, cameras) as writer: writer.add_sweep(1, ranges, bearings, pitch)``
+    ``with SessionWriter(path, board, lrf, cameras) as writer: writer.add_sweep(1, ranges, bearings,
+    pitch)``
     """
 
     def __init__(
@@ -92,16 +99,20 @@ class SessionWriter:
         with naming(self.path):
             stated.parse_session(json.loads(json.dumps(self.data)))
         if self.path.exists() and not self.path.is_dir():
-            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+            raise SessionError(
+                f"{self.path}: exists already; choose another name or remove it first"
+            )
         self.path.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            stack.enter_context(stated.alone(self.path))
+            stack.enter_context(alone(self.path))
             self._create()
             self._held = stack.pop_all()
 
     def _create(self):
-        if set(os.listdir(self.path)) - {stated.LOCK}:
-            raise SessionError(f"{self.path}: exists already; choose another name or remove it first")
+        if set(os.listdir(self.path)) - {LOCK}:
+            raise SessionError(
+                f"{self.path}: exists already; choose another name or remove it first"
+            )
         self._make_folders()
         self._state()
 
@@ -144,7 +155,8 @@ class SessionWriter:
             self._state(placements=sorted([*self.data["placements"], int(placement)]))
 
     def add_sweep(self, placement, ranges, bearings, pitch, time_s=None, intensities=None):
-        """Append the scan lines of a placement; SessionError for wrong shapes or units, or other bearings than before.
+        """Append the scan lines of a placement; SessionError for wrong shapes or units, or other
+        bearings than before.
 
         Parameters
         ----------
@@ -157,7 +169,10 @@ class SessionWriter:
         time_s, intensities : array_like, shapes (L,) and (L, B), optional
         """
         if self.telegrams.exists():
-            raise SessionError(f"{self.telegrams}: the session records telegrams: add_telegrams, or begin another one")
+            raise SessionError(
+                f"{self.telegrams}: the session records telegrams: add_telegrams, or begin "
+                "another one"
+            )
         ranges = np.array(ranges, float, ndmin=2)
         bearings = np.asarray(bearings, float)
         if time_s is None:
@@ -170,7 +185,9 @@ class SessionWriter:
         with naming(f"{self.path}: placement {placement}"):
             scans = read.check_scans(scans | {"placement": np.full(len(ranges), placement)})
             if self.bearings is not None and not np.array_equal(self.bearings, bearings):
-                raise ValueError("the bearings differ from those of the sweeps before: one grid a session")
+                raise ValueError(
+                    "the bearings differ from those of the sweeps before: one grid a session"
+                )
         self.bearings = bearings
         self.parts += 1
         self._write(f"lrf/part_{self.parts:06d}.npz", scans)
@@ -191,15 +208,17 @@ class SessionWriter:
         Raises
         ------
         SessionError
-            For other numbers of pitches or times, pitches that are no radians, something that is no bytes, or a session
-            that has scan lines already.
+            For other numbers of pitches or times, pitches that are no radians, something that is no
+            bytes, or a session that has scan lines already.
         """
         with naming(f"{self.path}: placement {placement}"):
             lengths = [len(raw) for raw in telegrams]
             pitch = np.broadcast_to(np.asarray(pitch, float), len(telegrams))
             time_s = np.broadcast_to(np.asarray(time_s, float), len(telegrams))
             if placement >= 0 and not np.all(np.abs(pitch) <= np.pi + 1e-6):
-                raise ValueError(f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed")
+                raise ValueError(
+                    f"a pitch is {np.abs(pitch).max():g}: finite radians, -pi to pi, are needed"
+                )
             if self.parts:
                 raise ValueError("the session has scan lines: add_sweep, or begin another one")
         self._begin_table("lrf/index.csv", INDEX_COLUMNS)
@@ -213,11 +232,15 @@ class SessionWriter:
             rows.append([cell(at), begin, length, number, cell(angle)])
         self._append_rows("lrf/index.csv", rows)
 
-    def add_image(self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"):
-        """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red pixels (h, w, 3).
+    def add_image(
+        self, camera, image, placement=-1, *, pitch=math.nan, time_s=math.nan, purpose="board"
+    ):
+        """Append an image: a PNG or JPEG file or its bytes, kept as they are, or blue-green-red
+        pixels (h, w, 3).
 
-        The placement is -1 for none, pitch in radians, purpose one of 'board', 'intrinsics', 'scene'. SessionError for
-        an unknown camera or purpose, or an image of another size than the camera's.
+        The placement is -1 for none, pitch in radians, purpose one of 'board', 'intrinsics',
+        'scene'. SessionError for an unknown camera or purpose, or an image of another size than the
+        camera's.
         """
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
@@ -230,9 +253,9 @@ class SessionWriter:
         else:
             what = image
             content = stated.read_bytes(image)
-        read.check_image_size(what, content, self.cameras[camera])
+        check_image_size(what, content, self.cameras[camera])
         self.shots[camera] += 1
-        kind = "jpg" if content.startswith(read.JPEG) else "png"
+        kind = "jpg" if content.startswith(JPEG) else "png"
         name = f"images/{camera}/{self.shots[camera]:04d}.{kind}"
         self._write(name, content)
         self._note_placement(placement)
@@ -242,15 +265,18 @@ class SessionWriter:
 
 
 def finish(path):
-    """Complete a session whose recording was interrupted: one scans.npz out of its sweeps, whole rows in its tables.
+    """Complete a session whose recording was interrupted: one scans.npz out of its sweeps, whole
+    rows in its tables.
 
     SessionError if there is no sweep, or one of them is damaged, or somebody records this session.
     """
     try:
-        with stated.alone(path):
+        with alone(path):
             complete(Path(path))
     except FileNotFoundError as error:
-        raise SessionError(f"{path}: {error.filename} is missing; is this the folder of a session?") from error
+        raise SessionError(
+            f"{path}: {error.filename} is missing; is this the folder of a session?"
+        ) from error
 
 
 def complete(path):
@@ -260,7 +286,9 @@ def complete(path):
         return
     parts = read.parts_of(path)
     if not parts:
-        raise SessionError(f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already")
+        raise SessionError(
+            f"{path}: no sweep to finish in lrf/; nothing was recorded, or it is finished already"
+        )
     sweeps = [read.read_npz(part, path) for part in parts]
     scans = {}
     for key in sweeps[0]:
@@ -299,7 +327,9 @@ def number_cell(placement):
 
 
 def write_file(file, content, within):
-    """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is whole or not there."""
+    """Write a file of a session (text or arrays, say) under another name, fsync, rename: it is
+    whole or not there.
+    """
     draft = stated.checked(file, within).with_name(file.name + ".draft")
     draft.unlink(missing_ok=True)
     with stated.opened(draft, within, os.O_WRONLY | os.O_CREAT | os.O_EXCL) as stream:
@@ -329,8 +359,8 @@ def whole(path):
     Yields
     ------
     Path
-        Beside it, to write to: a file there takes the place of `path` at the end. Where anything is raised before, it
-        goes, and what was at `path` stays.
+        Beside it, to write to: a file there takes the place of `path` at the end. Where anything is
+        raised before, it goes, and what was at `path` stays.
 
     Raises
     ------
@@ -338,7 +368,8 @@ def whole(path):
         With the file and the remedy, where it cannot be written.
     """
     path = Path(path)
-    draft = path.with_name(f".{os.getpid()}-{path.name}")  # keeps the suffix, by which writers choose a format
+    # keeps the suffix, by which writers choose a format
+    draft = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -358,10 +389,13 @@ def not_written(error):
 
 
 def append_file(file, content, within):
-    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk all or nothing."""
+    """Append to a file, which is on the disk afterwards; where the new part begins. On a full disk
+    all or nothing.
+    """
     left = memoryview(content.encode() if isinstance(content, str) else content)
     with stated.opened(file, within, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as stream:
-        handle, begin = stream.fileno(), os.fstat(stream.fileno()).st_size
+        handle = stream.fileno()
+        begin = os.fstat(stream.fileno()).st_size
         try:
             while left:
                 left = left[os.write(handle, left) :]
@@ -376,14 +410,18 @@ def append_file(file, content, within):
 class SessionRecorder(SessionWriter):
     """A :class:`SessionWriter` for recordings that may be interrupted and go on later (`resume`).
 
-    While a session is recorded, session.json has the key ``unfinished``: the placement that was begun. The placement
-    joins ``placements`` when it is finished, in one renaming of session.json; until then every reader leaves it out.
-    Going on, or dropping a placement, marks what was recorded of it: its rows of index.csv lose their placement, its
-    images get the purpose 'dropped'. No telegram and no image is deleted. SessionError if there is a session already,
-    or one that states another board or rig, where it goes on.
+    While a session is recorded, session.json has the key ``unfinished``: the placement that was
+    begun. The placement joins ``placements`` when it is finished, in one renaming of session.json;
+    until then every reader leaves it out. Going on, or dropping a placement, marks what was
+    recorded of it: its rows of index.csv lose their placement, its images get the purpose
+    'dropped'. No telegram and no image is deleted. SessionError if there is a session already, or
+    one that states another board or rig, where it goes on.
     """
 
-    finished = property(lambda self: tuple(self.data["placements"]), doc="Numbers of the finished placements.")
+    @property
+    def finished(self):
+        """Numbers of the finished placements."""
+        return tuple(self.data["placements"])
 
     def __init__(self, *rig, resume=False, **about):
         self._resume = resume
@@ -392,8 +430,12 @@ class SessionRecorder(SessionWriter):
     def _create(self):
         if self._resume and os.path.lexists(self.path / "session.json"):
             self._go_on()
-        elif set(os.listdir(self.path)) - {"session.json.draft", stated.LOCK}:
-            hint = "choose another name" if self._resume else "record with --resume to go on with it, or choose another"
+        elif set(os.listdir(self.path)) - {"session.json.draft", LOCK}:
+            hint = (
+                "choose another name"
+                if self._resume
+                else "record with --resume to go on with it, or choose another"
+            )
             raise SessionError(f"{self.path}: exists already; {hint}")
         else:  # session.json comes first, so that a recording killed at once can go on
             self._state(unfinished=[])
@@ -401,7 +443,9 @@ class SessionRecorder(SessionWriter):
         self._begin_table("platform.csv", read.PLATFORM_COLUMNS)
 
     def _go_on(self):
-        """Take over what an earlier recording wrote, without the placement that it did not finish."""
+        """Take over what an earlier recording wrote, without the placement that it did
+        not finish.
+        """
         mine = json.loads(json.dumps(self.data))
         data = stated.read_json(self.path / "session.json", self.path)
         with naming(self.path / "session.json"):
@@ -434,11 +478,16 @@ class SessionRecorder(SessionWriter):
         for other in self.data["unfinished"]:
             self.drop_placement(other)
         if placement in self.finished or placement < 0:
-            raise SessionError(f"{self.path}: placement {placement} cannot be begun; recorded: {short(self.finished)}")
+            raise SessionError(
+                f"{self.path}: placement {placement} cannot be begun; recorded: "
+                f"{short(self.finished)}"
+            )
         self._state(unfinished=[int(placement)])
 
     def finish_placement(self):
-        """State that the placement begun last is complete; from now on it is part of the session."""
+        """State that the placement begun last is complete; from now on it is part of the
+        session.
+        """
         self._state(placements=sorted([*self.finished, *self.data["unfinished"]]), unfinished=[])
 
     def drop_placement(self, placement):
@@ -447,13 +496,17 @@ class SessionRecorder(SessionWriter):
         SessionError if there is no such placement.
         """
         if placement not in {*self.finished, *self.data["unfinished"]}:
-            raise SessionError(f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}")
+            raise SessionError(
+                f"{self.path}: no placement {placement} to drop; recorded: {short(self.finished)}"
+            )
         self._state(placements=[p for p in self.finished if p != placement], unfinished=[placement])
         self._mark_dropped(placement)
         self._state(unfinished=[])
 
     def add_platform(self, rows):
-        """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN where unknown."""
+        """Append to the log of the platform: host time (s), commanded and measured pitch (rad), NaN
+        where unknown.
+        """
         cells = []
         for time_s, commanded, measured in rows:
             angles = [cell(math.degrees(angle)) for angle in (commanded, measured)]
@@ -477,7 +530,7 @@ class SessionRecorder(SessionWriter):
         counts = dict.fromkeys(self.cameras, 0)
         if not counts:
             return counts
-        for row in stated.read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
+        for row in read_table(self.path / "images.csv", read.IMAGE_COLUMNS, self.path)[0]:
             if row["camera"] in counts and row["purpose"] == purpose:
                 counts[row["camera"]] += 1
         return counts
@@ -494,7 +547,7 @@ class SessionRecorder(SessionWriter):
         """Write other values into the rows of a placement in a table, if there is one."""
         if not os.path.lexists(self.path / name):
             return
-        rows = stated.read_table(self.path / name, columns, self.path)[0]
+        rows = read_table(self.path / name, columns, self.path)[0]
         for row in rows:
             if row["placement"] == str(placement):
                 row.update(mark)

@@ -1,0 +1,57 @@
+"""One writer at a time for a session."""
+
+import fcntl
+import os
+import socket
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+
+from lrfcal_lib.session.stated import SessionError, opened
+
+LOCK = "writer.lock"
+
+
+@contextmanager
+def alone(path):
+    """Keep other writers out of a session as long as this lasts; a process that is killed lets go
+    of it as well.
+    """
+    file = Path(path) / LOCK
+    with ExitStack() as stack:
+        stream = stack.enter_context(_locked(file, path))
+        while not _still_there(file, stream):  # its holder removed the file after we had opened it
+            stack.close()
+            stream = stack.enter_context(_locked(file, path))
+        stream.truncate()
+        stream.write(
+            f"process {os.getpid()} on {socket.gethostname()} since "
+            f"{datetime.now():%Y-%m-%d %H:%M}".encode()
+        )
+        stream.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # gone with its session?
+                os.unlink(file)
+
+
+def _locked(file, path):
+    """The open lock of a session, which nobody else holds."""
+    stream = opened(file, path, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with stream:
+            holder = stream.read(200).decode(errors="replace") or "another process"
+        remedy = "end that first, or choose another one"
+        raise SessionError(f"{path}: {holder} writes this session: {remedy}") from None
+    return stream
+
+
+def _still_there(file, stream):
+    """Whether an open file is the one that has this name now."""
+    try:
+        return os.path.samestat(os.fstat(stream.fileno()), os.lstat(file))
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,53 @@
+"""Tables of a session: CSV files with given columns."""
+
+import csv
+
+from lrfcal_lib.session.stated import LARGEST_TEXT, SPLIT, SessionError, read_bytes, reading
+
+MOST_ROWS = 200_000
+WHOLE_COLUMNS = ("placement", "offset", "length")  # of tables, which hold whole numbers
+
+
+def read_table(file, columns, within, torn=False):
+    """Rows of a CSV file as dicts, and whether one was left out; the columns must be exactly
+    `columns`.
+
+    With `torn`, a last row without its line end (cut off by a crash) is left out.
+    """
+    data = read_bytes(file, within, LARGEST_TEXT)
+    with reading(file, "not a CSV file in UTF-8 ({})"):
+        text = data.decode()
+        cut = torn and not text.endswith("\n")
+        lines = (text.rpartition("\n")[0] if cut else text).splitlines()
+        if len(lines) > MOST_ROWS:
+            raise SessionError(f"{file}: {len(lines)} lines, more than {MOST_ROWS}; {SPLIT}")
+        rows = list(csv.reader(lines))
+    if not rows or tuple(rows[0]) != columns:
+        got = ", ".join(rows[0]) if rows else "an empty file"
+        if rows and tuple(rows[0]) == ("", *columns):
+            got = (
+                "a first column without a name: write the table without row numbers (index=False "
+                "in pandas)"
+            )
+        raise SessionError(f"{file}: columns must be {', '.join(columns)}; got {got}")
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(columns):
+            raise SessionError(
+                f"{file} line {number}: {len(row)} values for {len(columns)} columns; truncated?"
+            )
+    whole = [key in WHOLE_COLUMNS for key in columns]
+    rows = [map(_without_point, row, whole) for row in rows[1:]]
+    return [dict(zip(columns, row, strict=True)) for row in rows], cut
+
+
+def _without_point(cell, whole):
+    """A cell of a table: 1.0, as programs write whole numbers beside empty cells, is 1."""
+    return cell.removesuffix(".0") if whole else cell
+
+
+def whole_number(text, name):
+    """A whole number in a table, -1 where the cell is empty; ValueError in words for other text."""
+    try:
+        return int(text or -1)
+    except ValueError:
+        raise ValueError(f"{name} is '{text}': a whole number is needed") from None
