@@ -32,6 +32,7 @@ from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
+from lrfcal_lib.preprocess.survey import survey, views_of
 from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_stream
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
@@ -48,6 +49,7 @@ TINY = {  # for the test, which only asks whether everything is written
     "repeats": 1, "trials": 2, "placements": (10,), "joint": 10, "points": 10_000, "growth": (1_000,),
     "telegrams": 100, "session": None, "pixels": 2_000_000,
 }  # fmt: skip
+SURVEYED = 4  # images in a survey
 CHUNK = 1_000_000  # points that growth hands over at a time
 SHORT = 0.02  # seconds
 ROWS = {"face": 40, "beam": 30}
@@ -226,18 +228,32 @@ def decoding(size):
 
 
 def images(size):
-    """A large image decoded and its chessboard found to a fraction of a pixel: nothing else does the same."""
-    file = next((ROOT / "data" / "sim_quick" / "images" / "left").iterdir())
-    small = cv2.imread(str(file))
+    """Large images decoded and the board found in them, as JPEG the corners alone: nothing else does the same."""
+    session = open_session(ROOT / "data" / "sim_quick")
+    record = session.images("left", purpose="board")[0]
+    model = views_of(session).models["left"]
+    board = session.board
+    small = session.read_image(record)
     times = np.sqrt(size["pixels"] / (small.shape[0] * small.shape[1]))
     large = cv2.resize(small, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
-    data = cv2.imencode(".jpg", large)[1]
-    finder = PatternFinder(open_session(ROOT / "data" / "sim_quick").board.pattern)
+    jpeg = cv2.imencode(".jpg", large)[1]
+    png = cv2.imencode(".png", large)[1]
+    finder = PatternFinder(board.pattern)
+    middle = (np.array([model.cx, model.cy]) + 0.5) * times - 0.5
+    lens = (model.fx * times, model.fy * times, *middle, model.distortion)
+    model = CameraModel(large.shape[1], large.shape[0], *lens)
 
     def find():
-        return finder(cv2.imdecode(data, cv2.IMREAD_COLOR))
+        return finder(cv2.imdecode(jpeg, cv2.IMREAD_COLOR))
 
-    yield "image_12mp_s", seconds(min(size["repeats"], 3), find)[0], None, "", np.nan, find
+    def see():
+        """The whole survey of one camera's images, of which all are the same."""
+        records = [replace(record, placement=i, file=Path(f"{i}.png")) for i in range(SURVEYED)]
+        return survey(records, lambda r: cv2.imdecode(png, cv2.IMREAD_COLOR), board, {"left": model})
+
+    repeats = min(size["repeats"], 3)
+    yield "image_12mp_s", seconds(repeats, find)[0], None, "", np.nan, find
+    yield "survey_12mp_png_s", seconds(repeats, see)[0] / SURVEYED, None, "", np.nan, see
 
 
 def commands(size):

@@ -19,6 +19,7 @@ from lrfcal_lib.preprocess import edges_in_image, intrinsics, prepared, survey
 from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
 from lrfcal_lib.preprocess.edges_in_image import picked_edge, refine_edge
 from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
+from lrfcal_lib.preprocess.kept_images import KeptImages
 from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,
     PatternNotFound,
@@ -250,6 +251,24 @@ def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
     large[1200:1680, 900:1540] = render(far)
     exact = on_board(far, PATTERN.points()[:, :2], project) + [900, 1200]
     assert np.abs(up_to_a_turn(find_pattern(large), exact)).max() < 0.2
+
+
+def test_an_image_is_decoded_once_and_kept_where_the_board_is():
+    pose = pose_of(at=(0.0, 0.0, 2.5))
+    picture = render(pose)
+    reads = []
+    kept = KeptImages(lambda r: reads.append(r) or picture, SHEET)
+    one, other = record("left", "a.png", 3), record("left", "b.png", 4)
+    kept.make_room([one, other], picture)
+    kept.keep(one, picture, on_board(pose, PATTERN.points()[:, :2], project))
+    image = kept.around_board(one)
+    assert reads == []
+    low = np.floor(on_board(pose, CORNERS, project).min(axis=0)).astype(int) - 40
+    high = np.ceil(on_board(pose, CORNERS, project).max(axis=0)).astype(int) + 40
+    board = np.s_[max(low[1], 0) : high[1], max(low[0], 0) : high[0]]
+    np.testing.assert_array_equal(image[board], picture[board])
+    assert np.any(image != picture)  # the rest is not kept
+    assert kept.around_board(other) is picture and reads == [other]
 
 
 def test_corners_run_clockwise_also_in_a_mirrored_image():

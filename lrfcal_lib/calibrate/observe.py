@@ -455,11 +455,14 @@ def rough_poses(prepared):
 def _causes(prepared, placement):
     """What may be wrong where the scan of a placement disagrees with all cameras: scan, or images."""
     causes = "another surface, mixed readings"
-    views = {camera: {placement: seen[placement]} for camera, seen in prepared.views.items() if placement in seen}
+    views = {
+        camera: {placement: seen[placement]}
+        for camera, seen in prepared.views.items()
+        if placement in seen
+    }
     if small_squares(views, prepared.board.pattern):
         causes += (
-            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be "
-            "biased"
+            f"; or the images: squares below {SMALL_SQUARE_PX:.0f} px, whose distance may be biased"
         )
     return causes
 

