@@ -83,7 +83,7 @@ def make_sessions(folder):
     bearings, pitch = np.radians(np.arange(60.0, 121.0)), np.radians([-1.0, 0.0, 1.0])
     with SessionWriter(folder / "scans", SQUARE, LRF, cameras, HEAD) as writer:
         for placement in (1, 2):
-            writer.add_sweep(placement, np.full((3, 61), 2.0), bearings, pitch, [0.0, 1, 2], np.ones((3, 61)))
+            writer.add_sweep(placement, np.full((3, 61), 1.9 + 0.1 * placement), bearings, pitch, [0.0, 1, 2], np.ones((3, 61)))
             writer.add_image("right", picture(placement), placement, pitch=0.1, time_s=placement)
         for view in range(3):
             writer.add_image("left", picture(3 + view), 1 + view % 2, pitch=0.1, purpose="intrinsics")

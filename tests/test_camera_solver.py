@@ -12,7 +12,13 @@ from synthetic import camera_case, camera_observations
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import line_block, plane_residuals_m
 from lrfcal_lib.model import observations
-from lrfcal_lib.model.geometry import DegenerateGeometry, move_pose, pose_array, pose_transform, transform_difference
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    move_pose,
+    pose_array,
+    pose_transform,
+    transform_difference,
+)
 from lrfcal_lib.solvers import METHODS, best_method, solve_camera, starting_transform
 from lrfcal_lib.solvers.lines import distance_block, point_block
 
@@ -133,9 +139,10 @@ def test_errors_agree_with_the_covariance(name):
     for _ in range(10):
         found = solve_camera(camera_observations(rng, rig, poses, noise=1.0), name, rig.T_camera_lrf)
         e = increment(found.transform, rig.T_camera_lrf)
-        known = found.trusted if name == "zhang_pless_printed" else found.covariance  # it takes boards as exact
+        known = found.trusted if name == "zhang_pless_printed" else found.covariance
         scores.append(e @ np.linalg.solve(known[:6, :6], e) / 6)
-    assert 0.6 < np.mean(scores) < 1.6
+    # it takes boards as exact: all it knows of their errors is the scatter of 12 placements (Hotelling: 11 / 4)
+    assert 0.6 < np.mean(scores) < (2.75 if name == "zhang_pless_printed" else 1.6)
 
 
 @pytest.mark.parametrize(

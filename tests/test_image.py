@@ -16,9 +16,21 @@ from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, prepared, survey
-from lrfcal_lib.preprocess.board_in_image import BoardView, mirrored_pose, order_scores, pose_with_edges, view_board
+from lrfcal_lib.preprocess.board_in_image import (
+    BoardView,
+    mirrored_pose,
+    order_scores,
+    pose_with_edges,
+    view_board,
+)
 from lrfcal_lib.preprocess.edges_in_image import picked_edge, refine_edge
-from lrfcal_lib.preprocess.intrinsics import adjust, board_pose, estimate_intrinsics, estimate_relief, first_pose
+from lrfcal_lib.preprocess.intrinsics import (
+    adjust,
+    board_pose,
+    estimate_intrinsics,
+    estimate_relief,
+    first_pose,
+)
 from lrfcal_lib.preprocess.kept_images import KeptImages
 from lrfcal_lib.preprocess.pattern_in_image import (
     PatternFinder,

@@ -16,7 +16,16 @@ from virtual import lms as lms_on
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.lms2xx import LMS2xx
 from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, transfer_s
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, PortError, Refused, WrongDevice, open_port, set_rate
+from lrfcal_lib.drivers.port import (
+    DeviceError,
+    LineLost,
+    NoReply,
+    PortError,
+    Refused,
+    WrongDevice,
+    open_port,
+    set_rate,
+)
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram

@@ -14,7 +14,15 @@ from shared import until
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.head import PanTilt
-from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply, OutOfRange, PortError, Refused, WrongDevice
+from lrfcal_lib.drivers.port import (
+    DeviceError,
+    LineLost,
+    NoReply,
+    OutOfRange,
+    PortError,
+    Refused,
+    WrongDevice,
+)
 from lrfcal_lib.drivers.rig_file import HeadSettings
 from lrfcal_lib.emulators.head import EmulatedHead, Head
 from lrfcal_lib.simulate.rig import Platform

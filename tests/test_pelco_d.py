@@ -7,7 +7,15 @@ import pytest
 from shared import STRINGS
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import DOWN, UP, Frame, encode_extended, encode_frame, split_frames, split_replies
+from lrfcal_lib.drivers.pelco_d import (
+    DOWN,
+    UP,
+    Frame,
+    encode_extended,
+    encode_frame,
+    split_frames,
+    split_replies,
+)
 
 # TF-0002, and what other senders put on the line
 FRAMES = {

@@ -9,7 +9,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import CORNERS, TRIANGLE, edge_sweeps, sweep_boards
 
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.geometry import DegenerateGeometry, axis_difference, head_from_axis, lrf_to_platform
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    axis_difference,
+    head_from_axis,
+    lrf_to_platform,
+)
 from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.solvers import platform
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors

@@ -10,7 +10,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.camera import CameraModel, project
 from lrfcal_lib.simulate import scene
 from lrfcal_lib.simulate.rig import printed_triangle
-from lrfcal_lib.simulate.scene import Exposure, Imager, Lights, Thing, World, chessboard, plain, polygon
+from lrfcal_lib.simulate.scene import (
+    Exposure,
+    Imager,
+    Lights,
+    Thing,
+    World,
+    chessboard,
+    plain,
+    polygon,
+)
 
 HERE = RigidTransform.identity()
 LENS = CameraModel(512, 384, 800.0, 798.0, 258.0, 189.0, np.array([-0.21, 0.09, 0.0006, -0.0004, 0.0]))

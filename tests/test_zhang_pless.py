@@ -8,7 +8,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_case, camera_observations, random_board_poses, random_rig
 
 from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m
-from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array, pose_transform, transform_difference
+from lrfcal_lib.model.geometry import (
+    DegenerateGeometry,
+    pose_array,
+    pose_transform,
+    transform_difference,
+)
 from lrfcal_lib.solvers import planes, solve_camera
 from lrfcal_lib.solvers.planes import (
     board_whitener,

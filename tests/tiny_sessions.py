@@ -10,7 +10,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from lrfcal_lib.model.board import Board, Chessboard
 from lrfcal_lib.model.camera import CameraModel, project, undistort
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.stated import (
+    CameraInfo,
+    LrfInfo,
+    board_to_json,
+    model_to_json,
+    transform_to_json,
+)
 from lrfcal_lib.session.write import SessionWriter
 from lrfcal_lib.simulate.draw import AHEAD
 

@@ -29,7 +29,13 @@ from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, pose_array
 from lrfcal_lib.session.read import open_session
-from lrfcal_lib.session.stated import CameraInfo, LrfInfo, board_to_json, model_to_json, transform_to_json
+from lrfcal_lib.session.stated import (
+    CameraInfo,
+    LrfInfo,
+    board_to_json,
+    model_to_json,
+    transform_to_json,
+)
 from lrfcal_lib.session.write import SessionWriter
 from lrfcal_lib.simulate.beam import LMS221, echo, measured, spot_pattern
 from lrfcal_lib.simulate.draw import AHEAD

@@ -453,7 +453,7 @@ def rough_poses(prepared):
 
 
 def _causes(prepared, placement):
-    """What may be wrong where the scan of a placement disagrees with all cameras: scan, or images."""
+    """What may be wrong where the scan of a placement disagrees with all cameras."""
     causes = "another surface, mixed readings"
     views = {
         camera: {placement: seen[placement]}

@@ -153,7 +153,7 @@ class NamedSide:
 
 
 def named_sides(prepared, placement, variant="half_step", stretch=0.0):
-    """Named sides of a placement of which the sweep shows at least some share: NamedSide one by one."""
+    """NamedSide one by one, of a placement; those of which the sweep shows a share at least."""
     along = prepared.edges[variant][placement]
     swept = prepared.swept[variant].get(placement)
     numbers = np.unique(along.side)

@@ -1,4 +1,4 @@
-"""Tables of the board's edges in the cloud: how far points of them are off, and how long they are."""
+"""Tables of the board's edges in the cloud: how far their points are off, how long they are."""
 
 from contextlib import suppress
 from itertools import product

@@ -1,4 +1,6 @@
-"""The part of every image around the board, kept while several passes look at it: decoding costs most."""
+"""The part of every image around the board, kept while several passes look at it: decoding
+costs most.
+"""
 
 from mmap import mmap
 
@@ -71,7 +73,10 @@ class KeptImages:
         return self.memory[start : start + int(np.prod(shape))].reshape(shape)
 
     def _around(self, corners):
-        """Left, top, right and bottom of what may be looked at; all of an image where that is behind the camera."""
+        """Left, top, right and bottom of what may be looked at.
+
+        All of an image where that is behind the camera.
+        """
         height, width = self.shape[:2]
         homography = cv2.findHomography(self.grid, np.asarray(corners, float))[0]
         ends = np.column_stack([self.rectangle, np.ones(4)]) @ homography.T
@@ -87,7 +92,8 @@ class KeptImages:
 
 
 def _grids(board):
-    """Corners of the pattern (k, 2) on the board, and of a rectangle about its middle that holds all of the board.
+    """Corners of the pattern (k, 2) on the board, and of a rectangle about its middle that holds
+    all of the board.
 
     It holds the board also where the pattern is turned by 180 deg or mirrored (a square one also on
     its side): which order its corners are found in does not matter.

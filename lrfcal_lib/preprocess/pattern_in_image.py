@@ -1,4 +1,6 @@
-"""The printed chessboard in an image: its inner corners at sub-pixel level, and the orders that they may have."""
+"""The printed chessboard in an image: its inner corners at sub-pixel level, and the orders that
+they may have.
+"""
 
 from dataclasses import dataclass
 
@@ -6,8 +8,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
-SEARCH_PIXELS = 1.5e6  # larger images are searched at a reduced size: the detectors' time grows with it
-REACH = 0.5  # half window around a corner, squares; the outermost squares of some boards are cut to 0.65
+# larger images are searched at a reduced size: the detectors' time grows with it
+SEARCH_PIXELS = 1.5e6
+# half window around a corner, squares; the outermost squares of some boards are cut to 0.65
+REACH = 0.5
 WIDEST_WINDOW_PX = 15.0  # half window where squares are large, but for
 LEAST_REACH = 0.25  # of a square: large images are soft
 MARGIN = 2.0  # half windows around the corners: what a turned window and its blur reach
@@ -17,8 +21,10 @@ SMOOTH_ENOUGH_PX = 0.07  # corners that fit a smooth grid this well need no seco
 BEYOND = 0.3  # where to look outside the outermost corners, squares
 LEAST_BEYOND = 0.25  # contrast there, a share of that inside
 SMALL_SQUARE_PX = 9.0  # below it the blur of a corner reaches into the squares behind
-# Scale common to all images of rendered boards with cut outermost squares. Blurred by 0.5 to 1 px it
-# is right within 0.02 % from 5 px a square on; blurred by 1.5 px it is 0.09 % too large at 6 px (along
+# Scale common to all images of rendered boards with cut outermost squares. Blurred by 0.5 to 1 px
+# it
+# is right within 0.02 % from 5 px a square on; blurred by 1.5 px it is 0.09 % too large at 6 px
+# (along
 # the shorter side), 0.02 % at 8 px, below 0.003 % at 10 px. Nobody states the blur of an image.
 SCALE_ERROR = 0.001
 SCALE_ERROR_AT_PX = 6.0
@@ -36,7 +42,8 @@ class Look:
     settled_px: float  # no corner moves by more: done
 
 
-# rough corners need the wide blur; the narrow one then has less noise (0.20 px in lms400_zed, not 0.25)
+# rough corners need the wide blur; the narrow one then has less noise (0.20 px in lms400_zed, not
+# 0.25)
 ROUGHLY = Look(blur=0.3, samples=9, order=1, settled_px=0.05)
 FINELY = Look(blur=0.1, samples=17, order=3, settled_px=1e-3)
 
@@ -49,12 +56,15 @@ def grey(image):
     """8-bit grey image of a grey or BGR image; ValueError for anything else."""
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(f"an image must be uint8 of shape (h, w) or (h, w, 3), got {image.dtype} {image.shape}")
+        raise ValueError(
+            f"an image must be uint8 of shape (h, w) or (h, w, 3), got {image.dtype} {image.shape}"
+        )
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 class PatternFinder:
-    """Finds the inner corners of a chessboard in images; remembers whether its squares are dark on light.
+    """Finds the inner corners of a chessboard in images; remembers whether its squares are dark on
+    light.
 
     Parameters
     ----------
@@ -62,10 +72,11 @@ class PatternFinder:
 
     Notes
     -----
-    OpenCV's detectors only tell where the corners roughly are: the classic one (it wants dark squares
-    on a light ground, so it looks into the negative as well), then the sector-based one (Duda and
-    Frese 2018), whose own corners are off by up to 0.6 % in scale below 30 px a square. Both look at
-    a reduced picture where the image is large; :func:`refine_corners` looks at the image itself.
+    OpenCV's detectors only tell where the corners roughly are: the classic one (it wants dark
+    squares on a light ground, so it looks into the negative as well), then the sector-based one
+    (Duda and Frese 2018), whose own corners are off by up to 0.6 % in scale below 30 px a square.
+    Both look at a reduced picture where the image is large; :func:`refine_corners` looks at the
+    image itself.
     """
 
     def __init__(self, pattern):
@@ -75,9 +86,9 @@ class PatternFinder:
     def __call__(self, image):
         """Recorded pixels of the corners, (columns * rows, 2), x right, y down on the printed side.
 
-        A chessboard looks the same when it is turned by 180 deg: :mod:`lrfcal_lib.preprocess.survey`
-        resolves that. PatternNotFound where no detector finds all corners; ValueError for what is no
-        8-bit image.
+        A chessboard looks the same when it is turned by 180 deg:
+        :mod:`lrfcal_lib.preprocess.survey` resolves that. PatternNotFound where no detector finds
+        all corners; ValueError for what is no 8-bit image.
         """
         picture = grey(image)
         corners = self._in_reduced(picture)
@@ -92,7 +103,9 @@ class PatternFinder:
         return (grid if clockwise else grid[::-1]).reshape(-1, 2)
 
     def _in_reduced(self, picture):
-        """Corners of a large picture by way of a reduced one, or without it where that shows none."""
+        """Corners of a large picture by way of a reduced one, or without it where that shows
+        none.
+        """
         times = int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS)))
         if times <= 1:
             return self._search(picture)
@@ -119,7 +132,9 @@ class PatternFinder:
         return corners
 
     def _classic(self, picture):
-        """Rough corners by the classic detector, the last successful of picture and negative first."""
+        """Rough corners by the classic detector, the last successful of picture and negative
+        first.
+        """
         for negative in self.negatives:
             rough = classic(picture, self.size, negative)
             if rough is not None:
@@ -146,14 +161,18 @@ def classic(picture, size, negative):
 def sectors(picture, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
     """Rough corners (n, 2) by OpenCV's sector-based detector; None if there are none.
 
-    The flags make it look at a picture of twice the size, for small squares, at four times the time.
+    The flags make it look at a picture of twice the size, for small squares, at four times the
+    time.
     """
     found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
     return corners.reshape(-1, 2).astype(float) if found else None
 
 
 def _smoothest(picture, size, rough):
-    """Refined corners; from sectors near by where rough corners were too far off for their windows."""
+    """Refined corners.
+
+    From sectors near by where rough corners were too far off for their windows.
+    """
     refined = refine_corners(picture, rough, size)
     noise = grid_noise(refined, size)
     if noise < SMOOTH_ENOUGH_PX:
@@ -174,7 +193,8 @@ def _smoothest(picture, size, rough):
 def grid_noise(corners, size):
     """Root mean square distance of a chessboard's corners (row by row) from a smooth grid, pixels.
 
-    Smooth are a homography and polynomials of third order (second below 16 corners): lens distortion, a bent sheet.
+    Smooth are a homography and polynomials of third order (second below 16 corners): lens
+    distortion, a bent sheet.
     """
     y, x = (np.mgrid[: size[1], : size[0]] / (max(size) - 1) * 2 - 1).reshape(2, -1)
     order = 3 if len(x) >= 16 else 2
@@ -189,9 +209,9 @@ def refine_corners(picture, corners, size):
     """Corners of a chessboard: the points about which the picture is symmetric.
 
     A window turned by 180 deg about a corner looks the same, however blurred. The least squares of
-    what differs need no edges, which `cv2.cornerSubPix` does: small squares have none. The window is
-    that of the printed squares, not of the pixels, and falls to zero half a square away: it never
-    reaches the rim of the pattern, however the outermost squares are cut.
+    what differs need no edges, which `cv2.cornerSubPix` does: small squares have none. The window
+    is that of the printed squares, not of the pixels, and falls to zero half a square away: it
+    never reaches the rim of the pattern, however the outermost squares are cut.
 
     Parameters
     ----------
@@ -266,9 +286,12 @@ def sample(picture, places, order=1):
 
 
 def square_axes(corners, size):
-    """Sides of the squares around every corner, (n, 2, 2): columns along a row and along a column."""
+    """Sides of the squares around every corner, (n, 2, 2): columns along a row and along a
+    column.
+    """
     grid = np.reshape(corners, (size[1], size[0], 2))
-    along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
+    along = np.gradient(grid, axis=1)
+    across = np.gradient(grid, axis=0)
     return np.stack([along, across], axis=-1).reshape(-1, 2, 2)
 
 
@@ -284,19 +307,25 @@ def square_px(corners, size):
 
 
 def scale_error(side_px):
-    """Standard deviation of the scale of corners refined on squares of a side in pixels, a share."""
+    """Standard deviation of the scale of corners refined on squares of a side in pixels, a
+    share.
+    """
     error = SCALE_ERROR * (SCALE_ERROR_AT_PX / side_px) ** SCALE_ERROR_POWER
     return float(np.fmin(error, LARGEST_SCALE_ERROR))  # the largest for a side that is NaN
 
 
 def _ends_in_squares(picture, corners, size):
-    """Whether squares alternate outside the outermost corners: not where a pattern that is cut is taken a row off."""
+    """Whether squares alternate outside the outermost corners: not where a pattern that is cut
+    is taken a row off.
+    """
     grid = corners.reshape(size[1], size[0], 2)
     for side in (np.rot90(grid, k) for k in range(4)):
         edge, inner = (side[:2, 1:] + side[:2, :-1]) / 2
         both = np.array([edge - BEYOND * (inner - edge), edge + BEYOND * (inner - edge)])
         seen = np.all((both >= 0) & (both <= np.array(picture.shape[::-1]) - 1), axis=(0, 2))
-        outside, inside = cv2.remap(picture, both.astype(np.float32), None, cv2.INTER_LINEAR)[:, seen].astype(float)
+        outside, inside = cv2.remap(picture, both.astype(np.float32), None, cv2.INTER_LINEAR)[
+            :, seen
+        ].astype(float)
         sign = np.resize([1.0, -1.0], len(seen))[seen]
         sign -= sign.mean() if len(sign) else 0.0
         if (sign @ outside) * (sign @ inside) > -LEAST_BEYOND * (sign @ inside) ** 2:
@@ -305,10 +334,12 @@ def _ends_in_squares(picture, corners, size):
 
 
 def pattern_orders(pattern, mirrored=True):
-    """Orders of the corners that a chessboard allows, shape (n, k): as indices into the corners that were found.
+    """Orders of the corners that a chessboard allows, shape (n, k): as indices into the corners
+    that were found.
 
-    The first is the given one, the second the pattern turned by 180 deg; square patterns may also stand on their side.
-    With `mirrored`, the second half counts from the last row: x to y turns the other way (frames whose z points out).
+    The first is the given one, the second the pattern turned by 180 deg; square patterns may also
+    stand on their side. With `mirrored`, the second half counts from the last row: x to y turns the
+    other way (frames whose z points out).
     """
     grid = np.arange(pattern.rows * pattern.columns).reshape(pattern.rows, pattern.columns)
     orders = [grid, grid[::-1, ::-1]]
@@ -321,15 +352,18 @@ def pattern_orders(pattern, mirrored=True):
 
 
 def spread_views(pixels, count):
-    """Which views of a pattern (their corners, k by 2) differ most: at most `count` places, the largest view first.
+    """Which views of a pattern (their corners, k by 2) differ most: at most `count` places, the
+    largest view first.
 
     Each of the others is the one whose corners lie farthest from those of all views before it.
     """
     if not len(pixels):
         return []
     pixels = np.asarray(pixels, float)
-    flat, size = pixels.reshape(len(pixels), -1), np.ptp(pixels, axis=1).prod(axis=1)
-    chosen, nearest = [], np.full(len(flat), np.inf)
+    flat = pixels.reshape(len(pixels), -1)
+    size = np.ptp(pixels, axis=1).prod(axis=1)
+    chosen = []
+    nearest = np.full(len(flat), np.inf)
     while len(chosen) < min(count, len(flat)):
         chosen.append(int(np.argmax(nearest if chosen else size)))
         nearest = np.minimum(nearest, np.linalg.norm(flat - flat[chosen[-1]], axis=1))

@@ -69,7 +69,8 @@ class Prepared:
     ----------
     session : Session
     board : Board
-        With its outline, measured from the images where the session does not state it and they show it.
+        With its outline, measured from the images where the session does not state it and they show
+        it.
     scans : dict of int to BoardScan
         By placement.
     edges : dict of str to dict of int to ScanEdges
@@ -78,10 +79,12 @@ class Prepared:
         The same across the scan lines, where the sweep enters and leaves the board.
     models : dict of str to CameraModel
     views : dict of str to dict of int to BoardView
-        By camera and placement; where there are images at several pitch angles, the one with most edges.
+        By camera and placement; where there are images at several pitch angles, the one with most
+        edges.
     outline : Outline or None
     relief : ndarray or None
-        Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the images).
+        Heights of the pattern's corners over the sheet's mean plane, metres (see the survey of the
+        images).
     names : dict of int to dict of int to str
         Board edge of each side of the scan, by placement and side number.
     dropped : dict of int to dict of int to DroppedSide
@@ -107,7 +110,8 @@ class Prepared:
     problems: dict = field(default_factory=dict)
 
     def seen(self, camera, placement):
-        """The board in an image of a placement, and the very image that it was found in: there may be several.
+        """The board in an image of a placement, and the very image that it was found in: there may
+        be several.
 
         Parameters
         ----------
@@ -126,20 +130,33 @@ class Prepared:
 
 @cached
 def prepare_scans(session):
-    """The board in every sweep of a session, and its edge points in both variants; a Prepared without cameras."""
-    scans, problems = {}, {}
-    edges, swept = {variant: {} for variant in VARIANTS}, {variant: {} for variant in VARIANTS}
+    """The board in every sweep of a session, and its edge points in both variants.
+
+    A Prepared without cameras.
+    """
+    scans = {}
+    problems = {}
+    edges = {variant: {} for variant in VARIANTS}
+    swept = {variant: {} for variant in VARIANTS}
 
     def look(placement):
         """The board and its crossings in one sweep, or in words why not."""
         try:
-            scan = find_board(session.sweep(placement), session.board, session.T_head_lrf, session.lrf)
+            scan = find_board(
+                session.sweep(placement), session.board, session.T_head_lrf, session.lrf
+            )
         except (BoardNotFound, SessionError) as error:
             return str(error)
         along, sides = crossings(scan)
-        return scan, along, crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {}
+        return (
+            scan,
+            along,
+            crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {},
+        )
 
-    for placement, seen in zip(session.board_placements, spread(look, session.board_placements), strict=True):
+    for placement, seen in zip(
+        session.board_placements, spread(look, session.board_placements), strict=True
+    ):
         if isinstance(seen, str):
             problems[placement] = seen
             continue
@@ -151,18 +168,29 @@ def prepare_scans(session):
 
 
 def prepare_images(prepared):
-    """The same with the board in every image of the session, the cameras' intrinsics, and the board's outline."""
+    """The same with the board in every image of the session, the cameras' intrinsics, and the
+    board's outline.
+    """
     try:
         seen = views_of(prepared.session, one_per_placement=True)
     except DegenerateGeometry as error:  # what remains is a session without cameras
-        return replace(prepared, problems=prepared.problems | {"images": f"no image can be used: {error}"})
+        return replace(
+            prepared, problems=prepared.problems | {"images": f"no image can be used: {error}"}
+        )
     # an image that belongs to no placement is left out
-    views = {c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
-             for c, own in seen.views.items()}  # fmt: skip
+    views = {
+        c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
+        for c, own in seen.views.items()
+    }
     problems = dict(prepared.problems)
     if seen.unseen:
         problems["outline"] = f"faces of the board only: {seen.unseen}"
     for camera, words in small_squares(views, seen.board.pattern).items():
         problems[f"squares {camera}"] = words
-    found = {"board": seen.board, "outline": seen.outline, "relief": seen.relief, "problems": problems}
+    found = {
+        "board": seen.board,
+        "outline": seen.outline,
+        "relief": seen.relief,
+        "problems": problems,
+    }
     return replace(prepared, models=seen.models, views=views, **found)

@@ -392,12 +392,12 @@ def without_lost_placements(obs):
     np.add.at(count, (obs.beam_placement[obs.beam_hit], obs.beam_edge[obs.beam_hit]), 1)
     crossed = np.sum(count >= FEWEST_ANGLE_POINTS, axis=1)
     lost = (crossed < 2) & ~np.isin(np.arange(len(crossed)), obs.view_placement)
-    words = {
-        int(
-            p
-        ): f"placement {p}: no image shows the board and scans cross {n} edges, two needed; left out"
-        for p, n in zip(obs.placements[lost], crossed[lost], strict=True)
-    }
+    words = {}
+    for placement, n in zip(obs.placements[lost].tolist(), crossed[lost], strict=True):
+        words[placement] = (
+            f"placement {placement}: no image shows the board and scans cross {n} edges, two needed; "
+            "left out"
+        )
     if lost.all():
         raise DegenerateGeometry("; ".join(words.values()))
     return obs.select(obs.placements[~lost]), words
