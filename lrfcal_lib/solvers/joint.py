@@ -395,8 +395,8 @@ def without_lost_placements(obs):
     words = {}
     for placement, n in zip(obs.placements[lost].tolist(), crossed[lost], strict=True):
         words[placement] = (
-            f"placement {placement}: no image shows the board and scans cross {n} edges, two needed; "
-            "left out"
+            f"placement {placement}: no image shows the board and scans cross {n} edges, "
+            "two needed; left out"
         )
     if lost.all():
         raise DegenerateGeometry("; ".join(words.values()))
