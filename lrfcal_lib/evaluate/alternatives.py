@@ -334,24 +334,29 @@ def _certain(doubt, stated):
     return doubt.exceeds(ASKED) and abs(doubt.value) > stated[doubt.kind].worth
 
 
-def not_an_offset(solution, stated=ALTERNATIVES):
+def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     """The Doubt about bearings where they explain the data far better than the range offset found
     does, or None.
 
     Both stretch the cloud sideways, so that each can stand for the other; bearings are asked with
-    the offset held.
+    the offset held. Where both are free, what the data say of bearings must not contradict it.
     """
     offset = solution.sensor["range_offset"]
     sigma = solution.sigma.get("range_offset")
-    if sigma is not None:
-        square = (offset / sigma) ** 2
-        best = weigh(solution, HELD, stated)[0] if square > ASKED**2 else None
-        asked = best and best.ratio > max(square / AS_GOOD, INSTEAD**2) and best.kind == "bearings"
-        if asked and (best.moved > MOVED or _certain(best, stated)):
-            return replace(
-                best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
-            )
-    return None
+    if sigma is None or abs(offset) < ASKED * sigma:
+        return None
+    best = weigh(solution, HELD, stated)[0]
+    far_better = best.ratio > max((offset / sigma) ** 2 / AS_GOOD, INSTEAD**2)
+    if best.kind != "bearings" or not far_better:
+        return None
+    for free in weigh(solution, admitted_offset, stated):
+        if free.kind == "bearings" and abs(best.value - free.value) > ASKED * free.sigma:
+            return None
+    if best.moved < MOVED and not _certain(best, stated):
+        return None
+    return replace(
+        best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
+    )
 
 
 def plausible(solution):

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
+from scipy.special import fdtri
 
 from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
@@ -31,7 +32,10 @@ MISREAD = 0.005  # metres; what is misread lies off by more than that
 GOOD = 0.05  # metres; boards and scans that belong together lie nearer than that
 AS_GOOD = 2.0  # times the miss of the best reading: another one that may be meant as well
 POINTS = 60  # of a placement's face
+CHANCE = 0.9999  # a reading that fits better by chance alone does so less often than once in 10 000
 LOOKED_AT = 4  # placements in which a board is searched for again
+PLANE = 3  # numbers of a plane
+POSE = 6  # numbers of a camera's pose
 HALF = 0.6745  # standard deviations of normal noise that half of all values stay below
 LEAST_MISS = 0.001  # metres; paper is no flatter
 MOST_LOST = 8  # placements; where more are left out, something else is wrong
@@ -218,17 +222,28 @@ def misread_recording(prepared: Prepared) -> list[Fault]:
 
 @dataclass(frozen=True)
 class BoardMiss:
-    """How far scans lie off boards in images at a camera's best pose: metres, without noise."""
+    """How far scans lie off boards in images at a camera's best pose: metres, without noise.
+
+    `planes` is the number of placements that tell it.
+    """
 
     size: float
     transform: RigidTransform
+    planes: int
+
+    @property
+    def much_better(self):
+        """How many times smaller another miss has to be: few planes fit whatever is read."""
+        freedom = max(PLANE * self.planes - POSE, 1)
+        return max(BETTER, np.sqrt(fdtri(freedom, freedom, CHANCE)))
 
 
 def _fits(found, stated):
     """Whether the BoardMisses of all cameras are good, and far better than as stated."""
     if found.keys() != stated.keys():
         return False
-    return _worst(found) < GOOD and BETTER * _worst(found) < _worst(stated)
+    much_better = max(miss.much_better for miss in found.values())
+    return _worst(found) < GOOD and much_better * _worst(found) < _worst(stated)
 
 
 def _worst(misses):
@@ -250,7 +265,9 @@ def board_misses(prepared, reading):
                 for p in np.unique(obs.plane_placement)
             ]
             square = np.median(each) ** 2 - (HALF * reading.ranges * noise) ** 2
-            found[camera] = BoardMiss(float(np.sqrt(max(square, LEAST_MISS**2))), transform)
+            found[camera] = BoardMiss(
+                float(np.sqrt(max(square, LEAST_MISS**2))), transform, planes=len(each)
+            )
     return found
 
 

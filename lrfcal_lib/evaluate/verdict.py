@@ -523,7 +523,7 @@ def _asked(joint):
     admitted = joint.prepared.session.lrf.admitted_offset
     # a spot that is no evenly lit disc looks like one of another size, which does no harm
     asked = doubtful(joint.solution, admitted, stated, faint=("spot",))
-    instead = not_an_offset(joint.solution, stated)
+    instead = not_an_offset(joint.solution, admitted, stated)
     return [instead] if instead and (not asked or asked[0].kind == instead.kind) else asked, instead
 
 
