@@ -377,7 +377,7 @@ def other_sense(joint):
     turned = replace(
         obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing
     )
-    with suppress(DegenerateGeometry):
+    with suppress(DegenerateGeometry, np.linalg.LinAlgError):  # so read it may fit nothing at all
         again = solve_joint(turned, required=False, **joint.settings)
         better = level / again.noise["face_scale"]
         if (
