@@ -216,7 +216,7 @@ def view_levels(data, block, hessian, gradient, shared):
     factor = 1.0
     for sigma in PITCH_LEVELS if data.on_head.any() else PITCH_LEVELS[:1]:
         for _ in range(SCALE_ROUNDS):
-            cost, factor = views.judged(sigma**2, factor, float(np.min(data.view_scale)))
+            cost, factor = views.judged(sigma**2, factor)
         trials.append((cost, factor))
     costs, factors = np.array(trials).T
     best = int(np.argmin(costs))
@@ -283,13 +283,13 @@ class ViewEvidence:
             shared=shared,
         )
 
-    def judged(self, variance, factor, scale):
+    def judged(self, variance, factor):
         """Negative log likelihood of an error of the pitch and a factor on the scale; a better
         factor.
 
         `variance` is that of the pitch at the scale that the views are whitened with (a factor
-        serves both). Of the factor one row more is believed, as large as stated: where nothing else
-        shows the scale, it is the stated one.
+        serves both). One row more is believed to be as large as the factor says: where nothing else
+        shows the scale, it stays as it is.
         """
         f2 = factor**2
         c = self.shared
@@ -323,7 +323,7 @@ class ViewEvidence:
             + np.log1p(variance * self.strength).sum()
             + weight
         )
-        better = (np.sum(left) + scale**-2) / (max(self.rows - taken / f2, 0.0) + 1)
+        better = (np.sum(left) + f2) / (max(self.rows - taken / f2, 0.0) + 1)
         return cost, float(np.sqrt(better))
 
 
