@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES
+from lrfcal_lib.judge.alternatives import ALTERNATIVES
 
 
 def scaled(**sizes):

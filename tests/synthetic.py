@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.uncertainty import beams_to
+from lrfcal_lib.judge.uncertainty import beams_to
 from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel, pinhole, project
 from lrfcal_lib.model.geometry import polar_to_points

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate import next_placement
 from lrfcal_lib.evaluate.monte_carlo import joint_truth
-from lrfcal_lib.evaluate.verdict import diagnose, verdict
+from lrfcal_lib.judge import next_placement
+from lrfcal_lib.judge.verdict import diagnose, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.simulate.draw import CORNERS, bench, board_poses, observe

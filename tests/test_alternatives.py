@@ -9,8 +9,8 @@ from joint_draws import draw, rng
 from scipy.spatial.transform import Rotation
 from shared import campaign
 
-from lrfcal_lib.evaluate import alternatives
-from lrfcal_lib.evaluate.alternatives import (
+from lrfcal_lib.judge import alternatives
+from lrfcal_lib.judge.alternatives import (
     ALTERNATIVES,
     HELD,
     alternatives_of,
@@ -18,7 +18,7 @@ from lrfcal_lib.evaluate.alternatives import (
     not_an_offset,
     weigh,
 )
-from lrfcal_lib.evaluate.diagnosis import lens_words
+from lrfcal_lib.judge.diagnosis import lens_words
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.model.geometry import hat
 from lrfcal_lib.preprocess.intrinsics import estimate_intrinsics, first_pose

@@ -9,9 +9,9 @@ from joint_draws import draw, rng
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
-from lrfcal_lib.evaluate.camera_changes import camera_changes, large_changes, likeliest_step
-from lrfcal_lib.evaluate.recording_faults import faults_of_changes
 from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.judge.camera_changes import camera_changes, large_changes, likeliest_step
+from lrfcal_lib.judge.recording_faults import faults_of_changes
 from lrfcal_lib.solvers.joint import solve_joint
 
 SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale")

@@ -12,11 +12,11 @@ from test_image import MODEL, PATTERN, pose_of, view_poses
 from test_platform import ROUGH, TRUTH, make, pairs, pitched
 from test_uncertainty import CAMERA, moved_points, random_chain
 
-from lrfcal_lib.evaluate.uncertainty import carried
 from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.fit.residuals import move_head, move_state, prior_terms
 from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.judge.uncertainty import carried
 from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.preprocess import intrinsics

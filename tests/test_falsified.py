@@ -11,8 +11,8 @@ from joint_draws import draw, rng
 from shared import DATA, campaign
 
 from lrfcal_lib.evaluate.monte_carlo import state_errors
-from lrfcal_lib.evaluate.verdict import contradicts_stated, diagnose, verdict
 from lrfcal_lib.fit.result import PlatformPrior
+from lrfcal_lib.judge.verdict import contradicts_stated, diagnose, verdict
 from lrfcal_lib.model.board import Chessboard
 from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.solvers.joint import solve_joint

@@ -5,9 +5,9 @@ from falsified_sessions import WAYS, copied
 from shared import DATA, campaign
 
 from lrfcal_lib.calibrate.pipeline import calibrate
-from lrfcal_lib.evaluate.alternatives import ALTERNATIVES
-from lrfcal_lib.evaluate.recording_faults import recording_faults
-from lrfcal_lib.evaluate.verdict import judge
+from lrfcal_lib.judge.alternatives import ALTERNATIVES
+from lrfcal_lib.judge.recording_faults import recording_faults
+from lrfcal_lib.judge.verdict import judge
 from lrfcal_lib.session.faults import faults_of_files
 from lrfcal_lib.session.read import open_session, validate
 from lrfcal_lib.session.stated import SessionError

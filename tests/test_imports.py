@@ -15,6 +15,7 @@ FLOORS = [
     {"fit", "session", "plots"},
     {"preprocess", "solvers", "drivers", "simulate"},
     {"calibrate", "emulators"},
+    {"judge"},
     {"evaluate"},
     {"acquire", "report"},
 ]

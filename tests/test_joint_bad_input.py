@@ -9,7 +9,7 @@ from joint_draws import MOUNTS, draw, rng, scores, square_per_number
 from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
-from lrfcal_lib.evaluate.uncertainty import projection_sigma
+from lrfcal_lib.judge.uncertainty import projection_sigma
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
 

@@ -9,7 +9,7 @@ from figure_checks import complaints
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.calibrate.outline import MeasuredBoard
-from lrfcal_lib.evaluate.uncertainty import SigmaMap
+from lrfcal_lib.judge.uncertainty import SigmaMap
 from lrfcal_lib.plots import recording, results, rig
 from lrfcal_lib.session.read import Sweep
 

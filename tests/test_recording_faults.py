@@ -7,7 +7,7 @@ from falsified_sessions import WAYS, copied
 from shared import QUICK, campaign
 
 from lrfcal_lib.calibrate.pipeline import prepare
-from lrfcal_lib.evaluate.recording_faults import (
+from lrfcal_lib.judge.recording_faults import (
     explained,
     hopeless,
     misread_recording,

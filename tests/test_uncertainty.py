@@ -6,8 +6,8 @@ import pytest
 from joint_draws import draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate import uncertainty
-from lrfcal_lib.evaluate.uncertainty import Chain, beams_to, point_sigma, projection_sigma
+from lrfcal_lib.judge import uncertainty
+from lrfcal_lib.judge.uncertainty import Chain, beams_to, point_sigma, projection_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.simulate.draw import ShotSetup

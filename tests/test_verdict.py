@@ -10,7 +10,7 @@ from shared import DATA, campaign
 
 from lrfcal_lib import __main__
 from lrfcal_lib.calibrate import pipeline
-from lrfcal_lib.evaluate import verdict
+from lrfcal_lib.judge import verdict
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.preprocess.prepared import DroppedSide
 from lrfcal_lib.session.read import open_session

@@ -24,7 +24,7 @@ from scipy.stats import norm
 from lrfcal_lib.calibrate import combined, pipeline
 from lrfcal_lib.evaluate.monte_carlo import joint_truth, state_errors
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.evaluate.verdict import judge
+from lrfcal_lib.judge.verdict import judge
 from lrfcal_lib.model.board import Board, Chessboard, triangle_board
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, pose_array

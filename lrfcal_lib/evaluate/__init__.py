@@ -1,1 +1,1 @@
-"""How good a calibration is: tables, uncertainty, the verdict, what to record next."""
+"""What a calibration comes to: tables, scenes, files, Monte-Carlo trials."""

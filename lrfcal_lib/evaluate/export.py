@@ -14,8 +14,8 @@ from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
-from lrfcal_lib.evaluate.verdict import NO, judge
 from lrfcal_lib.fit.residuals import edge_residuals_px
+from lrfcal_lib.judge.verdict import NO, judge
 from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened

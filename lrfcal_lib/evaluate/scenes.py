@@ -9,7 +9,7 @@ import numpy as np
 from lrfcal_lib.calibrate.pipeline import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
-from lrfcal_lib.evaluate.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
+from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_plane, tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED
 from lrfcal_lib.session.stated import read_json

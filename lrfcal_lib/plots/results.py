@@ -107,7 +107,7 @@ def method_bars(ax, table, column, label):
 def projection_map(ax, found, index=0, name=""):
     """Standard deviation over an image of where points of the LRF project, at a map's distance.
 
-    `found` is a SigmaMap of :func:`lrfcal_lib.evaluate.uncertainty.projection_sigma`; inf and NaN
+    `found` is a SigmaMap of :func:`lrfcal_lib.judge.uncertainty.projection_sigma`; inf and NaN
     stay white.
     """
     _sigma_map(ax, found, index, "px", name)

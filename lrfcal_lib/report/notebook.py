@@ -207,7 +207,7 @@ def verdict(title, sentences, record=None):
     """Print sentences, the most important one first, and put them on the first page of the report
     before all else.
 
-    With the record of a :class:`lrfcal_lib.evaluate.verdict.Verdict` its answer and expected errors
+    With the record of a :class:`lrfcal_lib.judge.verdict.Verdict` its answer and expected errors
     stand in front.
     """
     sentences = [f"{words[:1].upper()}{words[1:].removesuffix('.')}." for words in sentences]

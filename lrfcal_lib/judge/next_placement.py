@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.evaluate.uncertainty import beams_to, information, marginal
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
 from lrfcal_lib.fit.residuals import named_blocks, rays
 from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.judge.uncertainty import beams_to, information, marginal
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.solvers.joint import UNSEEN, WORDS

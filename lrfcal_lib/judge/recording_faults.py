@@ -11,8 +11,8 @@ from scipy.special import fdtri
 from lrfcal_lib.calibrate.observe import observe_joint
 from lrfcal_lib.calibrate.outline import platform_of
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
-from lrfcal_lib.evaluate.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.fit.residuals import plane_residuals_m
+from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
 from lrfcal_lib.model.observations import CameraObservations
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, face_points, find_board

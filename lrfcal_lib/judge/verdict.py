@@ -11,25 +11,26 @@ from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
-from lrfcal_lib.evaluate import alternatives
-from lrfcal_lib.evaluate.alternatives import (
+from lrfcal_lib.fit.result import AXIS_NAMES
+from lrfcal_lib.judge import alternatives
+from lrfcal_lib.judge.alternatives import (
     alternatives_of,
     doubtful,
     far_from_stated,
     not_an_offset,
     places_of_cameras,
 )
-from lrfcal_lib.evaluate.diagnosis import OTHER_SIZE, lens_words, problem_words
-from lrfcal_lib.evaluate.next_placement import (
+from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words, problem_words
+from lrfcal_lib.judge.next_placement import (
     Suggestion,
     brief,
     group_sigma,
     outline,
     suggest_placement,
 )
-from lrfcal_lib.evaluate.recording_faults import explained, recording_faults
-from lrfcal_lib.evaluate.tables import placements_table
-from lrfcal_lib.evaluate.uncertainty import (
+from lrfcal_lib.judge.placements import placements_table
+from lrfcal_lib.judge.recording_faults import explained, recording_faults
+from lrfcal_lib.judge.uncertainty import (
     COLUMNS,
     Chain,
     chain_of,
@@ -37,7 +38,6 @@ from lrfcal_lib.evaluate.uncertainty import (
     projection_sigma,
     range_noise,
 )
-from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
@@ -115,7 +115,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from
-        stated', 'sense', of :data:`lrfcal_lib.evaluate.alternatives.ALTERNATIVES`, 'not weighed',
+        stated', 'sense', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
         'convergence', 'unobservable', 'cameras', 'lens', 'second minimum', 'placements',
         'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error',
         'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
@@ -228,7 +228,7 @@ def verdict(solution, models, *, suggest=True, doubt=0.0, **options):
         By how much all ranges may be wrong beside what the estimate knows, metres; see
         :func:`contradicts_stated`.
     **options
-        Of :func:`lrfcal_lib.evaluate.next_placement.suggest_placement`.
+        Of :func:`lrfcal_lib.judge.next_placement.suggest_placement`.
     """
     chains = {camera: chain_of(solution, camera) for camera in (None, *solution.transforms)}
     pitch = np.concatenate([solution.observations.face_pitch, solution.observations.beam_pitch])
@@ -448,7 +448,7 @@ def contradicts_stated(joint):
     """Reasons to doubt what session.json states, and by how much all ranges are off if a size is
     wrong (metres).
 
-    What :mod:`lrfcal_lib.evaluate.alternatives` finds, a range offset that no maker admits, the
+    What :mod:`lrfcal_lib.judge.alternatives` finds, a range offset that no maker admits, the
     scale of the pitch.
     """
     lrf = joint.prepared.session.lrf
