@@ -18,7 +18,7 @@ export OMP_NUM_THREADS ?= 1
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
-	@echo "make test                    lint and run all tests, the notebooks included"
+	@echo "make test                    lint, check types and run all tests, the notebooks included"
 	@echo "make campaign                the many falsified and drawn recordings of which make test has a few"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
@@ -38,6 +38,7 @@ report: setup
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
+	$(RUN) -m mypy
 	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 campaign: setup
