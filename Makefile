@@ -35,14 +35,15 @@ setup:
 report: setup
 	@$(RUN) -m lrfcal_lib report $${SESSION:+"$$SESSION"}
 
+# nbval takes 3 s to load, in every process of a test run: tests/notebook_runs.py starts it itself
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m mypy
-	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
+	$(RUN) -m pytest -p no:nbval -n 3 --dist loadgroup --no-loadscope-reorder
 
 campaign: setup
-	$(RUN) -m pytest -n 3 -m campaign
+	$(RUN) -m pytest -p no:nbval -n 3 -m campaign
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
