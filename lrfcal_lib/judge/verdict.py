@@ -370,8 +370,12 @@ def _refusal(calibration):
     an answer.
     """
     prepared = calibration.prepared
-    problems = calibration.problems
-    why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
+    at_once = calibration.problem("joint")
+    if at_once is not None:
+        why = at_once.words
+    else:
+        words = dict.fromkeys(problem.words for problem in calibration.problems)
+        why = "; ".join([*words][:3])
     if not prepared.views:
         why = prepared.problems.get("images", "the session has no camera")
         why += "; the tilt axis is known from the edges in the sweeps" * bool(
@@ -390,7 +394,6 @@ def sight_of(prepared):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared = calibration.prepared
-    problems = calibration.problems
     joint = calibration.joint
     solved = {
         camera: found for (camera, name), found in calibration.solutions.items() if name == method
@@ -400,7 +403,9 @@ def _without_joint(calibration, method, doubt):
         if joint is None
         else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
     )
-    why = "; ".join(bad) or problems.get(("rig", "joint"), "another method was asked for")
+    at_once = calibration.problem("joint")
+    asked = "another method was asked for" if at_once is None else at_once.words
+    why = "; ".join(bad) or asked
     answer = NO if joint is None or not joint.solution.converged else CARE
     reasons = [Reason(answer, "handed over", f"the joint estimate is not handed over ({why})")]
     fewest = min(
@@ -410,21 +415,20 @@ def _without_joint(calibration, method, doubt):
         reasons.append(
             Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed")
         )
-    lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
-    reasons += [
-        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})")
-        for c, why in lost.items()
-    ]
+    for camera in prepared.views:
+        if camera not in solved:
+            problem = calibration.problem(method, camera)
+            why = "no result" if problem is None else problem.words
+            reasons.append(Reason(CARE, "cameras", f"camera '{camera}' is not handed over ({why})"))
     reasons += [
         Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
         for camera, found in solved.items()
         if found.rival is not None
     ]
-    unknown = calibration.platform.problems.get("combined")
-    if unknown and any(
-        np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()
-    ):
-        reasons.append(Reason(NO, "far from stated", unknown))
+    sweeps = any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values())
+    unknown = calibration.platform.problem("combined")
+    if unknown is not None and sweeps:
+        reasons.append(Reason(NO, "far from stated", unknown.words))
     # the range offset of the cloud may be what the maker admits
     platform = calibration.platform
     session = prepared.session
@@ -433,10 +437,11 @@ def _without_joint(calibration, method, doubt):
     admitted = session.lrf.admitted_offset
     head = pose_array(platform.transform("combined"))
     offset = np.diag([admitted**2, 0.0, 0.0])
-    sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
+    of_axis = platform.axes["combined"].covariance
+    sigma = block_diag(of_axis, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
-        sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
+        sigma = block_diag(of_axis, found.trusted[:6, :6], 0 * offset)
         on_head = session.cameras[camera].mount == "head"
         chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
