@@ -1,11 +1,14 @@
 """Naming sides, placements left out: the parts of the chain that need no recording."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lrfcal_lib.calibrate import pipeline
 from lrfcal_lib.calibrate.observe import nearest_edges
 from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import Prepared
 
 BOARD = triangle_board()
@@ -36,7 +39,9 @@ def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
     ready = Prepared(None, None, {1: "a", 2: "b"}, parts, parts, names={1: {}, 2: {}}, views={"left": {1: "v", 2: "v"}})
-    ready.problems.update({2: "off", "2 0": "a side, not a placement"})
+    whole = Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, "off", placement=2)
+    part = Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, "a side, not a placement", placement=1)
+    ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
     assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]
     assert list(left.views["left"]) == [1, 2]

@@ -214,16 +214,17 @@ def prepare(session: Session) -> Prepared:
     """
     ready = prepare_images(prepare_scans(session))
     names, dropped, problems = name_sides(ready)
-    problems = ready.problems | problems
+    problems = (*ready.problems, *problems)
     ready = without(replace(ready, names=names, dropped=dropped, problems=problems))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
 
 
 def without(prepared: Prepared) -> Prepared:
-    """Drop the placements that are named in `problems` from everything but the images."""
+    """Drop the placements that are left out from everything but the images."""
+    left_out = prepared.left_out
 
     def kept(by_placement):
-        return {p: part for p, part in by_placement.items() if p not in prepared.problems}
+        return {p: part for p, part in by_placement.items() if p not in left_out}
 
     return replace(
         prepared,
