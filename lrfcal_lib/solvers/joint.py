@@ -3,13 +3,14 @@ angles.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import minimise, solve
-from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, move_state
+from lrfcal_lib.fit.least_squares import eliminate, minimise, reduced_hessian, solve
+from lrfcal_lib.fit.residuals import SENSOR, SWEEPS, Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -31,6 +32,7 @@ from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
+SWEEP_HELD = (0.0, 0.0)
 START_STEPS = 8
 FIRST_STEPS = 60
 NOISE_ROUNDS = 10
@@ -56,6 +58,21 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_scale": "the scale of the pitch",
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
+
+
+@dataclass(frozen=True)
+class Score:
+    """What placements say about the shared unknowns, all that is their own eliminated.
+
+    Attributes
+    ----------
+    information : ndarray, shape (p, c, c)
+    gradient : ndarray, shape (p, c)
+        Of half the sum of squares.
+    """
+
+    information: np.ndarray
+    gradient: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -121,6 +138,25 @@ class JointSolution:
         return self.solution.state
 
     @property
+    def board_poses(self) -> np.ndarray:
+        """``T_platform_board`` in the order of the observations' placements, shape (p, 3, 4)."""
+        return self.state.boards
+
+    @property
+    def side_odds(self) -> np.ndarray:
+        """By how much the log odds of each side differ from the sensor's, shape (p, e)."""
+        return self.state.sides
+
+    @property
+    def sweep_sigma(self) -> tuple[float, float]:
+        """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
+        held.
+        """
+        number = SWEEPS[self.unknowns.sweep]
+        offset, stretch = (*self.data.sweep_sigma[:number], *SWEEP_HELD[number:])
+        return offset, stretch
+
+    @property
     def converged(self):
         """Whether the last step was small."""
         return bool(self.solution.converged)
@@ -147,19 +183,103 @@ class JointSolution:
         """
         return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
 
-    def residuals(self, group):
-        """Residuals in the order of the observations: 'face' (n, 1), metres, or 'view' (n, 6),
-        radians and metres.
+    @cached_property
+    def blocks(self):
+        """Residuals by name at the solution, dict of str to Block; for `solvers` only."""
+        return residuals.named_blocks(self.state, self.data, self.unknowns)
+
+    def residuals(self, group: str) -> np.ndarray:
+        """Residuals in the order of the observations.
+
+        Parameters
+        ----------
+        group : {'face', 'view'}
+
+        Returns
+        -------
+        ndarray, shape (m, 1) or (v, 6)
+            Of ranges to faces, metres, or of poses in images, radians and metres.
         """
+        if group not in self.blocks:
+            return np.zeros((0, {"face": 1, "view": 6}[group]))
         used = getattr(self.data, group)["used"]
+        return self._in_order(group, self.blocks[group].residuals.reshape(*used.shape, -1))
+
+    def face_points(self) -> np.ndarray:
+        """Measured points of the faces in the frames of their boards, metres, shape (m, 3)."""
+        return self._in_order("face", joint_noise.on_board(self.state, self.data))
+
+    def _in_order(self, group, padded):
+        """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
         placement = getattr(self.observations, f"{group}_placement")
-        out = np.zeros((len(placement), {"face": 1, "view": 6}[group]))
-        blocks = residuals.named_blocks(self.state, self.data, self.unknowns)
-        if group in blocks:
-            out[np.argsort(placement, kind="stable")] = blocks[group].residuals.reshape(
-                used.shape + (-1,)
-            )[used]
-        return out
+        rows = np.zeros((len(placement), padded.shape[-1]))
+        rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
+        return rows
+
+    def with_levels(self, **levels) -> "JointSolution":
+        """The same estimate at other noise levels, fields of JointData by name."""
+        return replace(self, data=replace(self.data, **levels))
+
+    def information(self) -> np.ndarray:
+        """What every placement says about the shared unknowns, shape (p, c, c)."""
+        return self.score().information
+
+    def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
+        """What every placement says about the shared unknowns and, tested, about one more.
+
+        Parameters
+        ----------
+        changed : JointObservations, optional
+            As they would be if the truth were off by one unknown more.
+        step : float
+            The value of that unknown there.
+        """
+        shared = self.unknowns.shared
+        after = {}
+        if changed is not None:
+            data = residuals.gather(changed, **self.data.levels)
+            after = residuals.named_blocks(self.state, data, self.unknowns)
+        hessian = gradient = 0.0
+        for name, block in self.blocks.items():
+            J = block.white_jacobian
+            if after:
+                by_one_more = (after[name].white - block.white) / step
+                J = np.insert(J, shared, by_one_more, axis=-1)
+            transposed = np.swapaxes(J, -1, -2)
+            hessian = hessian + transposed @ J
+            gradient = gradient + (transposed @ block.white[..., None])[..., 0]
+        information, score, _ = eliminate(hessian, gradient, shared + bool(after))
+        return Score(information, score)
+
+    def forecast(
+        self, observations: JointObservations, boards: np.ndarray, weight: np.ndarray, like: int
+    ) -> np.ndarray:
+        """Information on the shared unknowns from placements that were not recorded, (n, c, c).
+
+        Parameters
+        ----------
+        observations : JointObservations
+            Of n placements; measured ranges do not matter.
+        boards : ndarray, shape (n, 3, 4)
+            ``T_platform_board``.
+        weight : ndarray, shape (n,)
+            How many beams about the edges each one stands for.
+        like : int
+            Number of the placement whose backgrounds they have.
+        """
+        n = len(boards)
+        row = list(self.boards).index(like)
+        data = residuals.gather(observations, **self.data.levels)
+        data.beam["used"] = data.beam["used"] * weight[:, None]
+        state = replace(
+            self.state,
+            boards=boards,
+            sweeps=np.zeros((n, 2)),
+            sides=np.repeat(self.state.sides[[row]], n, axis=0),
+        )
+        blocks = residuals.named_blocks(state, data, self.unknowns).values()
+        hessian = sum(np.swapaxes(b.white_jacobian, -1, -2) @ b.white_jacobian for b in blocks)
+        return reduced_hessian(hessian, self.unknowns.shared)
 
     def columns(self, prefix):
         """Indices of the shared unknowns whose names begin so."""
