@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate import observe, pipeline
-from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array

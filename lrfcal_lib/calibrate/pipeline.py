@@ -17,7 +17,7 @@ from lrfcal_lib.calibrate.observe import (
     observe_joint,
     platform_observations,
 )
-from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
@@ -340,7 +340,7 @@ def combine(found, stated):
 def axis_from_chart(parameters):
     """The axis of two angles and two offsets.
 
-    Undoes :func:`lrfcal_lib.fit.residuals.chart_parameters`.
+    Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
     """
     out_of_plane, within, *offset = parameters
     direction = np.array([1.0, -np.tan(within), np.tan(out_of_plane)])

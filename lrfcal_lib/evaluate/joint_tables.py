@@ -5,7 +5,8 @@ import pandas as pd
 
 from lrfcal_lib.evaluate.tables import rms, unit_of
 from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
-from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift
+from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
+from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project

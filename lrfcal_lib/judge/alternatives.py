@@ -11,7 +11,6 @@ from itertools import permutations
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.fit.residuals import SENSOR
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     axis_difference,
@@ -19,6 +18,7 @@ from lrfcal_lib.model.geometry import (
     transform_difference,
 )
 from lrfcal_lib.solvers.joint import JointSolution, solve_joint
+from lrfcal_lib.solvers.joint_model import SENSOR
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit import residuals
+from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.edge_likelihood import disc_edge
 from lrfcal_lib.fit.least_squares import eliminate, minimise, reduced_hessian, solve
-from lrfcal_lib.fit.residuals import SENSOR, SWEEPS, Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -22,6 +22,16 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
+from lrfcal_lib.solvers.joint_model import (
+    SENSOR,
+    SWEEPS,
+    JointData,
+    JointState,
+    Unknowns,
+    gather,
+    move_state,
+)
+from lrfcal_lib.solvers.joint_residuals import joint_blocks, named_blocks
 from lrfcal_lib.solvers.joint_start import (
     FEWEST_ANGLE_POINTS,
     boards_in_images,
@@ -118,7 +128,7 @@ class JointSolution:
 
     solution: Solution
     observations: JointObservations
-    data: residuals.JointData
+    data: JointData
     unknowns: Unknowns
     T_head_lrf: RigidTransform
     transforms: dict
@@ -181,12 +191,12 @@ class JointSolution:
         """Where readings flip with a background as far and bright as the board, spot radii
         outside the edge.
         """
-        return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
+        return float(disc_edge(self.sensor["edge_log_odds"])[0])
 
     @cached_property
     def blocks(self):
         """Residuals by name at the solution, dict of str to Block; for `solvers` only."""
-        return residuals.named_blocks(self.state, self.data, self.unknowns)
+        return named_blocks(self.state, self.data, self.unknowns)
 
     def residuals(self, group: str) -> np.ndarray:
         """Residuals in the order of the observations.
@@ -237,8 +247,8 @@ class JointSolution:
         shared = self.unknowns.shared
         after = {}
         if changed is not None:
-            data = residuals.gather(changed, **self.data.levels)
-            after = residuals.named_blocks(self.state, data, self.unknowns)
+            data = gather(changed, **self.data.levels)
+            after = named_blocks(self.state, data, self.unknowns)
         hessian = gradient = 0.0
         for name, block in self.blocks.items():
             J = block.white_jacobian
@@ -269,7 +279,7 @@ class JointSolution:
         """
         n = len(boards)
         row = list(self.boards).index(like)
-        data = residuals.gather(observations, **self.data.levels)
+        data = gather(observations, **self.data.levels)
         data.beam["used"] = data.beam["used"] * weight[:, None]
         state = replace(
             self.state,
@@ -277,7 +287,7 @@ class JointSolution:
             sweeps=np.zeros((n, 2)),
             sides=np.repeat(self.state.sides[[row]], n, axis=0),
         )
-        blocks = residuals.named_blocks(state, data, self.unknowns).values()
+        blocks = named_blocks(state, data, self.unknowns).values()
         hessian = sum(np.swapaxes(b.white_jacobian, -1, -2) @ b.white_jacobian for b in blocks)
         return reduced_hessian(hessian, self.unknowns.shared)
 
@@ -356,7 +366,7 @@ class Start:
     """
 
     kept: JointObservations
-    state: residuals.JointState
+    state: JointState
     left_out: dict
     settled: bool
     badness: float
@@ -391,7 +401,7 @@ def solve_joint(
     axis : bool
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
-        Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero
+        Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_model.SENSOR`; others stay zero
         (softness: 0.2).
     sides : bool
         Every side of every placement deviates from the sensor's edge bias, because backgrounds are
@@ -746,7 +756,7 @@ def contradictions(state, data, unknowns):
     A wrong image raises the noise level of all images until ranges outvote it: images are compared
     with images.
     """
-    blocks = residuals.named_blocks(state, data, unknowns)
+    blocks = named_blocks(state, data, unknowns)
     several = data.view["used"].sum(axis=1) > 1
     found = np.stack(
         [joint_noise.misfits(blocks, data, groups) for groups in (("face", "view"), ("view",))],
@@ -831,9 +841,7 @@ def finished(obs, state, data, unknowns, excluded, required):
 
     def read(s):
         poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
-        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[
-            unknowns.mask
-        ]
+        return None, np.concatenate([chart_parameters(s.head), poses, s.sensor])[unknowns.mask]
 
     found = solve(
         lambda s: joint_blocks(s, data, unknowns),
@@ -857,7 +865,7 @@ def finished(obs, state, data, unknowns, excluded, required):
     found = replace(found, covariance=found.covariance + lens - twice, covariance_placements=spread)
     wider = replace(unknowns, sensor=tuple(dict.fromkeys((*unknowns.sensor, *joint_noise.TERMS))))
     state = found.state
-    blocks = residuals.named_blocks(found.state, data, wider)
+    blocks = named_blocks(found.state, data, wider)
     numbers = obs.placements.tolist()
     levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return JointSolution(
