@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from lrfcal_lib.calibrate.cameras import KnownAxis, calibrate_platform, combine, stated_covariance
-from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
 from lrfcal_lib.model.observations import PlatformObservations

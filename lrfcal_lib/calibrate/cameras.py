@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
@@ -254,7 +254,7 @@ def combine(estimated: KnownAxis, stated: KnownAxis) -> KnownAxis:
 def axis_from_chart(parameters: np.ndarray) -> geometry.TiltAxis:
     """The axis of two angles and two offsets.
 
-    Undoes :func:`lrfcal_lib.fit.residuals.chart_parameters`.
+    Undoes :func:`lrfcal_lib.fit.axis_chart.chart_parameters`.
     """
     out_of_plane, within, y, z = parameters * [1, 1, -1, -1]
     direction = np.array([1.0, -np.tan(within), np.tan(out_of_plane)])

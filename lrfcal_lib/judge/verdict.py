@@ -656,7 +656,7 @@ def diagnose(solution):
 def _of_placements(solution):
     """What is weak about the recorded poses: rows of whether, answer, kind and words."""
     obs = solution.observations
-    boards = solution.state.boards
+    boards = solution.board_poses
     n = len(solution.boards)
     head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
     turned = obs.view_pitch[head]
