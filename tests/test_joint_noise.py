@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from joint_draws import draw, rng
 
-from lrfcal_lib.fit.residuals import LEAST_STEP, SIDE_FREEDOM
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.joint_noise import side_level
+from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM
 
 FINE = np.radians(0.5)
 NARROW = (0.012, 0.0044)  # m at the window, rad: an LMS200
