@@ -15,6 +15,7 @@ from lrfcal_lib.calibrate import observe
 from lrfcal_lib.calibrate.pipeline import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
+from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, prepared, survey
 from lrfcal_lib.preprocess.board_in_image import (
     BoardView,
@@ -226,8 +227,9 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
     seen = survey.Survey(views, {}, None, SHEET)
     monkeypatch.setattr(prepared, "views_of", lambda session, **options: seen)
     problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
-    assert list(problems) == ["squares left"]
-    assert "placements 4), 7.0 px at least" in problems["squares left"]
+    (problem,) = problems
+    assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
+    assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith("camera 'left': squares")
 
 
 @pytest.mark.parametrize(("side", "named"), [(7.0, True), (12.0, False)])
@@ -237,9 +239,9 @@ def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypat
     monkeypatch.setattr(observe, "observe", lambda prepared, camera: data)
     monkeypatch.setattr(observe, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
     monkeypatch.setattr(observe, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
-    words = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1][4]
-    assert "another surface" in words
-    assert ("or the images: squares below 9 px" in words) == named
+    (problem,) = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
+    assert problem.placement == 4 and "another surface" in problem.words
+    assert ("or the images: squares below 9 px" in problem.words) == named
 
 
 def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):

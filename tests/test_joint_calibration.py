@@ -12,6 +12,7 @@ from lrfcal_lib.evaluate import edge_tables, joint_tables, scenes
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.session.read import open_session
 
 
@@ -146,8 +147,9 @@ def test_lengths_between_features_know_how_good_they_are(quick):
 
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
-    problems = {placement: "a dog ran through" for placement in quick.prepared.scans}
-    lost = pipeline.joint_or_words(replace(quick.prepared, problems=problems))
+    kind = ProblemKind.NO_BOARD
+    problems = [Problem(Stage.SCANS, kind, "a dog ran through", placement) for placement in quick.prepared.scans]
+    lost = pipeline.joint_or_words(replace(quick.prepared, problems=tuple(problems)))
     again = pipeline.with_joint(replace(quick, joint=None), lost)
     assert again.joint is None and "no placement" in again.problems["rig", "joint"]
     assert again.solutions is quick.solutions

@@ -1,6 +1,6 @@
 """Combining axes, naming sides, pitch noise: the parts of the chain that need no recording."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +12,7 @@ from lrfcal_lib.fit.residuals import chart_parameters
 from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.board import triangle_board
 from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import Prepared
 
 SIGMA = (np.radians(0.5), 0.010)
@@ -75,7 +76,9 @@ def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
     ready = Prepared(None, None, {1: "a", 2: "b"}, parts, parts, names={1: {}, 2: {}}, views={"left": {1: "v", 2: "v"}})
-    ready.problems.update({2: "off", "2 0": "a side, not a placement"})
+    whole = Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, "off", placement=2)
+    part = Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, "a side, not a placement", placement=1)
+    ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
     assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]
     assert list(left.views["left"]) == [1, 2]

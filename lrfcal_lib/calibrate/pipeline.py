@@ -221,16 +221,17 @@ def prepare(session):
     """
     ready = prepare_images(prepare_scans(session))
     names, dropped, problems = name_sides(ready)
-    problems = ready.problems | problems
+    problems = (*ready.problems, *problems)
     ready = without(replace(ready, names=names, dropped=dropped, problems=problems))
     return replace(ready, pitch_noise=pitch_noise(find_pitch_errors(ready)))
 
 
 def without(prepared):
-    """Drop the placements that are named in `problems` from everything but the images."""
+    """Drop the placements that are left out from everything but the images."""
+    left_out = prepared.left_out
 
     def kept(found):
-        return {key: value for key, value in found.items() if key not in prepared.problems}
+        return {key: value for key, value in found.items() if key not in left_out}
 
     edges, swept = (
         {v: kept(found) for v, found in both.items()} for both in (prepared.edges, prepared.swept)

@@ -289,5 +289,7 @@ def _print_poses(calibration):
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for key, why in (calibration.prepared.problems | calibration.problems).items():
+    for problem in calibration.prepared.problems:
+        print(problem)
+    for key, why in calibration.problems.items():
         print(f"{key}: {why}")

@@ -38,7 +38,7 @@ class Diagnosis:
 
     bends: BoardBends
     pitch_errors: PitchErrors | None
-    problems: dict
+    problems: tuple
 
 
 def diagnose(prepared, pitch_errors=None):
@@ -48,7 +48,7 @@ def diagnose(prepared, pitch_errors=None):
     """
     # whose findings are in the problems already
     maps = board_maps(prepared, rough_poses(prepared)[0])
-    return Diagnosis(board_bends(prepared, maps), pitch_errors, dict(prepared.problems))
+    return Diagnosis(board_bends(prepared, maps), pitch_errors, prepared.problems)
 
 
 def bends_table(bends):
@@ -91,7 +91,7 @@ def findings_in_words(diagnosis):
     return (
         pitch_words(diagnosis.pitch_errors)
         + bend_words(diagnosis.bends)
-        + problem_words(diagnosis.problems)
+        + [str(problem) for problem in diagnosis.problems]
     )
 
 
@@ -221,13 +221,3 @@ def _listed(names):
     """Names as in a sentence: '1', '1 and 2', '1, 2 and 3'."""
     *most, last = [str(name) for name in names]
     return f"{', '.join(most)} and {last}" if most else last
-
-
-def problem_words(problems):
-    """Why placements or parts of them are left out, one sentence each, from the problems of a
-    prepared session.
-    """
-    return [
-        why if isinstance(key, str) or "placement" in why else f"placement {key}: {why}"
-        for key, why in problems.items()
-    ]

@@ -20,7 +20,7 @@ from lrfcal_lib.judge.alternatives import (
     not_an_offset,
     places_of_cameras,
 )
-from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words, problem_words
+from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words
 from lrfcal_lib.judge.next_placement import (
     Suggestion,
     brief,
@@ -39,6 +39,7 @@ from lrfcal_lib.judge.uncertainty import (
     range_noise,
 )
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.model.problem import LEAVES_OUT, ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.planes import rival_words
@@ -331,7 +332,7 @@ def judge(calibration, method=None, **options):
     method = method or handed_over(calibration)
     if method is None:
         refused = Reason(NO, "handed over", _refusal(calibration))
-        lost = problem_words(prepared.problems)
+        lost = [str(problem) for problem in prepared.problems]
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",) if lost else ()
         return replace(
             _answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]),
@@ -373,7 +374,8 @@ def _refusal(calibration):
     problems = calibration.problems
     why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
     if not prepared.views:
-        why = prepared.problems.get("images", "the session has no camera")
+        lost = prepared.problems_of(ProblemKind.NO_IMAGES)
+        why = lost[0].words if lost else "the session has no camera"
         why += "; the tilt axis is known from the edges in the sweeps" * bool(
             calibration.platform.solutions
         )
@@ -558,7 +560,7 @@ def _left_out(calibration, method):
     prepared = calibration.prepared
     excluded = {}
     table = placements_table(prepared, calibration.observations).set_index("placement")
-    used = set(table.index[table.used]) - set(prepared.problems)
+    used = set(table.index[table.used]) - set(prepared.left_out)
     if method == "joint":
         used = set(calibration.joint.solution.boards)
         excluded = calibration.joint.solution.excluded
@@ -574,8 +576,9 @@ def _left_out(calibration, method):
             )
             reasons.append(Reason(CARE, "left out", f"{words}: {', '.join(unseen)}"))
     large = len(lost) > LOST * len(table)
-    every = prepared.problems | (excluded if large else {})
-    parts = [words for key, words in every.items() if key not in table.index]
+    parts = [str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    if large:
+        parts += [words for key, words in excluded.items() if key not in table.index]
     also = (
         f"Parts left out beside whole placements: {len(parts)} ({'; '.join(parts)})."
         if parts
@@ -584,7 +587,7 @@ def _left_out(calibration, method):
     if not lost:
         return reasons, f"All {len(table)} placements were used. {also}".strip()
     why = [
-        f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})"
+        f"{p} ({excluded.get(p) or prepared.left_out.get(p) or table.reason[p] or 'no edge'})"
         for p in lost
     ]
     words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
