@@ -18,7 +18,7 @@ export OMP_NUM_THREADS ?= 1
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
-	@echo "make test                    lint and run all tests, the notebooks included"
+	@echo "make test                    lint, check types and run all tests, the notebooks included"
 	@echo "make campaign                the many falsified and drawn recordings of which make test has a few"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
@@ -35,13 +35,15 @@ setup:
 report: setup
 	@$(RUN) -m lrfcal_lib report $${SESSION:+"$$SESSION"}
 
+# nbval takes 3 s to load, in every process of a test run: tests/notebook_runs.py starts it itself
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
-	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
+	$(RUN) -m mypy
+	$(RUN) -m pytest -p no:nbval -n 3 --dist loadgroup --no-loadscope-reorder
 
 campaign: setup
-	$(RUN) -m pytest -n 3 -m campaign
+	$(RUN) -m pytest -p no:nbval -n 3 -m campaign
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
