@@ -47,16 +47,6 @@ def camera_methods():
         yield J.T @ r, lambda s: 0.5 * np.sum(whiten(block(s))[0] ** 2), 6
 
 
-def intervals():
-    rig, obs = camera_case(3, noise=1.0)
-    state = np.concatenate([pose_array(rig.T_camera_lrf), [[0.4], [0.0], [0.0]]], axis=1)
-    sight, lengths = residuals.sight_normals(obs.crossing_lines, obs.model)
-    frozen = (obs, sight, *lines.freeze_intervals(state, obs, sight, lengths, 0.2))
-    block = lines.interval_block(state, *frozen)
-    score = block.jacobian.T @ block.residuals
-    yield score, lambda s: np.sum(lines.interval_block(lines.move_biased(state, s), *frozen).cost), 7
-
-
 def board_planes():
     rig, obs = camera_case(5, noise=1.0)
     sets, pose = planes.plane_sets(obs), pose_array(rig.T_camera_lrf * OFF)
@@ -101,13 +91,7 @@ def recorded_pitch():
 
 
 def single_beams():
-    """Cost, score and information of beams and of pairs of them, as the margin moves by its sigma."""
-    for sigma, half in ((0.0004, 0.001), (0.003, 0.005)):
-        def interval(s):
-            return residuals.interval_terms(MARGINS + sigma * s + half, MARGINS + sigma * s - half, sigma)
-
-        found = interval(0.0)
-        yield sigma * found[1][:, None], lambda s: interval(s[0])[0], 1
+    """Cost, score and information of beams, as the margin moves by its sigma."""
     for hit in (True, False):
         for lapse in (0.0, 0.01):
             def beam(s):
@@ -169,7 +153,7 @@ def images():
     yield jacobian, lambda s: intrinsics.predict(intrinsics.moved(state, s), points, basis)[0], count
 
 
-@pytest.mark.parametrize("cases", [projection, camera_methods, intervals, board_planes, tilt_axis, recorded_pitch,
+@pytest.mark.parametrize("cases", [projection, camera_methods, board_planes, tilt_axis, recorded_pitch,
                                    single_beams, joint_estimate, chain_of_a_rig, images])  # fmt: skip
 def test_derivatives_are_those_of_differences(cases):
     for number, (found, function, count) in enumerate(cases()):
