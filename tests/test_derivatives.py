@@ -76,18 +76,20 @@ def tilt_axis():
 
 
 def recorded_pitch():
-    data = pitch.gather(*pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1])
+    cameras, *_ = pitched(25, 0.0, 0.02, count=5, noise=0.003, cameras=("left", "right"))[1]
+    rows = pitch.gather(list(cameras.values()), np.arange(1, 6))
     pose = pose_array(RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([1.5, 0.1, 0.2])))
-    state = np.array([pose, pose]), 0.01, np.full(5, 0.02), np.full(5, 0.03)
-    for name in pitch.MODELS:
-        shared, count = 12 + (name == "direction"), pitch.pitch_blocks(state, data, name)[0].jacobian.shape[-1]
+    each = np.eye(5)[rows.placement]
+    for by_unknown in (each[:, :0], np.concatenate([each, each * rows.pitch[:, None]], axis=1)):
+        k = by_unknown.shape[1]
 
         def blocks(s):
-            moved = pitch.move_pitch_state(state, (s[:shared], np.tile(s[shared:], (5, 1))), name)
-            return pitch.pitch_blocks(moved, data, name)
+            poses = move_pose(np.array([pose, pose]), s[:12].reshape(2, 6))
+            return pitch.pitch_blocks((poses, np.full(k, 0.02) + s[12:]), rows, by_unknown)
 
-        for i, block in enumerate(blocks(np.zeros(count))):
-            yield block.jacobian, lambda s: blocks(s)[i].residuals, count
+        for i, block in enumerate(blocks(np.zeros(12 + k))):
+            if block.residuals.size:
+                yield block.jacobian, lambda s: blocks(s)[i].residuals, 12 + k
 
 
 def single_beams():
