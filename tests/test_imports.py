@@ -96,6 +96,10 @@ ALONE = {  # code; modules and nodes at most; what it must not load
         CAMERA, 20, 30_000,
         ("session", "preprocess", "calibrate", "judge", "evaluate", "solvers.joint", "solvers.pitch"),
     ),
+    "platform and cameras": (
+        "import lrfcal_lib.calibrate.cameras", 20, 30_000,
+        ("session", "preprocess", "judge", "evaluate", "solvers.joint", "solvers.pitch", "calibrate.reconstruct"),
+    ),
 }  # fmt: skip
 
 
