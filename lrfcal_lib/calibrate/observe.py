@@ -175,12 +175,8 @@ class RecordedSource:
 
     def covariance(self, covariance, pitch):
         """Covariances (n, 3, 3) of measured points, turned into the source frame."""
-        R = self.rotation(pitch)
+        R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
         return R @ covariance @ R.swapaxes(-1, -2)
-
-    def rotation(self, pitch):
-        """Rotation matrices (n, 3, 3) from the LRF at a recorded pitch (n,) to the source frame."""
-        return self.frame.rotation(self.corrections.pitch(self.placement, pitch))
 
     def by_pitch(self, p_lrf, pitch):
         """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
@@ -256,8 +252,6 @@ def _crossings(prepared, placement, view, source, sides):
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
             "covariance": source.covariance(scanned.covariance[rows], pitch) + pitch_error,
-            "noise": source.covariance(scanned.noise[rows], pitch) + pitch_error,
-            "half_step": (source.rotation(pitch) @ scanned.half_step[rows][..., None])[..., 0],
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": scanned.background[rows],
             "lines": np.tile(edge.line, (n, 1)),
