@@ -8,6 +8,7 @@ from joint_draws import draw, rng
 
 from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_model import Levels
 from lrfcal_lib.solvers.joint_noise import side_level
 from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM
 
@@ -52,7 +53,7 @@ def test_sides_that_beams_hardly_show_do_not_pull_their_scale_down(true, start):
         x, prior = most_likely(y, known, level)
         hessian = np.zeros((200, 9, 9))
         hessian[:, range(9), range(9)] = np.concatenate([np.ones((200, 6)), known + prior], axis=1)
-        level = side_level(x, SimpleNamespace(side_sigma=level, beam=used), hessian, np.zeros((200, 9)))
+        level = side_level(x, SimpleNamespace(levels=Levels(side_sigma=level), beam=used), hessian, np.zeros((200, 9)))
     assert level == pytest.approx(true, rel=0.15)
 
 

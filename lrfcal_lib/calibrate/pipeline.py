@@ -33,7 +33,8 @@ from lrfcal_lib.preprocess.prepared import (
 from lrfcal_lib.preprocess.survey import all_views
 from lrfcal_lib.session.cache import cached, spread
 from lrfcal_lib.solvers import METHODS, SHIPPED, best_method, row_of, solve_camera
-from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
+from lrfcal_lib.solvers.joint import solve_again, solve_joint
+from lrfcal_lib.solvers.joint_solution import JointSolution
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
 from lrfcal_lib.solvers.platform import solve_platform, solve_projected
 

@@ -82,7 +82,7 @@ def calibration_record(calibration, method, judged=None):
         }
         record["sensor"] = sensor | {
             "noise": joint.noise,
-            "excluded": list(joint.excluded.values()),
+            "excluded": [one.words for one in joint.excluded],
         }
     return record
 
