@@ -1,17 +1,19 @@
 """Placements and images that contradict all others: found, named and left out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from lrfcal_lib.fit.least_squares import Block, medians
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.solvers.joint_model import JointData, JointState, Unknowns
 from lrfcal_lib.solvers.joint_noise import face_points
 from lrfcal_lib.solvers.joint_residuals import minimum, named_blocks, view_block
 from lrfcal_lib.solvers.joint_start import FEWEST_ANGLE_POINTS, boards_in_images
 
+CONTRADICTS = ProblemKind.CONTRADICTS
 CONTRADICTION = 16.0  # mean squared residual, relative to the median placement's
 LEAST_MISFIT = 1e-6  # of images: below, they agree exactly
 LARGEST_SHARE = 0.3  # of the placements that may contradict the others
@@ -21,48 +23,21 @@ FEW_STEPS = 8  # of a minimisation that only has to show where it leads
 BOARD = 6  # numbers of a pose
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """Something that was not used, and why.
-
-    Attributes
-    ----------
-    placement : int or None
-        Its number; None for a camera as a whole.
-    camera : str or None
-        None for a whole placement.
-    name : str
-        What it is, in words.
-    why : str
-    """
-
-    placement: int | None
-    camera: str | None
-    name: str
-    why: str
-
-    @property
-    def words(self) -> str:
-        """What is left out and why."""
-        return f"{self.name}: {self.why}"
+def of_placement(obs, row, kind, why):
+    """The Problem of a placement (index)."""
+    return Problem(Stage.JOINT, kind, f"{why}; left out", placement=int(obs.placements[row]))
 
 
-def left_out_placement(obs, row, why):
-    """A placement (index) that is LeftOut."""
-    number = int(obs.placements[row])
-    return LeftOut(number, None, f"placement {number}", f"{why}; left out")
-
-
-def left_out_image(obs, row, why):
-    """A view (index) that is LeftOut."""
+def of_image(obs, row, why):
+    """The Problem of a view (index)."""
     number = int(obs.placements[obs.view_placement[row]])
     camera = obs.cameras[obs.view_camera[row]]
     pitch = np.degrees(obs.view_pitch[row])
-    name = f"placement {number}, image of '{camera}' at {pitch:.1f} deg"
-    return LeftOut(number, camera, name, f"{why}; the image is left out")
+    words = f"image of '{camera}' at {pitch:.1f} deg: {why}; the image is left out"
+    return Problem(Stage.JOINT, CONTRADICTS, words, placement=number, camera=camera)
 
 
-def left_out_share(obs: JointObservations, left_out: list[LeftOut]) -> float:
+def left_out_share(obs: JointObservations, left_out: list[Problem]) -> float:
     """The larger share of the placements, and of the images of the others, that are left out."""
     placements = sum(one.camera is None for one in left_out)
     images = len(left_out) - placements
@@ -76,10 +51,10 @@ def without_blind_cameras(obs, required):
         return obs, []
     left_out = []
     for name in blind:
-        why = "it never sees the board, its pose stays open"
-        left_out.append(LeftOut(None, name, f"camera '{name}'", why))
+        words = "never sees the board: its pose stays open"
+        left_out.append(Problem(Stage.JOINT, ProblemKind.NO_IMAGES, words, camera=name))
     if required:
-        words = "; ".join(one.words for one in left_out)
+        words = "; ".join(map(str, left_out))
         raise DegenerateGeometry(f"{words}; leave it out with obs.with_cameras")
     return obs.with_cameras([name for name in obs.cameras if name not in blind]), left_out
 
@@ -94,9 +69,9 @@ def without_lost_placements(obs):
     left_out = []
     for row in np.flatnonzero(lost):
         why = f"no image shows the board and scans cross {crossed[row]} edges, two needed"
-        left_out.append(left_out_placement(obs, row, why))
+        left_out.append(of_placement(obs, row, ProblemKind.TOO_LITTLE, why))
     if lost.all():
-        raise DegenerateGeometry("; ".join(one.words for one in left_out))
+        raise DegenerateGeometry("; ".join(map(str, left_out)))
     return obs.select(obs.placements[~lost]), left_out
 
 
@@ -156,10 +131,10 @@ def without_contradictions(obs, state, data):
     for row in out:
         miss = 1000 * misses[place == row].min()
         why = f"the scan is {miss:.0f} mm off where its image puts the board"
-        left_out.append(left_out_placement(obs, row, why))
+        left_out.append(of_placement(obs, row, CONTRADICTS, why))
     for view in single:
         why = f"it puts the board {1000 * misses[view]:.0f} mm off the scan"
-        left_out.append(left_out_image(obs, view, why))
+        left_out.append(of_image(obs, view, why))
     return *without(obs, replace(state, boards=moved), single, out), left_out
 
 
@@ -199,7 +174,7 @@ def without_misfits(obs, state, data, unknowns):
     """Leave out placements whose residuals are far larger than the others', or the one image
     that makes them so.
 
-    Returned are observations and state, and what was LeftOut.
+    Returned are observations and state, and what was left out.
     """
     squares, usual = contradictions(state, data, unknowns)
     limits = CONTRADICTION * usual
@@ -214,10 +189,10 @@ def without_misfits(obs, state, data, unknowns):
         if view is not None:
             boards[row] = board
             views.append(view)
-            left_out.append(left_out_image(obs, view, f"with it {why}"))
+            left_out.append(of_image(obs, view, f"with it {why}"))
         elif squares[row, 0] > limits[0]:
             rows.append(row)
-            left_out.append(left_out_placement(obs, row, f"its {why}"))
+            left_out.append(of_placement(obs, row, CONTRADICTS, f"its {why}"))
     if not left_out:
         return obs, state, []
     return *without(obs, replace(state, boards=boards), views, rows), left_out

@@ -37,7 +37,7 @@ def estimate_noise(state: JointState, data: JointData, unknowns: Unknowns) -> Jo
         scale, share = face_levels(state, data, blocks["face"])
         levels = replace(levels, face_scale=scale, face_share=share)
     if "beam" in blocks:
-        share = beam_share(state, data, blocks["beam"].jacobian[..., c:], blocks["beam"], spread)
+        share = beam_share(state, data, blocks["beam"], c, spread)
         levels = replace(levels, beam_share=share)
     if "view" in blocks:
         factor, sigma = view_levels(data, blocks["view"], hessian, gradient, c)
@@ -102,12 +102,12 @@ def _part(values, used):
     return np.sum(values[None] > limits[..., None], axis=0)
 
 
-def beam_share(state, data, by_own, block, spread):
+def beam_share(state, data, block, shared, spread):
     """Share of independent errors among neighbouring beams, from the scores of parts of every edge.
 
     What board and sides take up of the scores is told by `spread` (p, k, k), the covariance of a
-    placement's own unknowns, and `by_own` (p, n, k), the beams' Jacobian by them. The steps count a
-    little more information than there is where beams may say nothing (`lapse`, see
+    placement's own unknowns, which follow the `shared` ones. The steps count a little more
+    information than there is where beams may say nothing (`lapse`, see
     :func:`lrfcal_lib.fit.edge_likelihood.beam_terms`); the share brings that down to the true
     curvature of the cost.
 
@@ -118,6 +118,7 @@ def beam_share(state, data, by_own, block, spread):
     before = data.levels.beam_share
     used = data.beam["used"]
     along = _along_edges(state, data)
+    by_own = block.jacobian[..., shared:]
     root = np.linalg.norm(by_own[..., 3:6], axis=-1)  # root information
     lapsed = data.levels.lapse * np.exp(np.where(used, block.cost, 0.0) / before)
     curvature = root**2 * (1 - block.residuals**2 * lapsed / (1 - lapsed))

@@ -12,11 +12,11 @@ from lrfcal_lib.model.geometry import (
     transform_difference,
 )
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_contradictions import (
     CONTRADICTION,
     FEW_STEPS,
     LARGEST_SHARE,
-    LeftOut,
     face_misses,
     left_out_share,
     refuse_contradiction,
@@ -40,7 +40,7 @@ class Start:
     kept : JointObservations
         Without what contradicts it.
     state : JointState
-    left_out : list of LeftOut
+    left_out : list of Problem
     settled : bool
         Whether more steps with the coarse unknowns would change nothing.
     badness : float
@@ -49,7 +49,7 @@ class Start:
 
     kept: JointObservations
     state: JointState
-    left_out: list[LeftOut]
+    left_out: list[Problem]
     settled: bool
     badness: float
 
@@ -81,11 +81,16 @@ def best_start(
     if misses[chosen] > ROUGH_MISS:
         refuse_contradiction(best.state, gather(best.kept), ROUGH_MISS)
     if left_out_share(obs, best.left_out) > LARGEST_SHARE:
+        names = []
+        for problem in best.left_out[:8]:
+            name = str(problem.placement)
+            if problem.camera is not None:
+                name += f" in camera '{problem.camera}'"
+            names.append(name)
         raise DegenerateGeometry(
             f"{len(best.left_out)} placements or images of {len(obs.placements)} placements "
-            "contradict the others: images put boards elsewhere than scans "
-            f"({'; '.join(one.name for one in best.left_out[:8])}); check that images and scans "
-            "carry the right numbers"
+            f"contradict the others: images put boards elsewhere than scans ({', '.join(names)}); "
+            "check that images and scans carry the right numbers"
         )
     return best, rivals(obs, tried, best)
 

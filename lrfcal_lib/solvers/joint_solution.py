@@ -16,7 +16,7 @@ from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import pose_array, pose_parameters, pose_transform
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
-from lrfcal_lib.solvers.joint_contradictions import LeftOut
+from lrfcal_lib.model.problem import Problem
 from lrfcal_lib.solvers.joint_model import (
     SENSOR,
     SWEEPS,
@@ -95,7 +95,7 @@ class JointSolution:
         Without what is left out.
     data, unknowns : JointData, Unknowns
         Padded observations with the noise levels used, and what was unknown; for `solvers` only.
-    excluded : tuple of LeftOut
+    excluded : tuple of Problem
         Placements, cameras and single images left out, with the reason.
     misfit : dict of int to float
         Normalised squared residuals of each placement (1 is what the noise explains).
@@ -112,7 +112,7 @@ class JointSolution:
     observations: JointObservations
     data: JointData
     unknowns: Unknowns
-    excluded: tuple[LeftOut, ...]
+    excluded: tuple[Problem, ...]
     misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
@@ -121,7 +121,8 @@ class JointSolution:
     @property
     def excluded_placements(self) -> dict[int, str]:
         """Why placements are left out, in words, by their numbers."""
-        return {one.placement: one.words for one in self.excluded if one.camera is None}
+        whole = [problem for problem in self.excluded if problem.camera is None]
+        return {problem.placement: str(problem) for problem in whole}
 
     @property
     def state(self) -> JointState:
