@@ -156,11 +156,10 @@ def solve_joint(
     obs, left_out = without_blind_cameras(obs, required)
     unknowns = chosen.unknowns(obs)
     levels = Levels(sweep_sigma=tuple(chosen.sweep_sigma))
-    rivals = ()
     coarsely_settled = False
     if start is None:
         obs, lost = without_lost_placements(obs)
-        best, rivals = best_start(obs, unknowns, levels, T0)
+        best = best_start(obs, unknowns, levels, T0)
         obs = best.kept
         start = best.state
         coarsely_settled = best.settled
@@ -182,7 +181,7 @@ def solve_joint(
     if required:  # a cause before what follows from it: edges that fit nowhere, say
         refuse_contradiction(state, data, LAST_MISS)
     found = finished(obs, state, data, unknowns, required)
-    return replace(found, excluded=tuple(left_out), rivals=rivals)
+    return replace(found, excluded=tuple(left_out))
 
 
 def solve_again(obs: JointObservations, like: JointSolution) -> JointSolution:

@@ -9,7 +9,6 @@ from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     pose_array,
     pose_transform,
-    transform_difference,
 )
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.model.problem import Problem
@@ -25,7 +24,6 @@ from lrfcal_lib.solvers.joint_contradictions import (
 from lrfcal_lib.solvers.joint_model import JointState, Levels, Unknowns, gather
 from lrfcal_lib.solvers.joint_residuals import minimum
 from lrfcal_lib.solvers.joint_start import start_states, state_of
-from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 GOOD_START = 0.7  # mean half squared residual; a start value this good is not searched further
 ROUGH_MISS = 0.08  # metres, of a start value's boards from where images put them
@@ -56,8 +54,8 @@ class Start:
 
 def best_start(
     obs: JointObservations, unknowns: Unknowns, levels: Levels, T0: RigidTransform | None = None
-) -> tuple[Start, tuple[str, ...]]:
-    """The most promising start value, and in words its rivals.
+) -> Start:
+    """The most promising start value.
 
     More than 30 % of the placements that contradict the rest raise DegenerateGeometry: nobody knows
     which ones are wrong.
@@ -92,7 +90,7 @@ def best_start(
             f"contradict the others: images put boards elsewhere than scans ({', '.join(names)}); "
             "check that images and scans carry the right numbers"
         )
-    return best, rivals(obs, tried, best)
+    return best
 
 
 def coarse(unknowns: Unknowns) -> Unknowns:
@@ -125,19 +123,3 @@ def agreeing_start(obs, state, data, unknowns):
         cameras = [pose_transform(pose) for pose in found.state.cameras]
         state = state_of(obs, pose_transform(found.state.head), cameras)
     return min(attempts, key=lambda start: start.badness)
-
-
-def rivals(obs, tried, best):
-    """In words, which cameras a start value that fits nearly as well puts elsewhere."""
-    words = {}
-    for start in sorted(tried, key=lambda start: start.badness):
-        if start.badness > NEARLY**2 * best.badness:
-            break
-        for name, pose, other in zip(
-            obs.cameras, best.state.cameras, start.state.cameras, strict=True
-        ):
-            T = pose_transform(pose)
-            T_other = pose_transform(other)
-            if name not in words and transform_difference(T, T_other)[0] > SAME_TURN:
-                words[name] = rival_words(name, T, T_other)
-    return tuple(words.values())

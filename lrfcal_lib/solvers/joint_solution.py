@@ -104,8 +104,6 @@ class JointSolution:
     lens_scale : float
         By how much errors of the intrinsics let board poses in images scatter, in stated standard
         deviations.
-    rivals : tuple of str
-        Cameras that other minima put elsewhere, in words.
     """
 
     solution: Solution
@@ -116,7 +114,6 @@ class JointSolution:
     misfit: dict[int, float]
     lens: np.ndarray
     lens_scale: float
-    rivals: tuple[str, ...] = ()
 
     @property
     def excluded_placements(self) -> dict[int, str]:
@@ -402,9 +399,9 @@ class JointSolution:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is suspicious beyond convergence and unobservable motions, in words: noise that
-        contradicts what is stated, a weak axis, errors of the pitch that the data ask for, rivals.
+        contradicts what is stated, a weak axis, errors of the pitch that the data ask for.
         """
-        words = list(self.rivals)
+        words = []
         for what, stated, level in self._scatter():
             if not NOISE_LIMITS[0] < level < NOISE_LIMITS[1]:
                 words.append(
