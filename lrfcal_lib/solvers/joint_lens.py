@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.least_squares import OWN_RANK, pad
@@ -10,7 +11,7 @@ from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import CameraModel, project_jacobians
 from lrfcal_lib.model.observations import LENS, JointObservations
 from lrfcal_lib.solvers.joint_model import JointData, Unknowns
-from lrfcal_lib.solvers.joint_residuals import view_block
+from lrfcal_lib.solvers.joint_residuals import among_cameras, view_block
 
 LEAST_CORNERS = 6  # of a pattern, for the derivative of its pose by the intrinsics
 
@@ -71,24 +72,21 @@ def lens_share(
     block = view_block(found.state, data, unknowns)
     J = block.white_jacobian
     J_own = J[..., c:]
-    used = data.view["used"]
-    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
+    camera = data.view["camera"]
+    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(camera))["lens"]
+    by_lens = among_cameras(lens, camera, len(obs.cameras))
+    shift = block.whitened(by_lens.reshape(*J.shape[:2], -1))
+    spread = block_diag(*obs.lens_covariance)
     hessian = np.swapaxes(found.jacobian, -1, -2) @ found.jacobian
     own = np.linalg.pinv(hessian[:, c:, c:], rcond=OWN_RANK, hermitian=True)
     reduced = J[..., :c] - J_own @ own @ hessian[:, c:, :c]
     finite = np.where(np.isfinite(found.covariance), found.covariance, 0.0)
-    covariance = np.zeros((c, c))
-    square = 0.0
-    for camera, spread in enumerate(obs.lens_covariance):
-        mine = (used & (data.view["camera"] == camera))[..., None, None]
-        shift = block.whitened((lens * mine).reshape(J.shape[:2] + (LENS,)))
-        gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
-        left = shift - reduced @ gain - J_own @ (own @ (np.swapaxes(J_own, -1, -2) @ shift))
-        covariance += gain @ spread @ gain.T
-        square += np.sum(left @ spread * left)
+    gain = finite @ np.sum(np.swapaxes(reduced, -1, -2) @ shift, axis=0)
+    left = shift - reduced @ gain - J_own @ (own @ (np.swapaxes(J_own, -1, -2) @ shift))
+    square = np.sum(left @ spread * left)
     level = data.levels.view_scale**2
     taken = np.sum((J_own @ own) * J_own) + np.sum((reduced @ finite) * reduced)
-    square *= level / max(6 * used.sum() - taken, 1.0)  # rows that are left to show it
+    square *= level / max(6 * len(obs.view_camera) - taken, 1.0)  # rows that are left to show it
     share = np.clip(level - 1, 0, square) / level
     counted = share * finite @ np.tensordot(reduced, reduced, ((0, 1), (0, 1))) @ finite
-    return LensShare(covariance, counted, float(np.sqrt(square)))
+    return LensShare(gain @ spread @ gain.T, counted, float(np.sqrt(square)))

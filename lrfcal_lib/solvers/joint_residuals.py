@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lrfcal_lib.fit.axis_chart import PRIOR_FREEDOM, prior_terms
+from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, PRIOR_FREEDOM, prior_terms
 from lrfcal_lib.fit.edge_likelihood import beam_terms, edge_shift, flip_sigma
 from lrfcal_lib.fit.least_squares import Block, Minimum, minimise
 from lrfcal_lib.fit.stops import ViewBlock, same_stop
@@ -260,26 +260,24 @@ def view_block(state, data, unknowns):
     residuals = np.concatenate([w, arm + camera[..., 3] - pose[..., :3, 3]], axis=-1)
 
     left = inverse_left_jacobian(w)
-    axis = np.zeros(w.shape[:2] + (6, 4))
-    axis[..., :3, :2] = left @ -R_camera_head[..., 1:]
-    axis[..., 3:, :2] = (R_camera_head @ hat(origin - head[..., 3]))[..., 1:]
-    axis[..., 3:, 2:] = -R_camera_head[..., 1:]
-    turn = np.zeros(w.shape[:2] + (6, 1))
-    turn[..., :3, :] = left @ -R_camera_head[..., :1]
-    turn[..., 3:, :] = R_camera_head @ hat(origin)[..., :1]
+    turned = left @ -R_camera_head
+    lever = R_camera_head @ hat(origin - head[..., 3])
+    of_head = _by_pose(turned, lever, -R_camera_head) * moved
+    by_pitch = _by_pose(turned, R_camera_head @ hat(origin), 0.0)[..., :1] * moved
+    of_camera = _by_pose(left, -hat(arm), np.eye(3))
     J = assemble(
         unknowns,
-        turn * moved * by_parts[..., None, :],
-        axis=axis * moved,
+        by_pitch * by_parts[..., None, :],
+        axis=of_head[..., AXIS_COLUMNS],
         board=_by_pose(left @ R_camera_platform, 0.0, R_camera_platform),
-        cameras=_of_camera(_by_pose(left, -hat(arm), np.eye(3)), view["camera"], unknowns),
+        cameras=among_cameras(of_camera, view["camera"], unknowns.cameras),
     )
     p, v = pitch.shape
     return ViewBlock(
         residuals.reshape(p, 6 * v),
         J.reshape(p, 6 * v, -1),
         view["whitener"] / data.levels.view_scale,
-        by_pitch=(turn * moved)[..., 0],
+        by_pitch=by_pitch[..., 0],
         same=same_stop(view["pitch"], view["used"]),
         sigma_pitch=data.levels.sigma_pitch,
     )
@@ -294,11 +292,11 @@ def _by_pose(turn_by_turn, shift_by_turn, shift_by_shift):
     return by_pose
 
 
-def _of_camera(by_pose, camera, unknowns):
-    """Derivatives (p, v, 6, 6) by the pose of its camera, among those of all."""
-    mine = camera[..., None] == np.arange(unknowns.cameras)
-    among_all = by_pose[..., None, :] * mine[:, :, None, :, None]
-    return among_all.reshape(*camera.shape, 6, -1)
+def among_cameras(by_one, camera, count):
+    """Derivatives (p, v, 6, k) by what is a view's camera's, among those of all, (p, v, 6, k c)."""
+    mine = camera[..., None] == np.arange(count)
+    among_all = by_one[..., None, :] * mine[:, :, None, :, None]
+    return among_all.reshape(*by_one.shape[:-1], -1)
 
 
 def inverse_left_jacobian(w):
