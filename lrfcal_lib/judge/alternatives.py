@@ -3,7 +3,6 @@ cause and remedy.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -12,12 +11,11 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
     axis_difference,
     axis_of,
     transform_difference,
 )
-from lrfcal_lib.solvers.joint import JointSolution, solve_joint
+from lrfcal_lib.solvers.joint import JointSolution
 from lrfcal_lib.solvers.joint_model import SENSOR
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
@@ -36,7 +34,6 @@ FAR_SHIFT = 0.3
 # log odds; sides are expected to deviate no more than this while statements are weighed
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
-BETTER = 3.0  # times less scatter of ranges with the other sense
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
 
@@ -329,39 +326,6 @@ def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     return replace(
         best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
     )
-
-
-def plausible(solution):
-    """Whether a JointSolution converged, with a pitch that counts in the sense that is stated."""
-    return solution.converged and solution.sensor["pitch_scale"] > -1
-
-
-def other_sense(joint):
-    """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way
-    round; else ''.
-
-    Everything is estimated again. A pitch of the other sense is the same but for a half turn of the
-    range finder. A camera on the base contradicts either; without one a mirrored rig fits as well,
-    see :func:`far_from_stated`.
-    """
-    obs = joint.solution.observations
-    level = joint.solution.noise["face_scale"]
-    turned = replace(
-        obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing
-    )
-    with suppress(DegenerateGeometry, np.linalg.LinAlgError):  # so read it may fit nothing at all
-        again = solve_joint(turned, required=False, **joint.settings)
-        better = level / again.noise["face_scale"]
-        if (
-            again.converged
-            and not again.unobservable
-            and better > (BETTER if plausible(joint.solution) else 1.0)
-        ):
-            return (
-                f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} "
-                "times as well then"
-            )
-    return ""
 
 
 def far_from_stated(joint):

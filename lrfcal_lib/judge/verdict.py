@@ -12,7 +12,6 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge import alternatives
 from lrfcal_lib.judge.alternatives import (
     alternatives_of,
     doubtful,
@@ -116,7 +115,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from
-        stated', 'sense', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
+        stated', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
         'convergence', 'unobservable', 'cameras', 'lens', 'second minimum', 'placements',
         'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error',
         'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
@@ -462,10 +461,6 @@ def contradicts_stated(joint):
     reasons = []
     doubt = 0.0
     level = joint.solution.noise["face_scale"]
-    hopeless = not alternatives.plausible(joint.solution) or level > ABSURD
-    # what else is found wrong comes from that
-    if hopeless and (words := alternatives.other_sense(joint)):
-        return [Reason(NO, "sense", words)], doubt
     if not joint.solution.converged:
         return [Reason(NO, "not weighed", f"{NOT_WEIGHED}: the estimate has not converged")], doubt
     offset = joint.solution.sensor["range_offset"]

@@ -27,6 +27,8 @@ PITCH_LEVELS = np.radians(
 SCALE_ROUNDS = 4
 SCALE_LIMITS = (1e-4, 1e4)
 SIDE_ROUNDS = 20
+# of the curvature of the beams' cost over their information; below 0 where most contradict edges
+LEAST_CURVATURE = 0.1
 SETTLED = 0.02  # change of the logarithm of a noise level
 # scatter of residuals in stated standard deviations that still agrees with the statement
 NOISE_LIMITS = (0.5, 2.0)
@@ -199,7 +201,7 @@ def beam_share(state, data, block, unknowns, spread):
     left = np.sum(1 - taken / counted)
     if left < 1:
         return data.beam_share
-    gain = np.sum(true) / np.sum(counted)
+    gain = max(np.sum(true) / np.sum(counted), LEAST_CURVATURE)
     ratio = np.sum(score**2 / counted) / left / gain
     return float(gain / max(ratio, 1.0))
 
