@@ -27,7 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic import camera_observations, random_board_poses, random_rig
 from telegrams import encode_scan
 
-from lrfcal_lib.calibrate.reconstruct import Painter, View
+from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.fit.least_squares import whiten
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
