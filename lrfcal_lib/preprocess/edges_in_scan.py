@@ -5,13 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points, tilt
-from lrfcal_lib.preprocess.board_in_scan import (
-    depth_jump,
-    median_step,
-    plane_axes,
-    row_ends,
-    row_median,
-)
+from lrfcal_lib.preprocess.board_in_scan import median_step, row_median
+from lrfcal_lib.preprocess.surfaces import depth_jump, plane_axes, row_ends
 
 VARIANTS = ("last_beam", "half_step")
 # metres; an LMS2xx gives one reading for two surfaces nearer together along the beam (telegram
