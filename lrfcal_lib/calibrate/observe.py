@@ -20,8 +20,8 @@ from lrfcal_lib.model.observations import (
 )
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.outline_in_images import side_lines
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import VARIANTS, DroppedSide
 from lrfcal_lib.preprocess.survey import all_views, small_squares
