@@ -9,7 +9,7 @@ import numpy as np
 
 from lrfcal_lib.calibrate import outline
 from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
+from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_image import line_misses
@@ -86,7 +86,9 @@ def combined_outlines(joint):
                 del cases[placement]
                 continue
             if case.images:
-                r, J = whiten(sight_block(found[placement], case, scale))
+                block = sight_block(found[placement], case, scale)
+                r = block.white
+                J = block.white_jacobian
                 total += np.sum(r**2), np.sum(1 - np.sum((J @ covariance) * J, axis=-1))
         scale = max(scale * np.sqrt(total[0] / total[1]) if total[1] > 0 else 1.0, LEAST_SCALE)
     return as_scattered(measured)
