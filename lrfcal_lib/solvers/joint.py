@@ -38,7 +38,7 @@ from lrfcal_lib.solvers.joint_start import (
     start_states,
     state_of,
 )
-from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
+from lrfcal_lib.solvers.plane_start import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
