@@ -1,7 +1,6 @@
 """Derivatives that are worked out by hand are those of differences: one table of all residuals."""
 # ruff: noqa: B007,B023 (each function is used before the next one is made)
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.solvers import lines, pitch, planes, platform
-from lrfcal_lib.solvers.joint_model import SENSOR, Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_model import SENSOR, Levels, Unknowns, gather, move_state
 from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
@@ -117,7 +116,7 @@ def joint_estimate():
         off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
         state = move_state(truth, off, EVERY)
         for lapse in (0, 0.05):
-            data = replace(gather(obs), lapse=lapse)
+            data = gather(obs, Levels(lapse=lapse))
 
             def block(s):
                 step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))

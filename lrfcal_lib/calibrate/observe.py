@@ -13,19 +13,20 @@ from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED, Corrections, SourceFrame
 from lrfcal_lib.model.observations import (
+    LENS,
     CameraObservations,
     JointObservations,
     PlatformObservations,
 )
 from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.outline_in_images import side_lines
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import VARIANTS, DroppedSide
 from lrfcal_lib.preprocess.survey import all_views, small_squares
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
-from lrfcal_lib.solvers.joint_noise import LENS, pose_by_intrinsics
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
 
 ONE_SCAN = "one_scan"

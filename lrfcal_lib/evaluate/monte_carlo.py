@@ -19,8 +19,9 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations
-from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
+from lrfcal_lib.preprocess.board_in_scan import fit_lines
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
+from lrfcal_lib.preprocess.surfaces import row_ends
 from lrfcal_lib.simulate.draw import ShotSetup
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge

@@ -9,6 +9,7 @@ from lrfcal_lib.model.board import outline_lines
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
 
+LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 ROUGH_NOISE = 1e-4 * np.eye(3)  # a centimetre every way, for points whose covariance is not told
 
 
