@@ -121,11 +121,12 @@ def estimate_pose(
 
     def equal_weights(pose, _):
         """The residuals with one weight for all, at a pose."""
-        weight = np.mean(residual(pose, obs).whitener ** -2.0) ** -0.5
+        weight = np.mean(_variances(residual(pose, obs)), axis=-1, keepdims=True) ** -0.5
 
         def plain(pose):
             block = residual(pose, obs)
-            return Block(block.residuals, block.jacobian, np.full_like(block.residuals, weight))
+            weights = np.broadcast_to(weight, block.residuals.shape)
+            return Block(block.residuals, block.jacobian, weights)
 
         return plain
 
@@ -138,6 +139,13 @@ def estimate_pose(
     return solve(
         problem, pose, move_pose, groups=placements, earlier=earlier, **unknowns, **options
     )
+
+
+def _variances(block):
+    """Variance of every residual, from its whitener."""
+    if block.whitener.ndim == block.residuals.ndim:
+        return block.whitener**-2.0
+    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(block.residuals.shape)
 
 
 def start_from_lines(obs: CameraObservations) -> RigidTransform:
