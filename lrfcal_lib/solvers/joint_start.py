@@ -20,7 +20,7 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.model.kinematics import TILT_AXIS
 from lrfcal_lib.model.observations import CameraObservations, JointObservations
 from lrfcal_lib.solvers.joint_model import JointState
-from lrfcal_lib.solvers.planes import start_from_planes
+from lrfcal_lib.solvers.plane_start import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii
 LEAST_TURN = np.radians(1.0)  # between two images of a camera for the axis
