@@ -15,7 +15,7 @@ from lrfcal_lib.model.geometry import (
     pose_array,
     pose_transform,
 )
-from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.model.observations import CameraObservations, thin
 from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.planes import start_from_planes
 
@@ -70,15 +70,6 @@ def start_states(obs, T0=None):
         raise DegenerateGeometry(
             "no start value for the joint estimate: " + "; ".join(dict.fromkeys(reasons))
         )
-
-
-def thin(rows, count):
-    """At most `count` of some rows, evenly spread."""
-    return (
-        rows
-        if len(rows) <= count
-        else rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
-    )
 
 
 def _camera(obs, camera, head=None):
