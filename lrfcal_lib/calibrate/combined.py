@@ -216,7 +216,7 @@ def case_of(joint, observations, placement):
     )
     whitener = whitener_of(solution.solution.trusted)
     return Case(
-        data=joint_model.gather(obs, **solution.data.levels | {"prior": None}),
+        data=joint_model.gather(obs, replace(solution.data.levels, prior=None)),
         unknowns=solution.unknowns,
         whitener=whitener,
         images=images,

@@ -221,8 +221,6 @@ def _crossings(prepared, view, source, sides, count):
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
             "covariance": source.covariance(edges.covariance[rows], pitch) + pitch_error,
-            "noise": source.covariance(edges.noise[rows], pitch) + pitch_error,
-            "half_step": (source.rotation(pitch) @ edges.half_step[rows][..., None])[..., 0],
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": edges.background[rows],
             "lines": np.tile(edge.line, (n, 1)),

@@ -4,13 +4,13 @@ import numpy as np
 
 from lrfcal_lib.calibrate.observe import FACE_POINTS, stack
 from lrfcal_lib.model.board import corners_of_lines
-from lrfcal_lib.model.observations import JointObservations, thin
+from lrfcal_lib.model.observations import LENS, JointObservations, thin
 from lrfcal_lib.preprocess.board_in_image import BoardView
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edge_cells import edge_cells
-from lrfcal_lib.preprocess.edges_in_image import side_lines
+from lrfcal_lib.preprocess.outline_in_images import side_lines
 from lrfcal_lib.preprocess.prepared import Prepared
-from lrfcal_lib.solvers.joint_noise import LENS, pose_by_intrinsics
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 
 CELLS_PER_EDGE = 160  # a placement, of each edge
 

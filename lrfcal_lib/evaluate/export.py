@@ -83,7 +83,7 @@ def calibration_record(calibration, method, judged=None):
         }
         record["sensor"] = sensor | {
             "noise": joint.noise,
-            "excluded": list(joint.excluded.values()),
+            "excluded": [str(problem) for problem in joint.excluded],
         }
     return record
 
