@@ -2,6 +2,7 @@
 everything at once.
 """
 
+import operator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,7 +32,8 @@ from lrfcal_lib.preprocess.prepared import (
     prepare_scans,
 )
 from lrfcal_lib.preprocess.survey import all_views
-from lrfcal_lib.session.cache import cached, spread
+from lrfcal_lib.session.cache import cached
+from lrfcal_lib.session.workers import spread
 from lrfcal_lib.solvers import METHODS, SHIPPED, best_method, row_of, solve_camera
 from lrfcal_lib.solvers.joint import JointSolution, solve_again, solve_joint
 from lrfcal_lib.solvers.pitch import estimate_pitch_errors
@@ -200,9 +202,7 @@ def _calibrate(session, methods):
     """As :func:`calibrate`, by methods that do not change."""
     prepared = prepare(session)
     stages = [partial(joint_or_words, prepared, all_views(prepared))] if prepared.views else []
-    *joint, found = spread(
-        lambda stage: stage(), [*stages, partial(_by_themselves, prepared, methods)]
-    )
+    *joint, found = spread(operator.call, [*stages, partial(_by_themselves, prepared, methods)])
     return with_joint(found, *joint) if joint else found
 
 

@@ -37,8 +37,8 @@ from lrfcal_lib.preprocess.pattern_in_image import (
     spread_views,
     square_px,
 )
-from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.stated import short
+from lrfcal_lib.session.workers import spread
 
 # weight of the turn between two cameras where few placements tell: most look the same way, head up
 UPRIGHT = 0.05
