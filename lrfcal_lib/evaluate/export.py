@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
+from lrfcal_lib.calibrate.clouds import cloud_blocks
+from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
@@ -19,8 +20,8 @@ from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.verdict import NO, judge
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
-from lrfcal_lib.session.write import whole
 from lrfcal_lib.session.workers import spread
+from lrfcal_lib.session.write import whole
 
 SCHEMA = 1
 AXIS_PARAMETERS = [
@@ -63,7 +64,7 @@ def calibration_record(calibration, method, judged=None):
         "platform": {
             **_transform(platform.transform(axis)),
             "maps": "lrf to head",
-            "axis_covariance": platform.parameters()[axis][1].tolist(),
+            "axis_covariance": platform.axes[axis].covariance.tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
         "cameras": {
@@ -290,5 +291,5 @@ def _print_poses(calibration):
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for key, why in (calibration.prepared.problems | calibration.problems).items():
-        print(f"{key}: {why}")
+    for problem in (*calibration.prepared.problems, *calibration.problems):
+        print(problem)

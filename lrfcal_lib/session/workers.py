@@ -13,7 +13,7 @@ from functools import partial
 
 _executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
 _cores: ContextVar[int] = ContextVar("cores", default=1)  # for processes of our own
-_loop: tuple = ()  # of a forked process: what is to be done, and with what
+_loop: tuple = ()  # of a forked process, which finds it in its memory
 
 
 @contextmanager
@@ -56,34 +56,51 @@ def spread(work: Callable, items: Iterable) -> list:
     -------
     list
         Every result is a copy, as a pickle makes it: sums over arrays of another layout in memory
-        differ in the last digit. What a worker could not do because it died is done here.
+        differ in the last digit. What a worker could not do is done here.
     """
     items = list(items)
-    results = []
-    with suppress(BrokenExecutor):
-        for result in _results(partial(_packed, work), items):
-            results.append(pickle.loads(result))
-    for item in items[len(results) :]:
-        results.append(pickle.loads(_packed(work, item)))
-    return results
-
-
-def _results(work, items):
-    """What work gives of each item, in order, by whoever is to do it."""
     executor = _executor.get()
     cores = min(_cores.get(), len(items))
+    results = {}
     if executor is not None and len(items) > 1:
-        yield from executor.map(work, items)
+        with suppress(BrokenExecutor):
+            for number, result in enumerate(executor.map(partial(_packed, work), items)):
+                results[number] = result
     elif cores > 1:
-        fork = multiprocessing.get_context("fork")
-        with _pool(cores, fork, work, items) as pool:
-            yield from pool.map(_numbered, range(len(items)))
-    else:
-        yield from map(work, items)
+        results = _forked(work, items, cores)
+    for number, item in enumerate(items):
+        if number not in results:
+            results[number] = _packed(work, item)
+    return [pickle.loads(results[number]) for number in range(len(items))]
 
 
 def _packed(work, item):
     return pickle.dumps(work(item))
+
+
+def _forked(work, items, cores):
+    """Results by number, of forked processes and of this one, which keeps what it has read."""
+    fork = multiprocessing.get_context("fork")
+    loop = (work, items, fork.Value("i"))
+    with _pool(cores - 1, fork, loop) as pool, _setting(_cores, 1):
+        others = [pool.submit(_take_part) for _ in range(cores - 1)]
+        results = _rounds(*loop)
+        for other in others:
+            with suppress(BrokenExecutor):
+                results |= other.result()
+    return results
+
+
+def _rounds(work, items, begun):
+    """Whoever is free takes the next item, until none is left or one fails: results by number."""
+    results = {}
+    with suppress(Exception):
+        while True:
+            with begun.get_lock():
+                number = begun.value
+                begun.value += 1
+            results[number] = _packed(work, items[number])
+    return results
 
 
 @contextmanager
@@ -96,11 +113,8 @@ def _setting(variable, value):
 
 
 @contextmanager
-def _pool(count, context, *loop):
-    """Processes that end with this one, however it ends, and at once where anything is raised.
-
-    Processes that are forked find the `loop` in their memory.
-    """
+def _pool(count, context, loop=()):
+    """Processes that end with this one, however it ends, and at once where anything is raised."""
     ours, theirs = context.Pipe()
     with ours, theirs, ProcessPoolExecutor(count, context, _begin, (ours, theirs, loop)) as pool:
         try:
@@ -127,7 +141,6 @@ def _end_with(pipe):
     os._exit(1)
 
 
-def _numbered(number):
-    """One round of the loop that this process was forked for."""
-    work, items = _loop
-    return work(items[number])
+def _take_part():
+    """In a forked worker."""
+    return _rounds(*_loop)
