@@ -93,8 +93,6 @@ REGIONS = [
     for both in product(("top", "", "bottom"), ("left", "", "right"))
 ]
 NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
-# warnings of the solver that are findings of their own
-SAID = ("not converged", "the data do not determine")
 
 NO_BOUND = {"mm": 1e4, "px": 1e4}  # ten metres; more pixels than an image has
 
@@ -563,7 +561,7 @@ def _left_out(calibration, method):
     used = set(table.index[table.used]) - set(prepared.left_out)
     if method == "joint":
         used = set(calibration.joint.solution.boards)
-        excluded = calibration.joint.solution.excluded
+        excluded = calibration.joint.solution.excluded_placements
     lost = [p for p in table.index if p not in used]
     reasons = []
     for camera, views in prepared.views.items():
@@ -623,7 +621,7 @@ def diagnose(solution):
         (len(np.unique(obs.view_placement[obs.view_camera == i])), c)
         for i, c in enumerate(obs.cameras)
     ]
-    own = [words for words in solution.warnings if not words.startswith(SAID)]
+    own = solution.warnings
     findings = [
         (
             not solution.converged,
@@ -755,7 +753,7 @@ def _of_residuals(solution):
     share = solution.noise["face_share"]
     return [
         (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
-        (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
+        (solution.excluded, CARE, "excluded", "; ".join(map(str, solution.excluded))),
         (
             ratio[worst] > MODEL_ERROR,
             CARE,

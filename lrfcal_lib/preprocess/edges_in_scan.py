@@ -190,11 +190,6 @@ class ScanEdges:
     side : ndarray of int, shape (n,)
         Number of the straight side; -1 for outliers.
     sides : tuple of ScanSide
-    half_step : ndarray, shape (n, 3)
-        From the point halfway between the last beam on the board and the first off it to the
-        latter, metres.
-    noise : ndarray, shape (n, 3, 3)
-        The covariance without the beam spacing.
     background : ndarray, shape (n,)
         What the distance of the background adds to the log odds at which readings flip
         (:func:`background_odds`).
@@ -210,8 +205,6 @@ class ScanEdges:
     end: np.ndarray
     side: np.ndarray
     sides: tuple[ScanSide, ...]
-    half_step: np.ndarray
-    noise: np.ndarray
     background: np.ndarray
 
 
@@ -278,7 +271,7 @@ def crossings(scan, across=False, known=()):
         lean = [np.pi / 2 - s.angle if across else s.angle for s in every]
         sides = tuple(s for s, angle in zip(every, lean, strict=True) if angle >= LEAST_ANGLE)
         side = np.where(np.isin(side, [s.side for s in sides]), side, -1)
-    about = line, beam, step, end, side, sides, by_angle * (gap / 2)[:, None]
+    about = line, beam, step, end, side, sides
     odds = background_odds(here, behind)
     found = {}
     for variant, angle, there in (("last_beam", inner, pitch), ("half_step", middle, when)):
@@ -286,7 +279,7 @@ def crossings(scan, across=False, known=()):
         rays = points / np.linalg.norm(points, axis=1, keepdims=True)
         noise = _outer(rays * np.hypot(range_sigma, warp_sigma)[:, None])
         spacing = _outer(by_angle * sigma[:, None])
-        found[variant] = ScanEdges(variant, points, spacing + noise, there, *about, noise, odds)
+        found[variant] = ScanEdges(variant, points, spacing + noise, there, *about, odds)
     return found, every
 
 
