@@ -2,6 +2,7 @@
 everything at once.
 """
 
+import operator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,8 +34,9 @@ from lrfcal_lib.preprocess.prepared import (
     prepare_scans,
 )
 from lrfcal_lib.preprocess.survey import all_views
-from lrfcal_lib.session.cache import cached, spread
+from lrfcal_lib.session.cache import cached
 from lrfcal_lib.session.read import Session
+from lrfcal_lib.session.workers import spread
 from lrfcal_lib.solvers import METHODS, SHIPPED, best_method, row_of
 from lrfcal_lib.solvers.joint import solve_again, solve_joint
 from lrfcal_lib.solvers.joint_solution import JointSolution
@@ -184,7 +186,7 @@ def _calibrate(session, methods):
     if not prepared.views:
         return cameras()
     joint = partial(joint_or_problem, prepared, all_views(prepared))
-    at_once, calibration = spread(lambda stage: stage(), [joint, cameras])
+    at_once, calibration = spread(operator.call, [joint, cameras])
     return with_joint(calibration, at_once)
 
 

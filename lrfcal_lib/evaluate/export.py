@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import operator
 import os
 from functools import partial
 from pathlib import Path
@@ -17,9 +18,9 @@ from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
 from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.verdict import NO, judge
-from lrfcal_lib.session.cache import spread
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import FILES, opened
+from lrfcal_lib.session.workers import spread
 from lrfcal_lib.session.write import whole
 
 SCHEMA = 1
@@ -266,7 +267,7 @@ def calibrate_session(path, out=None):
     kinds = _kinds_of_clouds(calibration.prepared)
     clouds = [partial(_write_cloud, folder, calibration, method, kind) for kind in kinds]
     tasks = [*clouds, partial(_judged, calibration, method)]
-    *written, (judged, record) = spread(lambda task: task(), tasks)
+    *written, (judged, record) = spread(operator.call, tasks)
     file = folder / "calibration.json"
     write_calibration(file, record)  # last: where it stands, the clouds do
     print(*judged.sentences(), sep="\n")
