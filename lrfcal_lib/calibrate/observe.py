@@ -4,6 +4,7 @@ joint estimate.
 
 from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise, product
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -73,7 +74,6 @@ def observe(
     posed = {p: view for p, view in views.items() if view.T_camera_board is not None}
     on_faces = []
     crossed = []
-    corners = []
     for placement, scan in prepared.scans.items():
         if placement not in views:
             continue
@@ -85,10 +85,11 @@ def observe(
         else:
             sides = named_sides(prepared, placement, variant)
         crossed += _crossings(prepared, views[placement], source, sides, crossings)
+    corners: list = []
     if faces:
         rule = "last_beam" if variant == ONE_SCAN else variant
         boards = {} if outlines is None else outlines
-        corners = _corners(prepared, camera, rule, T_head_lrf, boards)
+        corners += _corners(prepared, camera, rule, T_head_lrf, boards)
     on_base = prepared.session.cameras[camera].mount == "platform"
     return CameraObservations(
         camera=camera,
@@ -153,7 +154,7 @@ def platform_observations(prepared: Prepared, variant: str = "half_step") -> Pla
     return PlatformObservations(**stack("edge_", sides), **stack("face_", faces))
 
 
-def stack(prefix: str, parts: Iterable[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def stack(prefix: str, parts: Iterable[dict]) -> dict[str, Any]:
     """Parts of a table end to end: its columns by name, with a prefix; none without parts."""
     parts = list(parts)
     if not parts:

@@ -36,13 +36,11 @@ def observe_joint(prepared: Prepared, views: dict[str, list[BoardView]]) -> Join
     if board.corners is None and board.pattern is not None:
         # nobody knows the outline: no beam is named after the sides of the printed squares
         corners = corners_of_lines(side_lines(board.pattern, np.full(4, board.pattern.square)))
-    lens_covariance = None
-    if views:
-        lens_covariance = np.zeros((len(views), LENS, LENS))
-        for number, camera in enumerate(views):
-            known = prepared.models[camera].covariance
-            if known is not None:
-                lens_covariance[number] = known
+    lens_covariance = np.zeros((len(views), LENS, LENS))
+    for number, camera in enumerate(views):
+        known = prepared.models[camera].covariance
+        if known is not None:
+            lens_covariance[number] = known
     return JointObservations(
         placements=np.array(list(scans), int),
         direction=np.array([session.sweep_direction(p) for p in scans], int),

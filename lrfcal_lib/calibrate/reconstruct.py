@@ -2,7 +2,7 @@
 in bounded memory.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +70,7 @@ def reconstruct(
         mask = np.isfinite(sweep.ranges)
     steps = (_pitch_step(sweep), lrf.bearing_step)
     painter = Painter(views, max(steps), BEHIND * lrf.sigma_range)
-    blocks = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
+    blocks: Iterable[_Block] = _Blocks(sweep, steps, T_head_lrf, corrections, lrf, continuous)
     if sweep.ranges.size <= KEPT:
         blocks = list(blocks)
     points = []
