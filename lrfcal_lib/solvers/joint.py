@@ -307,8 +307,10 @@ def solve_joint(
     unknowns = Unknowns(len(obs.cameras), len(obs.edges), axis, tuple(sensor), sweep, sides=sides)
     rivals = ()
     settled = False
+    placements = len(obs.placements)
     if start is None:
         obs, lost = without_lost_placements(obs)
+        placements -= len(lost)
         best, rivals = best_start(obs, unknowns, sweep_sigma, T0)
         obs = best.kept
         start = best.state
@@ -329,7 +331,7 @@ def solve_joint(
     if noise == "estimate" or lapse:
         state = converged(state, data, unknowns, LAST_STEP)
     if required:  # a cause before what follows from it: edges that fit nowhere, say
-        refuse_contradiction(state, data, LAST_MISS)
+        refuse_contradiction(state, data, LAST_MISS, left_out=placements - len(obs.placements))
     found = finished(obs, state, data, unknowns, excluded, required)
     return replace(found, warnings=rivals + found.warnings)
 
@@ -490,20 +492,18 @@ def best_start(obs, unknowns, sweep_sigma, T0=None):
     return best, second_minima(obs, tried, best)
 
 
-def refuse_contradiction(state, data, most):
-    """Raise DegenerateGeometry where images put a third of the boards more than `most` metres
-    off where they are.
+def refuse_contradiction(state, data, most, left_out=0):
+    """Raise DegenerateGeometry where a third of the placements contradict: images put their boards
+    more than `most` metres off where they are, or they are left out already for that.
     """
     seen = data.view["used"].any(axis=1)
-    if (
-        seen.any()
-        and (miss := np.quantile(joint_noise.view_misses(state, data)[seen], 2 / 3)) > most
-    ):
+    wrong = left_out + np.sum(joint_noise.view_misses(state, data)[seen] > most)
+    count = left_out + np.sum(seen)
+    if 3 * wrong > count:
         raise DegenerateGeometry(
-            "images and scans contradict each other: for a third of the placements the board "
-            f"lies {1000 * miss:.0f} "
-            "mm or more off where the images put it; check that images and scans carry the right "
-            "numbers"
+            f"images and scans contradict each other: for {wrong} of {count} placements the board "
+            f"lies more than {1000 * most:.0f} mm off where the images put it; check that images "
+            "and scans carry the right numbers"
         )
 
 

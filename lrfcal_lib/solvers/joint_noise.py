@@ -21,7 +21,7 @@ PITCH_LEVELS = np.radians(
 SCALE_ROUNDS = 4
 SCALE_LIMITS = (1e-4, 1e4)
 SIDE_ROUNDS = 20
-# curvature of the beams' cost, relative to their information: below 0 where most contradict their edges
+# of beams, relative to their information; where most contradict their edges it is negative
 LEAST_CURVATURE = 0.1
 SETTLED = 0.02  # change of the logarithm of a noise level
 # scatter of residuals in stated standard deviations that still agrees with the statement
