@@ -652,6 +652,13 @@ COLUMNS |= {name: ("<f4", name) for name in ("pitch", "bearing", "range", "inten
 KINDS = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 
 
+def record_type(columns):
+    """The dtype of one point in a file with columns like :data:`COLUMNS`."""
+    return np.dtype(
+        [(field, kind, (len(names.split()),)) for field, (kind, names) in columns.items()]
+    )
+
+
 def write_ply(path, clouds, comments=()):
     """Write a cloud, or blocks of one as they come, as binary PLY with all attributes; frame and
     units are comments.
@@ -671,9 +678,7 @@ def write_ply(path, clouds, comments=()):
         for kind, names in COLUMNS.values()
         for name in names.split()
     ]
-    table = np.dtype(
-        [(field, kind, (len(names.split()),)) for field, (kind, names) in COLUMNS.items()]
-    )
+    table = record_type(COLUMNS)
 
     def header(number):
         """The same length for every number of points."""

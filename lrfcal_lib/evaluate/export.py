@@ -10,7 +10,7 @@ import numpy as np
 
 from lrfcal_lib import __version__
 from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
-from lrfcal_lib.calibrate.reconstruct import write_ply
+from lrfcal_lib.calibrate.reconstruct import COLUMNS, record_type, write_ply
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
@@ -28,6 +28,13 @@ AXIS_PARAMETERS = [
     "offset_in_scan_plane_m",
     "offset_across_scan_plane_m",
 ]
+# of a PCD file, as its readers call them
+PCD_COLUMNS = COLUMNS | {
+    "normals": ("<f4", "normal_x normal_y normal_z"),
+    "colors": ("<u4", "rgb"),
+}
+RGB = np.array([[1 << 16], [1 << 8], [1]], "<u4")  # red, green and blue in one number
+POINTS_AT_ONCE = 1_000_000  # that are copied, 60 MB
 UNTRUSTED = 3  # exit status of a calibration whose verdict is 'no'
 SCENES_ONLY = (
     "all placements show scenes, and a calibration needs the board: "
@@ -216,16 +223,44 @@ def _write_cloud(folder, calibration, method, scene):
 
 
 def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as PCD.
+    """Write what a PLY of :func:`write_ply` holds as binary PCD.
 
     ValueError if the file cannot be written.
     """
-    import open3d as o3d
+    stored = record_type(COLUMNS)
+    with open(ply, "rb") as source, whole(path) as draft, open(draft, "wb") as file:
+        while source.readline() != b"end_header\n":
+            pass
+        count = (os.path.getsize(ply) - source.tell()) // stored.itemsize
+        file.write(_pcd_header(count).encode())
+        for start in range(0, count, POINTS_AT_ONCE):
+            points = np.fromfile(source, stored, min(POINTS_AT_ONCE, count - start))
+            packed = np.empty(len(points), record_type(PCD_COLUMNS))
+            for field in COLUMNS:
+                packed[field] = points[field] @ RGB if field == "colors" else points[field]
+            file.write(packed.tobytes())
 
-    cloud = o3d.t.io.read_point_cloud(str(ply))
-    with whole(path) as draft:
-        if not o3d.t.io.write_point_cloud(str(draft), cloud):
-            raise OSError("is the disk full?")
+
+def _pcd_header(count):
+    """The lines before the points of a PCD file."""
+    names = []
+    types = []
+    for kind, columns in PCD_COLUMNS.values():
+        names += columns.split()
+        types += [np.dtype(kind)] * len(columns.split())
+    lines = (
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary\n",
+    )
+    return "\n".join(lines)
 
 
 def calibrate_session(path, out=None):
