@@ -109,7 +109,7 @@ def check_scan(sweep, board, T_head_lrf=None, lrf=None):
             Light(
                 "scan",
                 "bad",
-                f"no board: {str(error).partition(': ')[2]}; sweep over all of it, free of walls",
+                f"no board: {error}; sweep over all of it, free of walls",
             )
         ]
     rows = np.flatnonzero(found.mask.any(axis=1))

@@ -13,18 +13,20 @@ from lrfcal_lib.model.board import corners_of_lines
 from lrfcal_lib.model.geometry import DegenerateGeometry, fit_line, tilt
 from lrfcal_lib.model.kinematics import AS_RECORDED, Corrections, SourceFrame
 from lrfcal_lib.model.observations import (
+    LENS,
     CameraObservations,
     JointObservations,
     PlatformObservations,
 )
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import face_points
-from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
+from lrfcal_lib.preprocess.outline_in_images import side_lines
 from lrfcal_lib.preprocess.pattern_in_image import SMALL_SQUARE_PX
 from lrfcal_lib.preprocess.prepared import VARIANTS, DroppedSide
 from lrfcal_lib.preprocess.survey import all_views, small_squares
 from lrfcal_lib.solvers import find_outlying_placements, solve_camera
-from lrfcal_lib.solvers.joint_noise import LENS, pose_by_intrinsics
+from lrfcal_lib.solvers.joint_lens import pose_by_intrinsics
 from lrfcal_lib.solvers.joint_start import thin
 
 ONE_SCAN = "one_scan"
@@ -174,12 +176,8 @@ class RecordedSource:
 
     def covariance(self, covariance, pitch):
         """Covariances (n, 3, 3) of measured points, turned into the source frame."""
-        R = self.rotation(pitch)
+        R = self.frame.rotation(self.corrections.pitch(self.placement, pitch))
         return R @ covariance @ R.swapaxes(-1, -2)
-
-    def rotation(self, pitch):
-        """Rotation matrices (n, 3, 3) from the LRF at a recorded pitch (n,) to the source frame."""
-        return self.frame.rotation(self.corrections.pitch(self.placement, pitch))
 
     def by_pitch(self, p_lrf, pitch):
         """Derivative (n, 3) of :meth:`points` by an error of the recorded pitch, metres a
@@ -255,8 +253,6 @@ def _crossings(prepared, placement, view, source, sides):
             "points": source.points(p_lrf, pitch),
             "pitch": pitch,
             "covariance": source.covariance(scanned.covariance[rows], pitch) + pitch_error,
-            "noise": source.covariance(scanned.noise[rows], pitch) + pitch_error,
-            "half_step": (source.rotation(pitch) @ scanned.half_step[rows][..., None])[..., 0],
             "radius": prepared.session.lrf.spot_radius(np.linalg.norm(p_lrf, axis=1)),
             "background": scanned.background[rows],
             "lines": np.tile(edge.line, (n, 1)),
@@ -393,8 +389,8 @@ def name_sides(prepared):
                 rows = found.side == side
                 sides.setdefault(int(side), on_board(found.points[rows], found.pitch[rows]))
         names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
-        for side, why in dropped[placement].items():
-            problems[f"{placement} {side}"] = f"placement {placement}: {why.words}"
+        for why in dropped[placement].values():
+            problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement))
     return names, dropped, problems
 
 
@@ -422,19 +418,18 @@ def board_maps(prepared, rough):
 
 
 def rough_poses(prepared):
-    """Poses ``T_camera_source`` of the cameras from the planes alone, and problems by placement or
-    camera.
+    """Poses ``T_camera_source`` of the cameras from the planes alone, and a list of Problem.
 
     Problems are placements that disagree with all others, and why a camera has no pose.
     """
-    rough, problems, misses = {}, {}, {}
+    rough, problems, misses = {}, [], {}
     for camera in prepared.views:
         obs = observe(prepared, camera)
         try:
             inliers, outlying = find_outlying_placements(obs)
             rough[camera] = solve_camera(obs.select(inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
-            problems[f"camera {camera}"] = str(error)
+            problems.append(Problem(Stage.SIDES, ProblemKind.NO_POSE, str(error), camera=camera))
             continue
         for placement in obs.placements.tolist():
             misses.setdefault(placement, {})[camera] = outlying.get(placement, 0.0)
@@ -448,7 +443,8 @@ def rough_poses(prepared):
                     f"scan: {off} board in the images of all {len(miss)} cameras "
                     f"({_causes(prepared, placement)})"
                 )
-            problems[placement] = f"{words}; left out"
+            words = f"{words}; left out"
+            problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, words, placement))
     return rough, problems
 
 
@@ -497,14 +493,14 @@ def nearest_edges(board, sides):
 
 def observe_joint(prepared, views=None):
     """Everything that the joint estimate uses of a session, of the placements that
-    `prepared.problems` does not name.
+    are not left out.
 
     `views` are lists of BoardView by camera; those of :func:`all_views` when left out.
     """
     if views is None:
         views = all_views(prepared)
     session = prepared.session
-    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.problems}
+    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
     ranges = [_ranges(scan, row) for row, scan in enumerate(scans.values())]
     lens_covariance = None
     if views:

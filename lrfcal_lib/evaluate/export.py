@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
-from lrfcal_lib.calibrate.reconstruct import COLUMNS, record_type, write_ply
+from lrfcal_lib.calibrate.cloud import COLUMNS, point_type, write_ply
+from lrfcal_lib.calibrate.clouds import cloud_blocks
+from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
@@ -69,7 +70,7 @@ def calibration_record(calibration, method, judged=None):
         "platform": {
             **_transform(platform.transform(axis)),
             "maps": "lrf to head",
-            "axis_covariance": platform.parameters()[axis][1].tolist(),
+            "axis_covariance": platform.axes[axis].covariance.tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
         "cameras": {
@@ -89,7 +90,7 @@ def calibration_record(calibration, method, judged=None):
         }
         record["sensor"] = sensor | {
             "noise": joint.noise,
-            "excluded": list(joint.excluded.values()),
+            "excluded": [str(problem) for problem in joint.excluded],
         }
     return record
 
@@ -227,7 +228,7 @@ def write_pcd(path, ply):
 
     ValueError if the file cannot be written.
     """
-    stored = record_type(COLUMNS)
+    stored = point_type(COLUMNS)
     with open(ply, "rb") as source, whole(path) as draft, open(draft, "wb") as file:
         while source.readline() != b"end_header\n":
             pass
@@ -235,7 +236,7 @@ def write_pcd(path, ply):
         file.write(_pcd_header(count).encode())
         for start in range(0, count, POINTS_AT_ONCE):
             points = np.fromfile(source, stored, min(POINTS_AT_ONCE, count - start))
-            packed = np.empty(len(points), record_type(PCD_COLUMNS))
+            packed = np.empty(len(points), point_type(PCD_COLUMNS))
             for field in COLUMNS:
                 packed[field] = points[field] @ RGB if field == "colors" else points[field]
             file.write(packed.tobytes())
@@ -324,5 +325,5 @@ def _print_poses(calibration):
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for key, why in (calibration.prepared.problems | calibration.problems).items():
-        print(f"{key}: {why}")
+    for problem in (*calibration.prepared.problems, *calibration.problems):
+        print(problem)
