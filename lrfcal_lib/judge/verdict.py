@@ -355,7 +355,8 @@ def judge(calibration, method=None, **options):
         words,
     )
     if method == "joint" and not sizes:
-        notes += (step_not_told(joint.solution, prepared.session.lrf.admitted_offset),)
+        words = step_not_told(joint.solution, prepared.session.lrf.admitted_offset)
+        notes += (words,) if words else ()
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
         known = 100 / np.sqrt(2 * (n - 1))
         within = stdtrit(n - 1, 0.95)
