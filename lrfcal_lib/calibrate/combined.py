@@ -13,7 +13,7 @@ from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.board_in_image import line_misses
+from lrfcal_lib.preprocess.pose_from_lines import line_misses
 
 STILL = 1e5  # information roots of what moves board and sides together, which changes no length
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
