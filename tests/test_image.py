@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
 from lrfcal_lib.calibrate import observe
-from lrfcal_lib.calibrate.pipeline import stereo_reference
+from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
 from lrfcal_lib.model.problem import ProblemKind
@@ -579,7 +579,8 @@ def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
     views = [{p: SimpleNamespace(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)]
     views, models = (dict(enumerate(each)) for each in (views, models))
     board = SimpleNamespace(pattern=pattern)
-    return stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))[1:]
+    reference = stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))
+    return reference.T_second_first, reference.covariance
 
 
 def test_stereo_reference_recovers_the_mounting_and_its_covariance_tells_the_error():
@@ -655,7 +656,8 @@ def test_real_cameras_edges_and_outline(lms400):
 
 
 def test_real_stereo(lms400):
-    refined, covariance = stereo_reference(lms400.prepared)[1:]
+    reference = stereo_reference(lms400.prepared)
+    refined, covariance = reference.T_second_first, reference.covariance
     # shape-free bundle of an independent analysis, with its own uncertainty
     off = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
     sigma = np.sqrt(np.diag(covariance)) * np.repeat([np.rad2deg(1), 1000], 3)

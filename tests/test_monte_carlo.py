@@ -10,9 +10,10 @@ from scipy.stats import chi2
 from shared import campaign
 
 from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, state_errors
-from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_model import Unknowns
 
 SENSOR = ("range_offset", "edge_log_odds")
 NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "left_rx", "left_tx", "range_offset")
@@ -80,6 +81,18 @@ def test_what_leaves_no_bound_is_named():
     obs, truth, _ = draw(np.random.default_rng(0), 5)
     with pytest.raises(DegenerateGeometry, match="leave .*edge_log_odds.* open"):
         bound(none(obs, "beam"), truth, Unknowns(2, 3, sensor=SENSOR))
+
+
+# single shots
+
+
+def test_neither_rule_for_the_edge_point_suits_every_bias_and_the_better_one_beats_planes_on_the_average():
+    """In the draws of notebook 08."""
+    table = pd.read_csv(GOLDEN / "sim_lms221" / "single_shots.csv").set_index(["step_deg", "bias", "method"])
+    rotation = table.rotation_median_deg.unstack("method")
+    rules = rotation[["line_last_beam", "line"]]
+    assert set(rules.idxmin(axis=1)) == {"line_last_beam", "line"}
+    assert rotation.zhang_pless.mean() > 1.5 * rules.min(axis=1).mean()
 
 
 # the estimator

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
-from lrfcal_lib.calibrate.reconstruct import write_ply
+from lrfcal_lib.calibrate.cloud import write_ply
+from lrfcal_lib.calibrate.clouds import cloud_blocks
+from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
 from lrfcal_lib.evaluate.tables import plane_residuals_of, rms
@@ -62,7 +63,7 @@ def calibration_record(calibration, method, judged=None):
         "platform": {
             **_transform(platform.transform(axis)),
             "maps": "lrf to head",
-            "axis_covariance": platform.parameters()[axis][1].tolist(),
+            "axis_covariance": platform.axes[axis].covariance.tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
         "cameras": {
@@ -82,7 +83,7 @@ def calibration_record(calibration, method, judged=None):
         }
         record["sensor"] = sensor | {
             "noise": joint.noise,
-            "excluded": list(joint.excluded.values()),
+            "excluded": [str(problem) for problem in joint.excluded],
         }
     return record
 
@@ -289,7 +290,5 @@ def _print_poses(calibration):
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for problem in calibration.prepared.problems:
+    for problem in (*calibration.prepared.problems, *calibration.problems):
         print(problem)
-    for key, why in calibration.problems.items():
-        print(f"{key}: {why}")

@@ -12,7 +12,6 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge import alternatives
 from lrfcal_lib.judge.alternatives import (
     alternatives_of,
     doubtful,
@@ -94,8 +93,6 @@ REGIONS = [
     for both in product(("top", "", "bottom"), ("left", "", "right"))
 ]
 NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
-# warnings of the solver that are findings of their own
-SAID = ("not converged", "the data do not determine")
 
 NO_BOUND = {"mm": 1e4, "px": 1e4}  # ten metres; more pixels than an image has
 
@@ -116,7 +113,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from
-        stated', 'sense', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
+        stated', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
         'convergence', 'unobservable', 'cameras', 'lens', 'second minimum', 'placements',
         'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error',
         'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
@@ -371,8 +368,12 @@ def _refusal(calibration):
     an answer.
     """
     prepared = calibration.prepared
-    problems = calibration.problems
-    why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
+    at_once = calibration.problem("joint")
+    if at_once is not None:
+        why = at_once.words
+    else:
+        words = dict.fromkeys(problem.words for problem in calibration.problems)
+        why = "; ".join([*words][:3])
     if not prepared.views:
         lost = prepared.problems_of(ProblemKind.NO_IMAGES)
         why = lost[0].words if lost else "the session has no camera"
@@ -392,7 +393,6 @@ def sight_of(prepared):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared = calibration.prepared
-    problems = calibration.problems
     joint = calibration.joint
     solved = {
         camera: found for (camera, name), found in calibration.solutions.items() if name == method
@@ -402,7 +402,9 @@ def _without_joint(calibration, method, doubt):
         if joint is None
         else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
     )
-    why = "; ".join(bad) or problems.get(("rig", "joint"), "another method was asked for")
+    at_once = calibration.problem("joint")
+    asked = "another method was asked for" if at_once is None else at_once.words
+    why = "; ".join(bad) or asked
     answer = NO if joint is None or not joint.solution.converged else CARE
     reasons = [Reason(answer, "handed over", f"the joint estimate is not handed over ({why})")]
     fewest = min(
@@ -412,21 +414,20 @@ def _without_joint(calibration, method, doubt):
         reasons.append(
             Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed")
         )
-    lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
-    reasons += [
-        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})")
-        for c, why in lost.items()
-    ]
+    for camera in prepared.views:
+        if camera not in solved:
+            problem = calibration.problem(method, camera)
+            why = "no result" if problem is None else problem.words
+            reasons.append(Reason(CARE, "cameras", f"camera '{camera}' is not handed over ({why})"))
     reasons += [
         Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
         for camera, found in solved.items()
         if found.rival is not None
     ]
-    unknown = calibration.platform.problems.get("combined")
-    if unknown and any(
-        np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()
-    ):
-        reasons.append(Reason(NO, "far from stated", unknown))
+    sweeps = any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values())
+    unknown = calibration.platform.problem("combined")
+    if unknown is not None and sweeps:
+        reasons.append(Reason(NO, "far from stated", unknown.words))
     # the range offset of the cloud may be what the maker admits
     platform = calibration.platform
     session = prepared.session
@@ -435,10 +436,11 @@ def _without_joint(calibration, method, doubt):
     admitted = session.lrf.admitted_offset
     head = pose_array(platform.transform("combined"))
     offset = np.diag([admitted**2, 0.0, 0.0])
-    sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
+    of_axis = platform.axes["combined"].covariance
+    sigma = block_diag(of_axis, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
-        sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
+        sigma = block_diag(of_axis, found.trusted[:6, :6], 0 * offset)
         on_head = session.cameras[camera].mount == "head"
         chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
@@ -457,10 +459,6 @@ def contradicts_stated(joint):
     reasons = []
     doubt = 0.0
     level = joint.solution.noise["face_scale"]
-    hopeless = not alternatives.plausible(joint.solution) or level > ABSURD
-    # what else is found wrong comes from that
-    if hopeless and (words := alternatives.other_sense(joint)):
-        return [Reason(NO, "sense", words)], doubt
     if not joint.solution.converged:
         return [Reason(NO, "not weighed", f"{NOT_WEIGHED}: the estimate has not converged")], doubt
     offset = joint.solution.sensor["range_offset"]
@@ -563,7 +561,7 @@ def _left_out(calibration, method):
     used = set(table.index[table.used]) - set(prepared.left_out)
     if method == "joint":
         used = set(calibration.joint.solution.boards)
-        excluded = calibration.joint.solution.excluded
+        excluded = calibration.joint.solution.excluded_placements
     lost = [p for p in table.index if p not in used]
     reasons = []
     for camera, views in prepared.views.items():
@@ -623,7 +621,7 @@ def diagnose(solution):
         (len(np.unique(obs.view_placement[obs.view_camera == i])), c)
         for i, c in enumerate(obs.cameras)
     ]
-    own = [words for words in solution.warnings if not words.startswith(SAID)]
+    own = solution.warnings
     findings = [
         (
             not solution.converged,
@@ -651,7 +649,7 @@ def diagnose(solution):
 def _of_placements(solution):
     """What is weak about the recorded poses: rows of whether, answer, kind and words."""
     obs = solution.observations
-    boards = solution.state.boards
+    boards = solution.board_poses
     n = len(solution.boards)
     head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
     turned = obs.view_pitch[head]
@@ -755,7 +753,7 @@ def _of_residuals(solution):
     share = solution.noise["face_share"]
     return [
         (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
-        (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
+        (solution.excluded, CARE, "excluded", "; ".join(map(str, solution.excluded))),
         (
             ratio[worst] > MODEL_ERROR,
             CARE,

@@ -10,6 +10,9 @@ class Stage(Enum):
     SCANS = auto()
     IMAGES = auto()
     SIDES = auto()  # scans and images beside each other: planes, names of sides
+    PLATFORM = auto()  # the tilt axis by itself
+    CAMERAS = auto()  # one by one
+    JOINT = auto()  # everything at once
 
 
 class ProblemKind(Enum):
@@ -22,6 +25,9 @@ class ProblemKind(Enum):
     NO_IMAGES = auto()
     NO_OUTLINE = auto()  # the images do not show where the board ends
     SMALL_SQUARES = auto()  # of the pattern, in images of a camera
+    NO_RESULT = auto()  # by a method
+    TOO_LITTLE = auto()  # neither images nor edges enough for the pose of a board
+    CONTRADICTS = auto()  # placement or image: all others, in the joint estimate
 
 
 LEAVES_OUT = {ProblemKind.NO_BOARD, ProblemKind.OTHER_PLANE}  # the whole placement
@@ -39,6 +45,8 @@ class Problem:
         Why, for the user; without the placement.
     placement : int or None
     camera : str or None
+    method : str or None
+        That gives no result.
     """
 
     stage: Stage
@@ -46,11 +54,15 @@ class Problem:
     words: str
     placement: int | None = None
     camera: str | None = None
+    method: str | None = None
 
     def __str__(self) -> str:
-        """One sentence, with the placement or else the camera that it is about."""
+        """One sentence, with what it is about: the placement, or else the camera and the method."""
         if self.placement is not None:
             return f"placement {self.placement}: {self.words}"
+        about = []
         if self.camera is not None:
-            return f"camera '{self.camera}': {self.words}"
-        return self.words
+            about.append(f"camera '{self.camera}'")
+        if self.method is not None:
+            about.append(f"method '{self.method}'")
+        return ": ".join([*about, self.words])

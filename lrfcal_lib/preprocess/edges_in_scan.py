@@ -92,11 +92,6 @@ class ScanEdges:
     side : ndarray of int, shape (n,)
         Number of the straight side; -1 for outliers.
     sides : tuple of ScanSide
-    half_step : ndarray, shape (n, 3)
-        From the point halfway between the last beam on the board and the first off it to the
-        latter, metres.
-    noise : ndarray, shape (n, 3, 3)
-        The covariance without the beam spacing.
     background : ndarray, shape (n,)
         What the distance of the background adds to the log odds at which readings flip
         (:func:`background_odds`).
@@ -112,8 +107,6 @@ class ScanEdges:
     end: np.ndarray
     side: np.ndarray
     sides: tuple[ScanSide, ...]
-    half_step: np.ndarray
-    noise: np.ndarray
     background: np.ndarray
 
 
@@ -220,8 +213,6 @@ def crossings(
             end=ends.end,
             side=side,
             sides=sides,
-            half_step=middle.by_angle * (gap / 2)[:, None],
-            noise=noise,
             background=background_odds(here, behind),
         )
     return edges, every

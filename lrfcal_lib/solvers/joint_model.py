@@ -1,0 +1,211 @@
+"""The joint model: what moves, what of it is unknown, and the observations it is compared with.
+
+Poses of equations (4) to (6) and (16); residuals are in :mod:`lrfcal_lib.solvers.joint_residuals`.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lrfcal_lib.fit.axis_chart import move_head
+from lrfcal_lib.fit.least_squares import pad
+from lrfcal_lib.fit.result import AXIS_NAMES, PlatformPrior
+from lrfcal_lib.model import geometry
+from lrfcal_lib.model.geometry import move_pose
+from lrfcal_lib.model.observations import JointObservations
+
+SENSOR = ("range_offset", "edge_log_odds", "edge_log_softness", "pitch_scale", "pitch_by_direction")
+SWEEPS = {"none": 0, "offset": 1, "offset_stretch": 2}
+LARGEST_ODDS = 8.0  # beyond, the edge lies at the rim of the spot whatever the odds
+SOFTEST = np.log([1e-3, 10.0])  # spot radii, limits of the softness
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Everything that moves.
+
+    Attributes
+    ----------
+    head, cameras, boards : ndarray, shapes (3, 4), (c, 3, 4), (p, 3, 4)
+        ``T_head_lrf``, ``T_camera_lrf`` (mount 'head') or ``T_camera_platform`` (mount 'platform'),
+        ``T_platform_board``.
+    sensor : ndarray, shape (5,)
+        In the order of `SENSOR`: metres, log odds, log of spot radii, fraction, radians.
+    sweeps : ndarray, shape (p, 2)
+        Offset (radians) and stretch of the recorded pitch of each sweep.
+    sides : ndarray, shape (p, e)
+        By how much the log odds of each side differ from the sensor's: what stands behind it is
+        darker or brighter.
+    """
+
+    head: np.ndarray
+    cameras: np.ndarray
+    sensor: np.ndarray
+    boards: np.ndarray
+    sweeps: np.ndarray
+    sides: np.ndarray
+
+    def of_placements(self, rows) -> "JointState":
+        """The state of some placements (indices, or a mask)."""
+        return replace(
+            self, boards=self.boards[rows], sweeps=self.sweeps[rows], sides=self.sides[rows]
+        )
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Which columns of the full Jacobian are unknown.
+
+    `cameras` and `edges` are their numbers, `sensor` names some of `SENSOR`, `sweep` one of
+    `SWEEPS`; `poses` tells whether the cameras' are unknown, `sides` whether every side of every
+    placement has a deviation of its own from the sensor's edge bias.
+    """
+
+    cameras: int
+    edges: int
+    axis: bool = True
+    sensor: tuple[str, ...] = SENSOR[:3]
+    sweep: str = "none"
+    poses: bool = True
+    sides: bool = False
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Of the full set of shared columns, those that are unknown."""
+        sensor = [name in self.sensor for name in SENSOR]
+        return np.array([self.axis] * 4 + [self.poses] * 6 * self.cameras + sensor)
+
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """Where the unknowns stand in a Jacobian: first the shared ones, then the placement's
+        own.
+        """
+        widths = {"axis": 4 * self.axis, "cameras": 6 * self.cameras * self.poses}
+        widths |= {name: int(name in self.sensor) for name in SENSOR}
+        widths |= {"board": 6, "sweep": SWEEPS[self.sweep], "sides": self.edges * self.sides}
+        columns = {}
+        end = 0
+        for name, width in widths.items():
+            columns[name] = slice(end, end + width)
+            end += width
+        return columns
+
+    @property
+    def shared(self) -> int:
+        """Number of unknowns common to all placements."""
+        return self.columns["board"].start
+
+    @property
+    def own(self) -> int:
+        """Number of unknowns of one placement."""
+        return self.columns["sides"].stop - self.shared
+
+    def names(self, cameras) -> tuple[str, ...]:
+        """Names of the shared unknowns, of cameras with these names."""
+        poses = [f"{camera}_{name}" for camera in cameras for name in geometry.POSE_NAMES]
+        every = np.array([*AXIS_NAMES, *poses, *SENSOR])
+        return tuple(every[self.mask].tolist())
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Noise levels and what is expected.
+
+    Attributes
+    ----------
+    face_scale : float
+        Factor on the stated standard deviations of ranges.
+    view_scale : float
+        The same of all cameras' board poses.
+    sigma_pitch : float
+        Standard deviation of the recorded pitch at a stop, radians: what a head at rest is off by
+        (see :mod:`lrfcal_lib.fit.stops`).
+    face_share, beam_share : float
+        Share of independent errors per observation, below one where neighbours repeat each other's.
+    lapse : float
+        Share of beams that say nothing, see :func:`lrfcal_lib.fit.edge_likelihood.beam_terms`.
+    sweep_sigma : tuple of float
+        Of the sweeps' own offset (radians) and stretch.
+    side_sigma : float
+        Scale of the sides' deviations of the log odds, Student's t.
+    prior : PlatformPrior or None
+        The stated platform, which yields where the data contradict it.
+    """
+
+    face_scale: float = 1.0
+    view_scale: float = 1.0
+    sigma_pitch: float = 0.0
+    face_share: float = 1.0
+    beam_share: float = 1.0
+    lapse: float = 0.0
+    sweep_sigma: tuple[float, float] = (np.radians(0.5), 0.05)
+    side_sigma: float = 0.35
+    prior: PlatformPrior | None = None
+
+
+@dataclass(frozen=True)
+class JointData:
+    """Observations padded by placement: arrays (p, n, ...), `used` marks what is no padding.
+
+    Attributes
+    ----------
+    face, beam, view : dict of str to ndarray
+        Fields of that group of JointObservations, with ``ray`` (LRF frame) or, for views,
+        ``whitener`` (p, v, 6, 6).
+    lines : ndarray, shape (e, 3)
+        Sides of the board.
+    middle, direction : ndarray, shape (p,)
+        Of the sweeps.
+    on_head : ndarray of bool, shape (c,)
+        Whether cameras are fixed to the head.
+    levels : Levels
+    """
+
+    face: dict
+    beam: dict
+    view: dict
+    lines: np.ndarray
+    middle: np.ndarray
+    direction: np.ndarray
+    on_head: np.ndarray
+    levels: Levels
+
+
+def gather(obs: JointObservations, levels: Levels = Levels()) -> JointData:
+    """Observations as padded arrays, with noise levels other than those stated."""
+    count = len(obs.placements)
+    face = pad(obs.group("face"), count)
+    beam = pad(obs.group("beam"), count)
+    for group in (face, beam):
+        group["ray"] = geometry.polar_to_points(1.0, group["bearing"])
+    view = pad(obs.group("view"), count)
+    padding = ~view["used"][..., None, None]
+    covariance = np.where(padding, np.eye(6), view["covariance"])
+    view["whitener"] = np.where(padding, 0.0, np.linalg.inv(np.linalg.cholesky(covariance)))
+    view["pose"] = np.where(padding, np.eye(4), view["pose"])
+    on_head = np.array([mount == "head" for mount in obs.mounts], bool)
+    return JointData(face, beam, view, obs.lines(), obs.middle, obs.direction, on_head, levels)
+
+
+def move_state(state: JointState, step: tuple, unknowns: Unknowns) -> JointState:
+    """Retraction of the joint estimate: shared increments (c,) and those of each placement (p,
+    l).
+    """
+    full = np.zeros(len(unknowns.mask))
+    full[unknowns.mask] = step[0]
+    axis, cameras, sensor = np.split(full, [4, len(full) - len(SENSOR)])
+    boards, sweep, sides = np.split(step[1], [6, 6 + SWEEPS[unknowns.sweep]], axis=1)
+    sensor = state.sensor + sensor
+    sensor[1] = np.clip(sensor[1], -LARGEST_ODDS, LARGEST_ODDS)
+    sensor[2] = np.clip(sensor[2], *SOFTEST)
+    sweeps = state.sweeps.copy()
+    sweeps[:, : sweep.shape[1]] += sweep
+    return JointState(
+        head=move_head(state.head, axis),
+        cameras=move_pose(state.cameras, cameras.reshape(-1, 6)),
+        sensor=sensor,
+        boards=move_pose(state.boards, boards),
+        sweeps=sweeps,
+        sides=state.sides + sides if unknowns.sides else state.sides,
+    )
