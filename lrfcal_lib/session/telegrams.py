@@ -188,20 +188,22 @@ def _check_index(index, size, file):
     absurd = (index.length < 7) | (index.length > LONGEST) | (index.offset > LARGEST_FILE)
     absurd |= index.offset < np.r_[0, index.end[:-1]]
     if absurd.any():
+        where = index.place(absurd.argmax())
         raise ValueError(
-            f"{index.place(absurd.argmax())}: telegrams of 7 to {LONGEST} bytes lie one after the other; "
-            "restore the file"
+            f"{where}: telegrams of 7 to {LONGEST} bytes lie one after the other; restore the file"
         )
     missing = index.end > size
     if missing[:-1].any():
+        where = index.place(missing.argmax())
         raise ValueError(
-            f"{index.place(missing.argmax())}, but {file.name} has {size} bytes: restore it, or remove the "
-            "rows from this one on"
+            f"{where}, but {file.name} has {size} bytes: restore it, or remove the rows from this "
+            "one on"
         )
     blind = (index.placement >= 0) & ~np.isfinite(index.pitch)
     if blind.any():
+        where = f"{index.place(blind.argmax())}, placement {index.placement[blind][0]}"
         raise ValueError(
-            f"{index.place(blind.argmax())}, placement {index.placement[blind][0]}: pitch_deg is missing; "
+            f"{where}: pitch_deg is missing; "
             "fill it in, or empty the placement to ignore the telegram"
         )
 
