@@ -15,12 +15,12 @@ from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import (
-    MIRROR_TURN,
     MODES,
     UNITS,
     Configuration,
     encode_telegram,
 )
+from lrfcal_lib.session.stated import MIRROR_TURN
 from lrfcal_lib.simulate.beam import VARIANTS
 
 LOG = logging.getLogger(__name__)
