@@ -121,7 +121,7 @@ class Lrf:
             self.head.note()
         times = instant + (np.arange(BEAMS) / 360) * 0.0133
         ranges = np.full(BEAMS, 2.0 + pitch)
-        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, None, None))
+        self.readings.append(Reading((telegram(pitch),), ranges, None, BEARINGS, instant, times, -1, -1))
         return self.readings[-1]
 
     def request(self):

@@ -15,7 +15,7 @@ from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import TURN_S, Assembler, Link, ScanClock, transfer_s
+from lrfcal_lib.drivers.lms2xx_link import Assembler, Link, ScanClock, transfer_s
 from lrfcal_lib.drivers.port import (
     DeviceError,
     LineLost,
@@ -28,6 +28,7 @@ from lrfcal_lib.drivers.port import (
 )
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.emulators.lms2xx import EmulatedLms
+from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session.lms2xx_codec import Configuration, encode_telegram
 
 
@@ -267,8 +268,8 @@ def test_late_arrivals_do_not_shift_scans():
     turns = np.cumsum(rng.integers(1, 40, 400))  # over many rounds of the index
     late = np.where(rng.random(400) < 0.2, rng.exponential(0.05, 400), 0)
     late[0] = 0
-    instants, steps = zip(*map(clock.place, (turns % 256).tolist(), 100.0 + turns * TURN_S + late), strict=True)
-    off = np.array(instants) - 100.0 - turns * TURN_S
+    instants, steps = zip(*map(clock.place, (turns % 256).tolist(), 100.0 + turns * MIRROR_TURN + late), strict=True)
+    off = np.array(instants) - 100.0 - turns * MIRROR_TURN
     assert np.median(off) == pytest.approx(0, abs=1e-9) and np.abs(off).max() < 0.01 < late.max()
     assert list(steps[1:]) == np.diff(turns).tolist()
 
@@ -276,11 +277,11 @@ def test_late_arrivals_do_not_shift_scans():
 def interlaced(partials, indexed, skipped=()):
     """Readings that telegrams of interlaced scans complete; ranges tell where they belong."""
     configuration, counts = INDEXED.changed(realtime_indices=indexed), {"dropped": 0, "stale": 0}
-    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, None), {}
+    one, made = Assembler((100, 0.25), configuration, 500000, True, counts, ScanClock()), {}
     for k, partial in enumerate(partials):
         ranges = 1 + (4 * np.arange(181 - (partial > 0)) + partial) / 1000
         raw = encode_scan(ranges, partial=partial, indices=(k % 256, k % 256) if indexed else None)
-        reading = None if k in skipped else one.feed(raw, 9 + k * TURN_S + transfer_s(len(raw), 500000))
+        reading = None if k in skipped else one.feed(raw, 9 + k * MIRROR_TURN + transfer_s(len(raw), 500000))
         made |= {k: reading} if reading else {}
     return made
 

@@ -5,7 +5,8 @@ import pytest
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import RATES, TURN_S, interval_s
+from lrfcal_lib.drivers.lms2xx_link import RATES, interval_s
+from lrfcal_lib.model.kinematics import MIRROR_TURN
 
 # scans that a telegram takes by the manual's table 10-17: 812 (100/0.25), 732 (180/0.5), 372 bytes (180/1)
 TABLE = {9600: (16, 29, 30), 19200: (8, 15, 15), 38400: (4, 8, 8), 500000: (1, 1, 1)}
@@ -17,7 +18,7 @@ VARIANTS = {(100, 25): 812, (180, 50): 732, (180, 100): 372}
 def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate, variant):
     device = lms(baudrate=rate, variant=variant, configuration=INDEXED)
     with LMS2xx(device.path, host=device.host) as driver:
-        before = driver.counts
+        before = dict(driver.counts)
         driver.start()
         readings = driver.take(1)
         while readings[-1].time_s < readings[0].time_s + 10.0:
@@ -32,7 +33,7 @@ def test_every_scan_is_delivered_or_counted_with_the_instant_of_the_mirror(rate,
     # a telegram that takes longer than a scan keeps those in between from being sent; they are counted by the index
     period, turns = TABLE[rate][[*VARIANTS].index(variant)], 100 // variant[1]
     assert set(np.diff([record.turn for record in truth])) == {period * turns}
-    assert interval_s(VARIANTS[variant], rate, turns * TURN_S) == pytest.approx(period * turns * TURN_S)
+    assert interval_s(VARIANTS[variant], rate, turns * MIRROR_TURN) == pytest.approx(period * turns * MIRROR_TURN)
     assert counts["dropped"] == (len(readings) - 1) * (period - 1)
     assert [r.time_s for r in readings] == pytest.approx([record.time_s for record in truth], abs=5e-4)
 

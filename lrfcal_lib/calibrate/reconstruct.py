@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter
 from lrfcal_lib.fit.robust import TUKEY, robust_sigma
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel, fold, project
-from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
+from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session.write import whole
 
 GREY = 128  # colour of points that no camera sees

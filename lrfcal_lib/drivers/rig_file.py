@@ -144,19 +144,13 @@ class HeadSettings(Stated):
     degrees_per_second: Annotated[
         several(Speed, 2), BeforeValidator(lambda v: v if isinstance(v, tuple | list) else (v, v))
     ] = None
-    # From the motion frame to the movement, less what it runs on after the stop.
-    start_delay_s: number(-10, 10, "s") = 0.0
     start_pitch_deg: Angle = 0.0  # where a head without feedback stands at first: levelled by hand
     tolerance_deg: Near = 0.1  # readings that differ by less are the same: cheap encoders jitter
-    arrival_deg: Near = 0.5  # a move that ends this near has arrived; its settled pitch counts
     settle_s: Seconds = 0.3  # the head rests when its readings stay the same for this long
-    stall_s: Seconds = 1.5  # rest elsewhere for this long: it does not get to where it was sent
     poll_s: Seconds = 0.1  # between queries while it moves
     reply_s: number(1e-3, 10, "s") = 0.35  # until a reply begins; 1 is needed by slow heads
     gap_s: number(0, 10, "s") = 0.05  # silence between frames, and time for an acknowledgement
     retries: whole(0, 20) = 3  # queries repeated when no reply came
-    # motion frames in a row: 2 on weak lines; stops are sent twice in any case
-    sends: whole(1, 20) = 1
     repeat_s: number(1e-3, 60, "s") = None  # below 1 for heads that stop by themselves without
     # a call waits this long for a vanished port to come back
     reconnect_s: number(0, 3600, "s") = 3.0
@@ -192,7 +186,6 @@ class CameraDevice(Stated):
     ]
     size: several(whole(1, 100_000), 2) = None
     exposure: number(1e-6, 60, "s") = None
-    fps: number(0.01, 10_000, "Hz") = None
     silence_s: number(0.1, 3600, "s") = None
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from lrfcal_lib.drivers.lms2xx_link import BURST
 from lrfcal_lib.drivers.port import REAL
 from lrfcal_lib.emulators.line import SerialDevice
+from lrfcal_lib.model.kinematics import MIRROR_TURN
 from lrfcal_lib.session import lms2xx_codec as codec
 from lrfcal_lib.session.lms2xx_codec import (
-    MIRROR_TURN,
     MODES,
     UNITS,
     Configuration,

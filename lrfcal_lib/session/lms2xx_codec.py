@@ -205,7 +205,6 @@ def cut(data, offset, length):
     return np.lib.stride_tricks.sliding_window_view(data, int(length))[offset]
 
 
-MIRROR_TURN = 1 / 75.08  # s; 75 Hz nominal, 148 us for a ninetieth of a turn on a real device
 SCAN = 0xB0
 METRES = {"cm": 0.01, "mm": 0.001}
 UNITS = ("cm", "mm")
