@@ -164,4 +164,4 @@ class FaultyHead(FaultyLine, EmulatedHead):
         if len(raw) >= pelco_d.GENERAL and raw[0] == SYNC and self.hit("address"):
             other = raw[1] % 255 + 1
             raw = bytes([SYNC, other]) + raw[2:-1] + bytes([(raw[-1] + other - raw[1]) % 256])
-        return encode_extended(self.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw
+        return encode_extended(self.habits.address, 0x5D, 0x1234) + raw if self.hit("foreign") else raw

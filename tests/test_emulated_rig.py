@@ -54,10 +54,10 @@ def test_a_scan_is_the_one_of_the_simulator_at_the_true_pitch_of_every_beam(worl
     world.head = Head(SETUP.rig.platform, pitch=start)
     world.head.move(0.0, start + 0.5, speed)
     times = 0.1 + QUARTERS % 4 / 75.08
-    scans, _, ends = zip(*(world.scan(0, QUARTERS, times) for _ in range(30)), strict=True)
+    scans, _ = zip(*(world.scan(0, QUARTERS, times) for _ in range(30)), strict=True)
     pitch, still = world.head.pitch(times), world_of(SETUP, placements[0].T_platform_board)
     ideal = lrf.ideal_readings(beam, still, beam.bearings(), pitch + 0 * times, SETUP.rig.T_head_lrf)[0]
-    assert ends[0] == pytest.approx([pitch.min(), pitch.max()]) and (np.ptp(pitch) > 0.01) == (speed > 0)
+    assert (np.ptp(pitch) > 0.01) == (speed > 0)
     error = np.array(scans) - beam.systematic - ideal
     assert np.nanstd(error) == pytest.approx(beam.sigma_range, rel=0.05)
     assert abs(np.nanmean(error)) < 5 * beam.sigma_range / np.sqrt(error.size)
@@ -129,7 +129,7 @@ def test_no_web_page_moves_the_board(world, order):
 def test_an_image_begun_before_a_move_is_not_sent(small):
     server, drawn = CameraServer(small), []
 
-    def draw(name, place, pitch, seed):
+    def draw(name, scene, pitch):
         drawn.append(pitch)
         if len(drawn) == 1:
             small.head.go(small.host.now(), 0.05, 2.0)

@@ -193,7 +193,7 @@ def test_a_mean_is_that_of_its_scans_and_one_without_a_range_leaves_none():
     assert parse_telegram(raw).code == 0xB6 and parse_telegram(raw).data[0] == 5
     turn = device.scans[0].turn
     quarters = 2 * np.arange(361)
-    ranges, reasons, _ = zip(
+    ranges, reasons = zip(
         *(Source().scan(turn + 2 * k, quarters, None) for k in range(5)), strict=True
     )
     ranged = np.all(np.array(reasons) == 0, axis=0)
