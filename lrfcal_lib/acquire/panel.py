@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
-from lrfcal_lib.acquire.pictures import PICTURE, jpeg, png, scan_picture, sweep_picture
+from lrfcal_lib.acquire.pictures import WIDTH, jpeg, png, scan_picture, sweep_picture
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.session.shown import escape
@@ -78,7 +78,7 @@ class Picture:
     """A picture with a heading and a remark under it."""
 
     def __init__(self, name, heading, kind="png"):
-        layout = w.Layout(width="100%", max_width=f"{PICTURE[0]}px")
+        layout = w.Layout(width="100%", max_width=f"{WIDTH}px")
         self.image = w.Image(format=kind, layout=layout)
         self.image.add_class(f"lrfcal-picture-{name}")
         self.remark = w.HTML()
@@ -472,7 +472,7 @@ class Panel(Closed):
             pictures["sweep"].show(png(picture), said)
         for name, frame in dict(view.frames).items():
             height, width = frame.image.shape[:2]
-            picture = jpeg(frame.image, PICTURE[0])
+            picture = jpeg(frame.image, WIDTH)
             pictures[name].show(picture, f"{width} x {height} pixels")
 
         if view.trouble or self._view_failed:  # what was said goes when it is over
