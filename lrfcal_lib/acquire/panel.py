@@ -2,9 +2,10 @@
 
 import contextlib
 import logging
+import os
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -13,13 +14,23 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted
+from lrfcal_lib.acquire.checks import Light
+from lrfcal_lib.acquire.collector import PRACTICE_RIGS, Busy, Collector, Interrupted, Result
 from lrfcal_lib.acquire.pictures import WIDTH, jpeg, png, scan_picture, sweep_picture
 from lrfcal_lib.acquire.record import RecordingError
 from lrfcal_lib.drivers.port import Closed, DeviceError
 from lrfcal_lib.session.shown import escape
 from lrfcal_lib.session.write import new_session_path
 
+LOG = logging.getLogger(__name__)
+DRIVERS = logging.getLogger("lrfcal_lib")
+# errors whose messages say what to do
+EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
+LOOK_S = 0.3  # between looks at the rig
+NOTES = 4  # lines of what drivers report
+FOLLOWS = "three placements and more; the recording can go on afterwards"
+PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
+BUTTONS = ("connect", "close", "stop", "go", "capture", "again", "calibrate")  # methods of Panel
 HERE = Path(__file__).parent
 STYLE = f"<style>\n{HERE.joinpath('panel.css').read_text()}</style>"
 
@@ -88,10 +99,6 @@ class Picture:
         """Show the bytes of an image; what did not change is not sent again."""
         self.image.value = data
         self.remark.value = HTML.soft(remark)
-
-
-FOLLOWS = "three placements and more; the recording can go on afterwards"
-BUTTONS = ("connect", "close", "stop", "go", "capture", "again", "calibrate")  # methods of Panel
 
 
 class Parts:
@@ -213,15 +220,6 @@ class Parts:
             part.disabled = busy or not (connected and recorded)
 
 
-LOG = logging.getLogger(__name__)
-DRIVERS = logging.getLogger("lrfcal_lib")
-# errors whose messages say what to do
-EXPECTED = (DeviceError, RecordingError, Busy, Interrupted, ValueError, OSError)
-LOOK_S = 0.3
-NOTES = 4
-PLAIN = "The data collection panel: it appears here while this notebook runs in JupyterLab."
-
-
 class Notes(logging.Handler):
     """Keeps what the drivers report while a rig is connected."""
 
@@ -258,9 +256,9 @@ class Panel(Closed):
 
     Parameters
     ----------
-    rig : path-like or str
+    rig
         Rig file, or an emulated rig: 'practice' (seconds a placement), 'sim_quick', 'sim_lms221'.
-    session : path-like, optional
+    session
         Folder of the session, which stays; by default a new one in the folder that the environment
         variable ``LRFCAL_RECORDINGS`` names, else in ``~/lrfcal_sessions``. The panel shows where.
 
@@ -270,14 +268,16 @@ class Panel(Closed):
     >>> panel.show()  # doctest: +SKIP
     """
 
-    def __init__(self, rig="practice", session=None):
+    def __init__(
+        self, rig: str | os.PathLike = "practice", session: str | os.PathLike | None = None
+    ):
         session = session or new_session_path()
         self.collector = Collector()
         self.parts = Parts(str(rig), str(session))
         self.notes = Notes(self.parts.notes)
-        self.job = None  # what a button began
+        self.job: Future | None = None  # what a button began
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="panel")
-        self._live = None  # the thread that keeps looking
+        self._live: threading.Thread | None = None  # keeps looking
         self._quit = threading.Event()
         self._sweep = None  # field of view, ends of the pitch and its step, radians
         self._view_failed = False  # the error shown is one of the view
@@ -289,7 +289,7 @@ class Panel(Closed):
         self._refresh()
 
     @property
-    def session(self):
+    def session(self) -> Path:
         """Folder of the session that the field names, an absolute Path."""
         return absolute(self.parts.session.value)
 
@@ -297,7 +297,7 @@ class Panel(Closed):
         """Show what the fields name: relative paths are taken from where this notebook lies."""
         self.parts.places.value = HTML.places(rig_named(self.parts.rig.value), self.session)
 
-    def show(self):
+    def show(self) -> None:
         """Display the panel."""
         from IPython.display import display
 
@@ -307,7 +307,7 @@ class Panel(Closed):
 
     # --------------------------------------------------------------------- the buttons
 
-    def connect(self):
+    def connect(self) -> None:
         """Open the rig and the session that the fields name; see :meth:`Collector.connect`."""
         with self._doing("connecting"):
             DRIVERS.addHandler(self.notes)
@@ -326,7 +326,7 @@ class Panel(Closed):
             self._live = threading.Thread(target=self._keep_looking, name="panel view", daemon=True)
             self._live.start()
 
-    def close(self):
+    def close(self) -> None:
         """Stop the head, finish the session, close the devices."""
         with self._doing("closing"):
             self._quit.set()
@@ -337,12 +337,12 @@ class Panel(Closed):
             finally:
                 DRIVERS.removeHandler(self.notes)
 
-    def go(self):
+    def go(self) -> float:
         """Move the head to the target of the slider; returns where it settled, radians."""
         with self._doing("moving the head"):
             return self.collector.move_to(np.radians(self.parts.slider.value))
 
-    def capture(self):
+    def capture(self) -> list[Light]:
         """Record the next placement; returns its lights."""
         task = self.collector.task()
         with self._doing("recording"):
@@ -351,21 +351,21 @@ class Panel(Closed):
             self.parts.lights.value = HTML.lights(f"Quality of {task.title.lower()}", lights)
         return lights
 
-    def again(self):
+    def again(self) -> int:
         """Take the placement recorded last back; returns its number."""
         with self._doing("taking it back"):
             number = self.collector.again()
             self.parts.lights.value = HTML.lights("Quality", ())
         return number
 
-    def calibrate(self):
+    def calibrate(self) -> Result:
         """Calibrate what was recorded so far; returns the Result."""
         with self._doing("calibrating"):
             result = self.collector.calibrate()
             self.parts.result.value = HTML.result(result)
         return result
 
-    def stop(self):
+    def stop(self) -> None:
         """Stop the head at once, and what is under way."""
         self.collector.stop()
         self._show_progress(0.0, "stopped")
