@@ -14,14 +14,15 @@ SIMULATED := sim_lms221 sim_quick
 # one thread a process where it is no matter (Open3D): two notebooks run side by side; lrfcal_lib sees to the rest
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup report test campaign notebooks golden lab data picture bench fuzz clean
+.PHONY: help setup report test campaign notebooks golden lab data picture docs bench fuzz clean
 
 help:
 	@echo "make report [SESSION=path]   execute the notebooks on a session, write reports/<session>/"
-	@echo "make test                    lint and run all tests, the notebooks included"
+	@echo "make test                    lint, check types and run all tests, the notebooks included"
 	@echo "make campaign                the many falsified and drawn recordings of which make test has a few"
 	@echo "make notebooks [SESSION=..]  execute the notebooks and store them"
 	@echo "make golden                  store the tables of three sessions that tests compare to the sixth digit"
+	@echo "make docs                    the reference of the library: reports/docs/index.html"
 	@echo "make bench                   speed and memory beside scipy, OpenCV and GTSAM (which it installs): reports/bench/"
 	@echo "make fuzz                    200 000 damaged sessions and rig files, a million telegrams: only our own errors"
 	@echo "make lab [SESSION=path]      open JupyterLab"
@@ -35,13 +36,15 @@ setup:
 report: setup
 	@$(RUN) -m lrfcal_lib report $${SESSION:+"$$SESSION"}
 
+# nbval takes 3 s to load, in every process of a test run: tests/notebook_runs.py starts it itself
 test: export TESTS := 1
 test: setup
 	$(RUN) -m ruff check .
-	$(RUN) -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
+	$(RUN) -m mypy
+	$(RUN) -m pytest -p no:nbval -n 3 --dist loadgroup --no-loadscope-reorder
 
 campaign: setup
-	$(RUN) -m pytest -n 3 -m campaign
+	$(RUN) -m pytest -p no:nbval -n 3 -m campaign
 
 notebooks: setup
 	@$(RUN) -m lrfcal_lib report --store $${SESSION:+"$$SESSION"}
@@ -54,6 +57,10 @@ lab: setup
 	[ -z "$$SESSION" ] || export LRFCAL_SESSION="$$(realpath -- "$$SESSION")"; \
 	[ -w notebooks ] || echo "this folder is read-only: notebooks run, changes to them cannot be saved" >&2; \
 	LRFCAL_CACHE="$$folder" .venv/bin/jupyter lab $(AS_ROOT) $(NO_BUILD_QUESTION) $(SAVING) notebooks
+
+docs: setup
+	$(RUN) -m pdoc --docformat numpy --no-show-source --output-directory reports/docs lrfcal_lib
+	@echo "written: reports/docs/index.html"
 
 bench: export BENCH := 1
 bench: setup

@@ -29,7 +29,6 @@ from telegrams import encode_scan
 
 from lrfcal_lib.calibrate.reconstruct import Painter, View
 from lrfcal_lib.fit.least_squares import whiten
-from lrfcal_lib.fit.residuals import Unknowns, gather, joint_blocks, move_state
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole
 from lrfcal_lib.preprocess.pattern_in_image import PatternFinder
 from lrfcal_lib.preprocess.survey import survey, views_of
@@ -37,6 +36,8 @@ from lrfcal_lib.session.lms2xx_codec import decode_scan, decode_scans, split_str
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import converged, of_placements, solve_joint
+from lrfcal_lib.solvers.joint_model import Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_residuals import joint_blocks
 from lrfcal_lib.solvers.joint_start import start_states, thin
 
 ROOT = Path(__file__).resolve().parent.parent

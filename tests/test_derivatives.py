@@ -12,19 +12,21 @@ from test_image import MODEL, PATTERN, pose_of, view_poses
 from test_platform import ROUGH, TRUTH, make, pairs, pitched
 from test_uncertainty import CAMERA, moved_points, random_chain
 
-from lrfcal_lib.fit import residuals
+from lrfcal_lib.fit import edge_likelihood, residuals
+from lrfcal_lib.fit.axis_chart import move_head, prior_terms
 from lrfcal_lib.fit.least_squares import whiten
-from lrfcal_lib.fit.residuals import move_head, move_state, prior_terms
 from lrfcal_lib.fit.result import PlatformPrior
 from lrfcal_lib.judge.uncertainty import carried
 from lrfcal_lib.model import camera
 from lrfcal_lib.model.geometry import move_pose, pose_array
 from lrfcal_lib.preprocess import intrinsics
 from lrfcal_lib.solvers import lines, pitch, planes, platform
+from lrfcal_lib.solvers.joint_model import SENSOR, Unknowns, gather, move_state
+from lrfcal_lib.solvers.joint_residuals import named_blocks
 
 OFF = RigidTransform.from_components([0.05, -0.04, 0.06], Rotation.from_rotvec([0.05, -0.04, 0.03]))
 MARGINS = np.array([-0.03, -0.011, -0.004, -0.001, 0.0, 0.002, 0.006, 0.02])
-EVERY = residuals.Unknowns(2, 3, sensor=residuals.SENSOR, sweep="offset_stretch", sides=True)
+EVERY = Unknowns(2, 3, sensor=SENSOR, sweep="offset_stretch", sides=True)
 
 
 def projection():
@@ -104,19 +106,19 @@ def single_beams():
     """Cost, score and information of beams and of pairs of them, as the margin moves by its sigma."""
     for sigma, half in ((0.0004, 0.001), (0.003, 0.005)):
         def interval(s):
-            return residuals.interval_terms(MARGINS + sigma * s + half, MARGINS + sigma * s - half, sigma)
+            return edge_likelihood.interval_terms(MARGINS + sigma * s + half, MARGINS + sigma * s - half, sigma)
 
         found = interval(0.0)
         yield sigma * found[1][:, None], lambda s: interval(s[0])[0], 1
     for hit in (True, False):
         for lapse in (0.0, 0.01):
             def beam(s):
-                return residuals.beam_terms(MARGINS + 0.004 * s, 0.004, hit, lapse)
+                return edge_likelihood.beam_terms(MARGINS + 0.004 * s, 0.004, hit, lapse)
 
             yield 0.004 * beam(0.0)[1][:, None], lambda s: beam(s[0])[0], 1
             assert (beam(0.0)[2] >= 0).all()
-        sharp = residuals.beam_terms(MARGINS, 0.004, hit)[2]
-        yield 0.004 * sharp[:, None], lambda s: residuals.beam_terms(MARGINS + 0.004 * s[0], 0.004, hit)[1], 1
+        sharp = edge_likelihood.beam_terms(MARGINS, 0.004, hit)[2]
+        yield 0.004 * sharp[:, None], lambda s: edge_likelihood.beam_terms(MARGINS + 0.004 * s[0], 0.004, hit)[1], 1
 
 
 def joint_estimate():
@@ -129,11 +131,11 @@ def joint_estimate():
         off = own.normal(0, 0.03, EVERY.shared), own.normal(0, 0.03, (3, EVERY.own))
         state = move_state(truth, off, EVERY)
         for lapse in (0, 0.05):
-            data = replace(residuals.gather(obs), lapse=lapse)
+            data = replace(gather(obs), lapse=lapse)
 
             def block(s):
                 step = s[: EVERY.shared], np.tile(s[EVERY.shared :], (3, 1))
-                return residuals.named_blocks(move_state(state, step, EVERY), data, EVERY)[name]
+                return named_blocks(move_state(state, step, EVERY), data, EVERY)[name]
 
             def costs(s):
                 found = block(s)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lrfcal_lib.fit.residuals import beam_terms, disc_edge, disc_share, interval_terms
+from lrfcal_lib.fit.edge_likelihood import beam_terms, disc_edge, disc_share, interval_terms
 
 MARGINS = np.array([-0.03, -0.011, -0.004, -0.001, 0.0, 0.002, 0.006, 0.02])
 

@@ -7,7 +7,7 @@ from shared import DATA, QUICK, stages
 from test_session import CAMERAS, HEAD, LRF, pixels, wall
 
 from lrfcal_lib import __main__ as command_line
-from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate import clouds
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.export import write_calibration, write_clouds, write_pcd
 from lrfcal_lib.model.board import triangle_board
@@ -21,7 +21,7 @@ LITTLE = 100_000  # bytes; the cloud of the small session needs twice as many
 @pytest.fixture(scope="module")
 def cloud(quick):
     """The boards of the small session."""
-    return pipeline.color_cloud(quick, "joint")
+    return clouds.color_cloud(quick, "joint")
 
 
 @pytest.fixture(scope="module")

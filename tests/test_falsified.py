@@ -86,14 +86,10 @@ def test_what_is_falsified_is_named(name):
     assert named or (harmless and not kinds), [reason.words for reason in reasons]
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [pytest.param("bearings mirrored", "other sense", marks=campaign),
-     pytest.param("pitch reversed", "other sense", marks=campaign), ("cameras exchanged", "folders?")],
-)  # fmt: skip
-def test_what_is_named_where_no_platform_and_no_guess_is_stated(name, words):
-    reasons, *_ = judged(FALSIFIED[name][0], 7, "platform", stated=False)
-    assert words in "".join(reason.words for reason in reasons)
+def test_cameras_are_told_apart_by_name_where_no_platform_and_no_guess_is_stated():
+    """What counts in the other sense is told by `recording_faults`, see test_falsified_sessions."""
+    reasons, *_ = judged(FALSIFIED["cameras exchanged"][0], 7, "platform", stated=False)
+    assert "folders?" in "".join(reason.words for reason in reasons)
 
 
 def moved(solution, honest):

@@ -12,9 +12,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from shared import campaign
 
 from lrfcal_lib.calibrate import observe
-from lrfcal_lib.calibrate.pipeline import stereo_reference
+from lrfcal_lib.evaluate.stereo import stereo_reference
 from lrfcal_lib.model.board import Board, Chessboard, corners_of_lines, triangle_board
 from lrfcal_lib.model.camera import CameraModel, line_distance, pinhole, project, undistort
+from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess import edges_in_image, intrinsics, prepared, survey
 from lrfcal_lib.preprocess.board_in_image import (
     BoardView,
@@ -226,8 +227,9 @@ def test_small_squares_are_a_problem_of_their_camera(monkeypatch):
     seen = survey.Survey(views, {}, None, SHEET)
     monkeypatch.setattr(prepared, "views_of", lambda session, **options: seen)
     problems = prepared.prepare_images(prepared.Prepared(None, SHEET, {}, {}, {})).problems
-    assert list(problems) == ["squares left"]
-    assert "placements 4), 7.0 px at least" in problems["squares left"]
+    (problem,) = problems
+    assert problem.kind == ProblemKind.SMALL_SQUARES and problem.camera == "left"
+    assert "placements 4), 7.0 px at least" in problem.words and str(problem).startswith("camera 'left': squares")
 
 
 @pytest.mark.parametrize(("side", "named"), [(7.0, True), (12.0, False)])
@@ -237,9 +239,9 @@ def test_where_all_cameras_contradict_a_scan_small_squares_are_a_cause(monkeypat
     monkeypatch.setattr(observe, "observe", lambda prepared, camera: data)
     monkeypatch.setattr(observe, "find_outlying_placements", lambda obs: ([], {4: 0.02}))
     monkeypatch.setattr(observe, "solve_camera", lambda obs, method: SimpleNamespace(transform=None))
-    words = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1][4]
-    assert "another surface" in words
-    assert ("or the images: squares below 9 px" in words) == named
+    (problem,) = observe.rough_poses(SimpleNamespace(views=views, board=SHEET))[1]
+    assert problem.placement == 4 and "another surface" in problem.words
+    assert ("or the images: squares below 9 px" in problem.words) == named
 
 
 def test_large_images_are_searched_small_and_refined_as_they_are(monkeypatch):
@@ -577,7 +579,8 @@ def stereo(first, second, pattern=PATTERN, models=(MODEL, MODEL)):
     views = [{p: SimpleNamespace(pixels=own) for p, own in enumerate(seen)} for seen in (first, second)]
     views, models = (dict(enumerate(each)) for each in (views, models))
     board = SimpleNamespace(pattern=pattern)
-    return stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))[1:]
+    reference = stereo_reference(SimpleNamespace(board=board, views=views, models=models, relief=None))
+    return reference.T_second_first, reference.covariance
 
 
 def test_stereo_reference_recovers_the_mounting_and_its_covariance_tells_the_error():
@@ -653,7 +656,8 @@ def test_real_cameras_edges_and_outline(lms400):
 
 
 def test_real_stereo(lms400):
-    refined, covariance = stereo_reference(lms400.prepared)[1:]
+    reference = stereo_reference(lms400.prepared)
+    refined, covariance = reference.T_second_first, reference.covariance
     # shape-free bundle of an independent analysis, with its own uncertainty
     off = np.r_[np.rad2deg(refined.rotation.as_rotvec()), 1000 * refined.translation]
     sigma = np.sqrt(np.diag(covariance)) * np.repeat([np.rad2deg(1), 1000], 3)

@@ -80,3 +80,54 @@ def test_no_heavy_library_is_loaded_by(what):
     shown = f"{code}\nimport sys\nprint(*{heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
+# Parts that can be had alone: what they load, and how much of the library that is at most.
+CAMERA = """
+import numpy as np
+from lrfcal_lib.model.board import triangle_board
+from lrfcal_lib.model.camera import CameraModel
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers import METHODS, best_method, solve_camera
+from lrfcal_lib.solvers.platform import solve_platform
+"""
+ALONE = {  # code; modules and nodes at most; what it must not load
+    "one camera and the platform from arrays": (
+        CAMERA, 20, 30_000,
+        ("session", "preprocess", "calibrate", "judge", "evaluate", "solvers.joint", "solvers.pitch"),
+    ),
+    "platform and cameras": (
+        "import lrfcal_lib.calibrate.cameras", 20, 30_000,
+        ("session", "preprocess", "judge", "evaluate", "solvers.joint", "solvers.pitch", "calibrate.reconstruct"),
+    ),
+}  # fmt: skip
+
+
+UNCOUNTED = (ast.expr_context, ast.operator, ast.cmpop, ast.boolop, ast.unaryop, ast.arguments, ast.arg, ast.alias,
+             ast.keyword)  # fmt: skip
+
+
+def count_nodes(path):
+    """Nodes of a file's syntax tree: what a reader has to take in, without docstrings and annotations."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            del node.body[0]
+        if isinstance(node, ast.FunctionDef):
+            node.returns = None
+        if isinstance(node, ast.arg):
+            node.annotation = None
+    return sum(not isinstance(node, UNCOUNTED) for node in ast.walk(tree))
+
+
+@pytest.mark.parametrize("what", ALONE)
+def test_a_part_can_be_had_alone(what):
+    code, modules, nodes, others = ALONE[what]
+    shown = f"{code}\nimport sys\nprint(*(name for name in sys.modules if name.split('.')[0] == 'lrfcal_lib'))"
+    done = subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    loaded = {path for path in MODULES if name_of(path) in done.stdout.split()}
+    names = {name_of(path) for path in loaded}
+    assert not {name for name in names if name.removeprefix("lrfcal_lib.").startswith(others)}
+    assert len(loaded) <= modules, sorted(names)
+    assert sum(map(count_nodes, loaded)) <= nodes

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from shared import QUICK, campaign
 
-from lrfcal_lib.calibrate import combined, pipeline
+from lrfcal_lib.calibrate import clouds, combined, pipeline
 from lrfcal_lib.calibrate.observe import all_views, observe_joint
 from lrfcal_lib.evaluate import edge_tables, joint_tables, scenes
 from lrfcal_lib.evaluate.export import calibration_record
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.session.read import open_session
 
 
@@ -66,12 +67,12 @@ def test_it_is_handed_over_with_its_platform_and_sensor(quick):
 
 
 def test_a_cloud_is_coloured_by_what_is_handed_over(quick):
-    default, joint, line = (pipeline.color_cloud(quick, *method).points for method in ((), ("joint",), ("line",)))
+    default, joint, line = (clouds.color_cloud(quick, *method).points for method in ((), ("joint",), ("line",)))
     np.testing.assert_array_equal(default, joint)
     assert np.linalg.norm(joint - line, axis=1).min() > 0
     nothing = replace(quick, joint=None, solutions={})
     with pytest.raises(ValueError, match="no camera was calibrated that could colour a cloud"):
-        pipeline.color_cloud(nothing)
+        clouds.color_cloud(nothing)
 
 
 @campaign
@@ -106,8 +107,8 @@ BAD = {
     "images without a known pitch": (lambda c: other_session(c, pitch=np.nan), "joint", "of none is the pitch known"),
     "a method that was not run": (lambda c: c, "line_printed", "'line_printed' poses no camera"),
     "another rig's cameras": (
-        lambda c: replace(c, solutions={("top", m): s for (_, m), s in c.solutions.items()}), "joint",
-        "they are of left, right, the calibration by 'joint' poses top",
+        lambda c: other_session(c, camera="top"), "joint",
+        "they are of top, the calibration by 'joint' poses left, right",
     ),
     "another rig's lenses": (
         lambda c: replace(c, prepared=replace(c.prepared, models={
@@ -121,12 +122,12 @@ BAD = {
 def test_what_cannot_colour_a_cloud_is_refused(quick, case):
     change, method, words = BAD[case]
     with pytest.raises(ValueError, match=words):
-        pipeline.color_cloud(change(quick), method)
+        clouds.color_cloud(change(quick), method)
 
 
 def test_lengths_between_features_know_how_good_they_are(quick):
     """Two halves of one face are no distance apart across it, and half a board along it."""
-    cloud, solution, offs = pipeline.color_cloud(quick, "joint"), quick.joint.solution, []
+    cloud, solution, offs = clouds.color_cloud(quick, "joint"), quick.joint.solution, []
     for placement in np.unique(cloud.placement):
         rows = np.flatnonzero(cloud.placement == placement)
         x = cloud.points[rows, 0]
@@ -146,8 +147,9 @@ def test_lengths_between_features_know_how_good_they_are(quick):
 
 def test_a_rig_that_cannot_be_solved_jointly_keeps_the_other_methods(quick):
     """Without a usable placement the joint estimate has a problem in words; what was there stays."""
-    problems = {placement: "a dog ran through" for placement in quick.prepared.scans}
-    lost = pipeline.joint_or_words(replace(quick.prepared, problems=problems))
+    kind = ProblemKind.NO_BOARD
+    problems = [Problem(Stage.SCANS, kind, "a dog ran through", placement) for placement in quick.prepared.scans]
+    lost = pipeline.joint_or_problem(replace(quick.prepared, problems=tuple(problems)))
     again = pipeline.with_joint(replace(quick, joint=None), lost)
-    assert again.joint is None and "no placement" in again.problems["rig", "joint"]
+    assert again.joint is None and "no placement" in again.problem("joint").words
     assert again.solutions is quick.solutions

@@ -1,14 +1,16 @@
 """Noise levels of beams and sides of the joint estimate."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from joint_draws import draw, rng
 
-from lrfcal_lib.fit.residuals import LEAST_STEP, SIDE_FREEDOM
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.joint_noise import side_level
+from lrfcal_lib.solvers.joint_noise import beam_share, side_level
+from lrfcal_lib.solvers.joint_residuals import SIDE_FREEDOM, named_blocks
 
 FINE = np.radians(0.5)
 NARROW = (0.012, 0.0044)  # m at the window, rad: an LMS200
@@ -63,3 +65,14 @@ def test_beams_of_the_model_itself_are_independent():
 def test_beams_about_sharp_edges_say_no_more_than_their_spacing():
     noise = levels(2, softness=0.02, spread=0.3, spot=NARROW)
     assert all(0.5 < one["beam_share"] <= 1 for one in noise)
+
+
+def test_beams_that_all_contradict_their_edges_still_have_a_share():
+    """Bearings of the other sense: the cost of beams is bent the other way, and a share below 0 ended in a traceback."""
+    found = solve_joint(draw(rng(3), 6)[0], required=False)
+    data = replace(found.data, lapse=0.01)
+    block = named_blocks(found.state, data, found.unknowns)["beam"]
+    cost = np.full(block.cost.shape, 4.0)
+    own = np.zeros((6, *[block.jacobian.shape[-1] - found.unknowns.shared] * 2))
+    contradicted = replace(block, residuals=np.sqrt(2 * cost), cost=cost)
+    assert 0 < beam_share(found.state, data, contradicted, found.unknowns, own) < 0.01

@@ -10,9 +10,10 @@ from scipy.stats import chi2
 from shared import campaign
 
 from lrfcal_lib.evaluate.monte_carlo import Trials, bound, consistency, monte_carlo, state_errors
-from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_model import Unknowns
 
 SENSOR = ("range_offset", "edge_log_odds")
 NAMES = ("axis_out_of_scan_plane", "axis_in_scan_plane", "left_rx", "left_tx", "range_offset")

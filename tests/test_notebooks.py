@@ -2,10 +2,14 @@
 
 import ast
 import re
+import shutil
+import subprocess
+import sys
 
 import nbformat
 import pytest
 from notebook_runs import NOTEBOOKS, check_tables, code_cells, read, run_nbval
+from shared import ROOT
 
 LONGEST_FUNCTION = 10  # lines
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -62,12 +66,31 @@ def test_stored_outputs_and_golden_tables_are_those_of_the_shipped_session(path,
     check_tables(tmp_path, "sim_lms221", path)
 
 
+def write_notebook(path, source, printed):
+    """A notebook of one cell, stored with what it is said to have printed."""
+    cell = nbformat.v4.new_code_cell(source, execution_count=1)
+    cell.outputs = [nbformat.v4.new_output("stream", name="stdout", text=printed)]
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata={"kernelspec": kernel}), path)
+
+
 def test_falsified_output_is_caught(tmp_path):
     """The strict comparison really compares: without it the guards above would mean little."""
-    path = tmp_path / "x.ipynb"
-    cell = nbformat.v4.new_code_cell("print(1 + 1)", execution_count=1)
-    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
-    cell.outputs = [nbformat.v4.new_output("stream", name="stdout", text="3\n")]
-    nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata={"kernelspec": kernel}), path)
-    done = run_nbval(path, tmp_path)
+    write_notebook(tmp_path / "x.ipynb", "print(1 + 1)", "3\n")
+    done = run_nbval(tmp_path / "x.ipynb", tmp_path)
     assert done.returncode == 1 and "1 failed" in done.stdout
+
+
+def test_what_everyone_types_compares_strictly_and_knows_the_sanitiser(tmp_path):
+    """``pytest --nbval notebooks/``, without an option; the notebooks themselves are compared above."""
+    folder = tmp_path / "notebooks"
+    folder.mkdir()
+    for file in ("notebooks/conftest.py", "tests/nbval_sanitize.cfg", "pyproject.toml"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / file, tmp_path / file)
+    write_notebook(folder / "right.ipynb", "print(object())", "<object object at 0x7f0123456789>\n")
+    write_notebook(folder / "falsified.ipynb", "print(1 + 1)", "3\n")
+    command = [sys.executable, "-m", "pytest", "--nbval", "notebooks/"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
+    assert "falsified.ipynb" in done.stdout.split("short test summary")[1]

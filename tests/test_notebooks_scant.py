@@ -29,7 +29,7 @@ SAYS = {
     ("scenes", "02"): "no sweep shows a board",
     ("lines", "01"): "a single scan line",
     ("lines", "03"): "no sweeps with a straight side",
-    ("lines", "07"): "whether it bends",
+    ("lines", "07"): "half of them do not determine the rig",
     ("wall", "04"): "the images do not agree on the top edge",
     ("wall", "05"): "no placement has sides",
     ("edges", "07"): "placements only, 6 or more are needed",

@@ -1,51 +1,15 @@
-"""Combining axes, naming sides, pitch noise: the parts of the chain that need no recording."""
+"""Naming sides, placements left out: the parts of the chain that need no recording."""
 
-from dataclasses import fields
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
-import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.calibrate import observe, pipeline
-from lrfcal_lib.fit.residuals import chart_parameters
-from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate.observe import nearest_edges
 from lrfcal_lib.model.board import triangle_board
-from lrfcal_lib.model.geometry import axis_difference, axis_of, pose_array
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.prepared import Prepared
-
-SIGMA = (np.radians(0.5), 0.010)
-STATED = pipeline.stated_covariance(SIGMA)
-
-
-def head(seed):
-    rng = np.random.default_rng(seed)
-    return RigidTransform.from_components(rng.normal(0, 0.1, 3), Rotation.from_rotvec(rng.normal(0, 0.05, 3)))
-
-
-def apart(one, other):
-    """Angle and offset between two axes, the larger one; radians, metres."""
-    return max(axis_difference(axis_of(one), axis_of(other)))
-
-
-def estimate(T_head_lrf, covariance, scatter=None):
-    inner = dict.fromkeys(field.name for field in fields(Solution))
-    inner |= {"parameters": chart_parameters(pose_array(T_head_lrf)), "covariance": covariance, "n_placements": 20}
-    return SimpleNamespace(T_head_lrf=T_head_lrf, solution=Solution(**inner | {"covariance_placements": scatter}))
-
-
-@pytest.mark.parametrize(("scale", "scatter", "wins"), [
-    (1e-8, None, head(2)),
-    (1e8, None, head(1)),
-    (1e8, 1e-8 * STATED, head(1)),  # placements that agree by chance do not outweigh the stated axis
-])  # fmt: skip
-
-
-def test_the_better_known_axis_wins(scale, scatter, wins):
-    found, covariance = pipeline.combine(estimate(head(2), scale * STATED, scatter), (head(1), STATED))
-    assert apart(found, wins) < 1e-6
-    assert (np.diag(covariance) <= np.diag(STATED) * (1 + 1e-9)).all()
-
 
 BOARD = triangle_board()
 
@@ -61,13 +25,13 @@ def side(edge, n=20, shift=0.0, turn_deg=0.0):
 
 def test_sides_are_named_after_the_nearest_edge():
     sides = {4: side("bc", shift=0.01), 7: side("ab", shift=-0.01), 9: side("ca")}
-    assert observe.nearest_edges(BOARD, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
-    names, _ = observe.nearest_edges(BOARD, {0: side("ab"), 1: side("ab", shift=0.02)})
+    assert nearest_edges(BOARD, sides) == ({4: "bc", 7: "ab", 9: "ca"}, {})
+    names, _ = nearest_edges(BOARD, {0: side("ab"), 1: side("ab", shift=0.02)})
     assert list(names.values()).count("ab") == 1, "two sides do not share an edge"
 
 
 def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
-    names, dropped = observe.nearest_edges(BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)})
+    names, dropped = nearest_edges(BOARD, {0: side("ab", turn_deg=5), 1: side("bc", shift=0.2)})
     assert names == {} and [dropped[number].edge for number in (0, 1)] == ["ab", "bc"]
     assert "turned by 5.0 deg" in dropped[0].words and "200 mm from the edge 'bc'" in dropped[1].words
 
@@ -75,7 +39,9 @@ def test_far_and_crooked_sides_stay_unnamed_with_a_reason():
 def test_placements_with_a_problem_are_left_out_of_everything_but_the_images():
     parts = {"last_beam": {1: "a", 2: "b"}, "half_step": {1: "a", 2: "b"}}
     ready = Prepared(None, None, {1: "a", 2: "b"}, parts, parts, names={1: {}, 2: {}}, views={"left": {1: "v", 2: "v"}})
-    ready.problems.update({2: "off", "2 0": "a side, not a placement"})
+    whole = Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, "off", placement=2)
+    part = Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, "a side, not a placement", placement=1)
+    ready = replace(ready, problems=(whole, part))
     left = pipeline.without(ready)
     assert list(left.scans) == list(left.names) == list(left.edges["half_step"]) == [1]
     assert list(left.views["left"]) == [1, 2]

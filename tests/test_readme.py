@@ -22,22 +22,26 @@ from lrfcal_lib.drivers.video import Camera
 from lrfcal_lib.session import cache
 from lrfcal_lib.solvers import METHODS
 
-README, CONTRIBUTING = ((ROOT / name).read_text() for name in ("README.md", "CONTRIBUTING.md"))
+README = (ROOT / "README.md").read_text()
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
+METHODS_PAGE = (ROOT / "notebooks" / "METHODS.md").read_text()
+RIG_PAGE = (ROOT / "notebooks" / "RIG_FILE.md").read_text()
 WORKFLOW = (ROOT / ".github" / "workflows" / "test.yml").read_text()
 
 
-def blocks(kind):
-    return re.findall(rf"```{kind}\n(.*?)```", README, re.S)
+def blocks(kind, page=README):
+    return re.findall(rf"```{kind}\n(.*?)```", page, re.S)
 
 
 def test_notebooks_methods_functions_and_files_are_all_there():
     assert [p.name for p in (ROOT / "notebooks").glob("*.ipynb") if f"(notebooks/{p.name})" not in README] == []
-    assert [method for method in METHODS if f"| `{method}` |" not in README] == []
+    assert [method for method in METHODS if f"| `{method}` |" not in METHODS_PAGE] == []
     links = re.findall(r"\]\(([^)#:]+)\)", README + CONTRIBUTING)
-    files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", README + CONTRIBUTING)
+    pages = README + CONTRIBUTING + METHODS_PAGE + RIG_PAGE
+    files = re.findall(r"`((?:lrfcal_lib|tests|data|notebooks)/[\w/.]+)`", pages)
     assert len(files) > 4 and [name for name in [*links, *files] if not (ROOT / name).exists()] == []
     assert "reports/readme.jpg" in links and (ROOT / "reports" / "readme.jpg").stat().st_size < 200_000
-    names = re.findall(r"^\| `([a-z_.]+)\.([a-z_]+)\(", README, re.M)
+    names = re.findall(r"^\| `([a-z_.]+)\.([a-z_]+)\(", METHODS_PAGE, re.M)
     assert len(names) == 10
     for module, function in names:
         assert callable(getattr(importlib.import_module(f"lrfcal_lib.{module}"), function))
@@ -84,41 +88,85 @@ def test_the_example_projects_a_scan_line_into_the_image(monkeypatch):
     assert np.ptp(v[inside]) < 60 < np.ptp(u[inside]), "a scan line is nearly level"
 
 
-ROWS = {
-    "joint estimate (this repository)": "joint", "planes (Zhang and Pless), weighted": "zhang_pless",
-    "lines, edge bias estimated": "line_ml", "lines, half step": "line",
-    "lines as the paper prints them": "line_printed",
-}  # fmt: skip
-WORDS = {"sim_lms221": "simulated", "lms400_zed": "real"}
-ERRORS = {"rotation_error_deg": "deg", "translation_error_mm": "mm"}
-
-
 def golden(session, name):
     return pd.read_csv(GOLDEN / session / f"{name}.csv")
 
 
+def cells(row):
+    """The cells of a row of one of README's tables, without its first."""
+    (line,) = (line for line in README.splitlines() if line.startswith(f"| {row} |"))
+    return [cell.strip() for cell in line.split("|")[2:-1]]
+
+
+def printed(value, as_printed):
+    """A number with as many decimals as the text prints."""
+    return f"{value:.{len(as_printed.partition('.')[2])}f}"
+
+
+def test_a_number_is_compared_to_its_printed_digit():
+    assert printed(0.0449, "0.04") == "0.04" and printed(0.0451, "0.04") == "0.05" and printed(12.5, "13") == "12"
+
+
+ROWS = {
+    "joint estimate (this repository)": "joint",
+    "planes (Zhang and Pless), weighted": "zhang_pless",
+    "lines, half step": "line",
+    "lines as the paper prints them": "line_printed",
+}
+
+
 @pytest.mark.parametrize("row", ROWS)
-def test_results_are_those_of_the_stored_tables(row):
-    (cells,) = (line.split("|")[2:-1] for line in README.splitlines() if line.startswith(f"| {row} |"))
-    worst = golden("sim_lms221", "method_comparison").groupby("method")[[*ERRORS]].max()
-    stereo = golden("lms400_zed", "stereo_check").set_index("method").reindex([*ROWS.values()])[[*ERRORS]]
-    found = [*worst.loc[ROWS[row]], *stereo.loc[ROWS[row]]]
-    for cell, value, unit in zip(cells, found, [*ERRORS.values()] * 2, strict=True):
-        number, _, stated = cell.strip().partition(" ")
-        assert stated == ("" if np.isnan(value) else unit) and (number == "-") == np.isnan(value)
-        assert np.isnan(value) or float(number) == pytest.approx(value, rel=0.05, abs=0.006)
+def test_errors_of_methods_are_those_of_the_stored_tables(row):
+    errors = ["rotation_error_deg", "translation_error_mm"]
+    worst = golden("sim_lms221", "method_comparison").groupby("method")[errors].max().loc[ROWS[row]]
+    for cell, value, unit in zip(cells(row), worst, ["deg", "mm"], strict=True):
+        number, stated = cell.split(" ")
+        assert (number, stated) == (printed(value, number), unit)
+
+
+def test_random_halves_are_those_of_the_stored_tables():
+    halves = golden("lms400_zed", "random_halves")
+    text = " ".join(README.split())
+    names = ["rotation_deg", "translation_mm", "predicted_rotation_deg", "predicted_translation_mm"]
+    found = re.search(
+        r"differ by ([\d.]+) deg and ([\d.]+) mm .* (\d+) pairs .* predicts ([\d.]+) deg and ([\d.]+) mm", text
+    ).groups()
+    numbers = [*found[:2], *found[3:]]
+    assert numbers == [printed(np.sqrt(np.mean(halves[n] ** 2)), k) for n, k in zip(names, numbers, strict=True)]
+    assert int(found[2]) == halves.pair.nunique()
+
+
+def edge_errors(session, variant, ends=None):
+    """Absolute errors of the board's edges, by placement and edge."""
+    table = golden(session, "edge_lengths").query("source == @session and variant == @variant")
+    table = table[(table.ends == ends) if ends else table.error_mm.notna()]
+    return table.set_index(["placement", "edge"]).error_mm.abs()
 
 
 def test_edge_lengths_are_those_of_the_stored_tables():
-    tables = {name: golden(name, "edge_summary").set_index(["source", "variant", "ends"]) for name in WORDS}
-    text, shares = " ".join(README.split()), []
-    for name, words in WORDS.items():
-        found = tables[name].loc[name, "combined", "image"]
-        shown, count = re.search(rf"([\d.]+) mm \((\d+) edges, {words}\)", text).groups()
-        assert float(shown) == pytest.approx(found.mean_abs_error_mm, abs=0.06) and int(count) == found.n
-        shares.append(f"{found.within_90_percent:.0f} %")
-    assert f"{' and '.join(shares)} of them within the 90 % intervals" in text
-    assert f"reports {tables['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm" in text
+    for column, session in enumerate(["sim_lms221", "lms400_zed"]):
+        last_beam = edge_errors(session, "last_beam", "scan")
+        combined = edge_errors(session, "combined")
+        rows = {
+            "like the paper: last beams of scan lines": last_beam,
+            "the same edges, half a step further out": edge_errors(session, "half_step", "scan")[last_beam.index],
+            "the same edges, by the cloud's plane and the images (`combined`)": combined[last_beam.index],
+            "all edges, `combined`": combined,
+        }
+        for row, errors in rows.items():
+            number, count = re.fullmatch(r"([\d.]+) mm(?: \((\d+) edges\))?", cells(row)[column]).groups()
+            assert number == printed(errors.mean(), number), (session, row)
+            assert count is None or int(count) == len(errors) == errors.notna().sum()
+
+
+def test_shares_within_intervals_and_the_papers_figure_are_those_of_the_stored_tables():
+    summary = {
+        s: golden(s, "edge_summary").set_index(["source", "variant", "ends"]) for s in ("sim_lms221", "lms400_zed")
+    }
+    shares = re.search(r"(\d+) % \(simulated\) and (\d+) % \(real\)", README).groups()
+    within = [table.loc[name, "combined", "image"].within_90_percent for name, table in summary.items()]
+    assert [*shares] == [f"{share:.0f}" for share in within]
+    assert f"error of {summary['sim_lms221'].loc['paper'].squeeze().mean_abs_error_mm:.2f} mm" in README
 
 
 MODELS = {
@@ -128,7 +176,7 @@ MODELS = {
 
 
 def test_every_key_of_a_rig_file_stands_there_with_its_default():
-    stated = dict(re.findall(r"^\| `([\w.\[\]]+)` \| ([^|]+) \| [^|]+ \|$", README.split("Every key of")[1], re.M))
+    stated = dict(re.findall(r"^\| `([\w.\[\]]+)` \| ([^|]+) \| [^|]+ \|$", RIG_PAGE, re.M))
     fields = {prefix + name: field for prefix, model in MODELS.items() for name, field in model.model_fields.items()}
     fields = {name: field for name, field in fields.items() if name not in ("lrf", "head", "cameras")}
     assert stated.keys() == fields.keys()
@@ -144,6 +192,6 @@ def test_every_key_of_a_rig_file_stands_there_with_its_default():
 
 
 def test_the_rig_file_shown_is_complete():
-    (example,) = blocks("json")
+    (example,) = blocks("json", RIG_PAGE)
     rig = rig_file.rig_of(json.loads(example))
     assert len(rig.plan.to_do()) == 20 and rig.devices.cameras.keys() == rig.cameras.keys() == {"left"}

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lrfcal_lib.calibrate import pipeline
+from lrfcal_lib.calibrate import clouds
 from lrfcal_lib.model.geometry import axis_difference, axis_of, transform_difference
 from lrfcal_lib.session.stated import TransformStated, from_json
 
@@ -61,7 +61,9 @@ def test_axis_and_cameras_are_close_to_the_authors(lms400):
     """The cameras roughly: the frames differ by the height of the axis and by what each method makes of the pitch."""
     angle, offset = axis_difference(*(axis_of(lms400.platform.transform(name)) for name in ("combined", "stated")))
     assert angle < np.deg2rad(1.5) and offset < 0.03
-    (data, its), (stated, known) = (lms400.platform.parameters()[name] for name in ("line_3d", "stated"))
+    axes = lms400.platform.axes
+    data, its = axes["line_3d"].parameters, axes["line_3d"].covariance
+    stated, known = axes["stated"].parameters, axes["stated"].covariance
     assert (np.abs(data - stated) < 3 * np.sqrt(np.diag(its + known))).all()
     authors = from_json(TransformStated, lms400.prepared.session.reference["T_left_platform"]).made()
     angle, shift = transform_difference(lms400.solutions["left", "zhang_pless"].transform, authors)
@@ -75,7 +77,7 @@ def test_the_cloud_is_coloured_and_borders_of_the_chessboard_lie_on_the_known_gr
     """
     ready, pattern, off = lms400.prepared, lms400.prepared.board.pattern, []
     scans = {p: ready.scans[p] for p in (1, 6, 11, 16)}
-    cloud = pipeline.color_cloud(replace(lms400, prepared=replace(ready, scans=scans)), "joint")
+    cloud = clouds.color_cloud(replace(lms400, prepared=replace(ready, scans=scans)), "joint")
     assert cloud.seen.mean() > 0.9
     for placement in scans:
         part = cloud.rows((cloud.placement == placement) & cloud.seen)

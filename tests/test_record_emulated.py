@@ -16,7 +16,7 @@ from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.drivers.video import Frame
 from lrfcal_lib.emulators.rig import EmulatedRig
 from lrfcal_lib.emulators.world import scaled
-from lrfcal_lib.fit.residuals import chart_parameters
+from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.model.geometry import pose_array
 from lrfcal_lib.session.read import open_session
 from lrfcal_lib.session.stated import model_to_json

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from joint_draws import MOUNTS, draw, rng
 
-from lrfcal_lib.fit.residuals import LEAST_STEP, Unknowns, gather, view_block
+from lrfcal_lib.fit.edge_likelihood import LEAST_STEP
 from lrfcal_lib.solvers.joint import solve_joint
+from lrfcal_lib.solvers.joint_model import Unknowns, gather
+from lrfcal_lib.solvers.joint_residuals import view_block
 
 STOP = np.radians(0.010)
 

@@ -147,8 +147,7 @@ def check_scan(
     try:
         scan = board_in_scan.find_board(sweep, board, T_head_lrf, lrf)
     except board_in_scan.BoardNotFound as error:
-        reason = str(error).partition(": ")[2]
-        text = f"no board: {reason}; sweep over all of it, free of walls"
+        text = f"no board: {error}; sweep over all of it, free of walls"
         return [Light("scan", "bad", text)]
     rows = np.flatnonzero(scan.mask.any(axis=1))
     text = (

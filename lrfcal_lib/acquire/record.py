@@ -111,6 +111,7 @@ class Recording(Closed):
             stated.T_head_lrf,
             platform_sigma=stated.platform_sigma,
             reference=reference,
+            continuous=stated.plan.mode == "continuous",
             resume=resume,
             **about,
         )

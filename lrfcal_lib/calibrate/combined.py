@@ -9,11 +9,11 @@ import numpy as np
 
 from lrfcal_lib.calibrate import outline
 from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.fit import residuals
 from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.preprocess.board_in_image import line_misses
+from lrfcal_lib.solvers import joint_model, joint_residuals
 
 STILL = 1e5  # information roots of what moves board and sides together, which changes no length
 SCALE_ROUNDS = 4  # of weighing image edges by how well they fit
@@ -32,8 +32,8 @@ class Case:
     begins and ends, metres.
     """
 
-    data: residuals.JointData
-    unknowns: residuals.Unknowns
+    data: joint_model.JointData
+    unknowns: joint_model.Unknowns
     whitener: np.ndarray
     images: list
     reach: np.ndarray
@@ -138,7 +138,7 @@ def case_of(joint, observations, placement):
     lines = np.array([rough.lines.get(name, [1.0, 0.0, -1.0]) for name in edges])
     lines *= -np.where(lines[:, 2:] > 0, 1.0, -1.0)  # outwards: the face is in the middle
     obs = obs.keep(beam=np.isin(obs.beam_edge, told))
-    data = residuals.gather(obs, **solution.data.levels | {"prior": None})
+    data = joint_model.gather(obs, **solution.data.levels | {"prior": None})
     own = {
         "boards": rough.T_platform_plane[None, :3],
         "sweeps": np.zeros((1, 2)),
@@ -183,7 +183,7 @@ def moved(case, state, step):
     """Everything a step on; the last two numbers of each side are its own."""
     (found, lines, change) = state
     own = case.unknowns.own
-    found = residuals.move_state(found, (step[0], step[1][:, :own]), case.unknowns)
+    found = joint_model.move_state(found, (step[0], step[1][:, :own]), case.unknowns)
     return (
         found,
         outline.moved_lines(lines, case.middle, step[1][0, own:].reshape(-1, 2)),
@@ -212,16 +212,17 @@ def blocks_of(state, case, scale):
     count = len(case.middle)
     data = replace(case.data, lines=lines)
     width = unknowns.shared + unknowns.own + 2 * count
-    blocks = [residuals.face_block(found, data, unknowns)]
+    blocks = [joint_residuals.face_block(found, data, unknowns)]
     if data.beam["used"].any():
-        beams = residuals.beam_block(found, data, unknowns)
+        beams = joint_residuals.beam_block(found, data, unknowns)
         own = side_columns(beams.jacobian, data.beam["edge"], state, case)
         blocks.append(replace(beams, jacobian=np.concatenate([beams.jacobian, own], axis=-1)))
-    blocks += (
-        [residuals.sweep_block(found, data, unknowns)] if residuals.SWEEPS[unknowns.sweep] else []
-    )
-    blocks += [residuals.side_block(found, data, unknowns)] if unknowns.sides else []
-    blocks += [sight_block(state, case, scale)] if case.images else []
+    if joint_model.SWEEPS[unknowns.sweep]:
+        blocks.append(joint_residuals.sweep_block(found, data, unknowns))
+    if unknowns.sides:
+        blocks.append(joint_residuals.side_block(found, data, unknowns))
+    if case.images:
+        blocks.append(sight_block(state, case, scale))
     # board and sides together; sides of which nothing is known
     fixed = np.zeros((3 + 2 * count, width))
     board = found.boards[0]
@@ -261,11 +262,11 @@ def sight_block(state, case, scale):
     found, lines, _ = state
     view = case.data.view
     unknowns = case.unknowns
-    off = residuals.view_block(found, case.data, unknowns).residuals.reshape(1, -1, 6)
+    off = joint_residuals.view_block(found, case.data, unknowns).residuals.reshape(1, -1, 6)
     here = np.concatenate(
         [geometry.move_pose(view["pose"][..., :3, :], off), view["pose"][..., 3:, :]], axis=-2
     )
-    by_all = residuals.view_block(
+    by_all = joint_residuals.view_block(
         found, replace(case.data, view=view | {"pose": here}), unknowns
     ).jacobian
     # of [w, v] of every T_camera_board

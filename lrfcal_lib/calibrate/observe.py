@@ -17,6 +17,7 @@ from lrfcal_lib.model.observations import (
     JointObservations,
     PlatformObservations,
 )
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import side_lines
 from lrfcal_lib.preprocess.intrinsics import raised_points
@@ -393,8 +394,8 @@ def name_sides(prepared):
                 rows = found.side == side
                 sides.setdefault(int(side), on_board(found.points[rows], found.pitch[rows]))
         names[placement], dropped[placement] = nearest_edges(prepared.board, sides)
-        for side, why in dropped[placement].items():
-            problems[f"{placement} {side}"] = f"placement {placement}: {why.words}"
+        for why in dropped[placement].values():
+            problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_SIDE, why.words, placement))
     return names, dropped, problems
 
 
@@ -422,19 +423,18 @@ def board_maps(prepared, rough):
 
 
 def rough_poses(prepared):
-    """Poses ``T_camera_source`` of the cameras from the planes alone, and problems by placement or
-    camera.
+    """Poses ``T_camera_source`` of the cameras from the planes alone, and a list of Problem.
 
     Problems are placements that disagree with all others, and why a camera has no pose.
     """
-    rough, problems, misses = {}, {}, {}
+    rough, problems, misses = {}, [], {}
     for camera in prepared.views:
         obs = observe(prepared, camera)
         try:
             inliers, outlying = find_outlying_placements(obs)
             rough[camera] = solve_camera(obs.select(inliers), "zhang_pless").transform
         except DegenerateGeometry as error:
-            problems[f"camera {camera}"] = str(error)
+            problems.append(Problem(Stage.SIDES, ProblemKind.NO_POSE, str(error), camera=camera))
             continue
         for placement in obs.placements.tolist():
             misses.setdefault(placement, {})[camera] = outlying.get(placement, 0.0)
@@ -448,7 +448,8 @@ def rough_poses(prepared):
                     f"scan: {off} board in the images of all {len(miss)} cameras "
                     f"({_causes(prepared, placement)})"
                 )
-            problems[placement] = f"{words}; left out"
+            words = f"{words}; left out"
+            problems.append(Problem(Stage.SIDES, ProblemKind.OTHER_PLANE, words, placement))
     return rough, problems
 
 
@@ -497,14 +498,14 @@ def nearest_edges(board, sides):
 
 def observe_joint(prepared, views=None):
     """Everything that the joint estimate uses of a session, of the placements that
-    `prepared.problems` does not name.
+    are not left out.
 
     `views` are lists of BoardView by camera; those of :func:`all_views` when left out.
     """
     if views is None:
         views = all_views(prepared)
     session = prepared.session
-    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.problems}
+    scans = {p: scan for p, scan in prepared.scans.items() if p not in prepared.left_out}
     ranges = [_ranges(scan, row) for row, scan in enumerate(scans.values())]
     lens_covariance = None
     if views:

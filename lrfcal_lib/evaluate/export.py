@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.pipeline import calibrate, cloud_blocks, handed_over
+from lrfcal_lib.calibrate.clouds import cloud_blocks
+from lrfcal_lib.calibrate.pipeline import calibrate, handed_over
 from lrfcal_lib.calibrate.reconstruct import write_ply
 from lrfcal_lib.evaluate.joint_tables import joint_fit
 from lrfcal_lib.evaluate.scenes import with_sigma
@@ -62,7 +63,7 @@ def calibration_record(calibration, method, judged=None):
         "platform": {
             **_transform(platform.transform(axis)),
             "maps": "lrf to head",
-            "axis_covariance": platform.parameters()[axis][1].tolist(),
+            "axis_covariance": platform.axes[axis].covariance.tolist(),
             "axis_covariance_of": AXIS_PARAMETERS,
         },
         "cameras": {
@@ -289,5 +290,5 @@ def _print_poses(calibration):
         turn = f"rotation vector {values[:3]} +- {sigma[:3]} deg"
         shift = f"translation {values[3:]} +- {sigma[3:]} mm"
         print(f"{camera:>8} {method:<20} {turn}, {shift}")
-    for key, why in (calibration.prepared.problems | calibration.problems).items():
-        print(f"{key}: {why}")
+    for problem in (*calibration.prepared.problems, *calibration.problems):
+        print(problem)

@@ -5,13 +5,13 @@ import pandas as pd
 
 from lrfcal_lib.evaluate.tables import rms, unit_of
 from lrfcal_lib.evaluate.truth import axis_errors, camera_errors
-from lrfcal_lib.fit.residuals import disc_edge, edge_residuals_px, edge_shift
+from lrfcal_lib.fit.edge_likelihood import disc_edge, edge_shift
+from lrfcal_lib.fit.residuals import edge_residuals_px
 from lrfcal_lib.judge.next_placement import outline
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.solvers.joint import solve_again
-from lrfcal_lib.solvers.joint_noise import on_board
 
 ALL = 10**9  # crossings
 NOISE_WORDS = {
@@ -93,8 +93,8 @@ def edge_bias_mm(joint):
     solution = joint.solution
     obs = joint.observations
     sensor = solution.sensor["edge_log_odds"]
-    distance = np.linalg.norm(solution.state.boards[:, :, 3], axis=1)
-    odds = obs.beam_background + solution.state.sides[obs.beam_placement, obs.beam_edge]
+    distance = np.linalg.norm(solution.board_poses[:, :, 3], axis=1)
+    odds = obs.beam_background + solution.side_odds[obs.beam_placement, obs.beam_edge]
     columns = {
         "placement": obs.placements[obs.beam_placement],
         "edge": np.array(obs.edges)[obs.beam_edge],
@@ -114,8 +114,7 @@ def joint_fit(joint, cameras=None):
     edges, the estimated edge bias taken off, over all cameras or those named.
     """
     solution = joint.solution
-    height = on_board(solution.state, solution.data)[..., 2]
-    height = height[solution.data.face["used"]]
+    height = solution.face_points()[:, 2]
     cameras = cameras or joint.observations.cameras
     edges = np.concatenate([edge_misses_px(joint, camera) for camera in cameras])
     return {"plane_rms_mm": 1000 * rms(height), "edge_rms_px": rms(edges)}
@@ -135,7 +134,7 @@ def edge_misses_px(joint, camera):
         return np.zeros(0)
     row = [placements.index(p) for p in obs.crossing_placement]
     side = [edges.index(e) for e in obs.crossing_edge]
-    odds = obs.crossing_background + solution.state.sides[row, side]
+    odds = obs.crossing_background + solution.side_odds[row, side]
     shift = edge_shift(solution.sensor["edge_log_odds"], obs.crossing_radius, odds)[0]
     depth = pose.apply(obs.crossing_points)[:, 2]
     return edge_residuals_px(obs, pose) - shift * obs.model.fx / depth

@@ -9,8 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import logit
 from scipy.stats import binom, chi2
 
+from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS
+from lrfcal_lib.fit.edge_likelihood import disc_share
 from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
-from lrfcal_lib.fit.residuals import AXIS_COLUMNS, JointState, disc_share, gather, named_blocks
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
     polar_to_points,
@@ -22,6 +23,8 @@ from lrfcal_lib.preprocess.board_in_scan import fit_lines, row_ends
 from lrfcal_lib.preprocess.edges_in_scan import UNIFORM
 from lrfcal_lib.solvers import solve_camera
 from lrfcal_lib.solvers.joint import in_stated_gauge
+from lrfcal_lib.solvers.joint_model import JointState, gather
+from lrfcal_lib.solvers.joint_residuals import named_blocks
 from lrfcal_lib.solvers.lines import edge_bias
 
 INTERVAL = 0.9

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.calibrate.pipeline import views_of
+from lrfcal_lib.calibrate.clouds import views_of
 from lrfcal_lib.calibrate.reconstruct import join, reconstruct
 from lrfcal_lib.evaluate.truth import read_truth
 from lrfcal_lib.judge.uncertainty import COLUMNS, carried, chain_of, range_noise, spread
@@ -187,13 +187,13 @@ def scene_errors(cloud, calibration, method):
     world = world_of(
         load_setup(read_json(session.path / "truth.json", session.path)["setup"]), None
     )
-    T_head_lrf, corrections = calibration.frame(method)
-    gauge = truth.T_head_lrf * T_head_lrf.inv()
+    rig = calibration.rig(method)
+    gauge = truth.T_head_lrf * rig.T_head_lrf.inv()
     turn = gauge.rotation.as_rotvec()[0]
     shift = np.array([gauge.translation[0], 0.0, 0.0])
     placement = int(cloud.placement[0])
     sweep = session.sweep(placement)
-    turn += np.mean(truth.pitch[placement] - corrections.pitch(placement, sweep.pitch))
+    turn += np.mean(truth.pitch[placement] - rig.corrections.pitch(placement, sweep.pitch))
     order = np.argsort(sweep.pitch)
     pitch = np.interp(cloud.pitch, sweep.pitch[order], truth.pitch[placement][order])
     points = tilt(cloud.points, turn) + shift
@@ -211,7 +211,7 @@ def scene_errors(cloud, calibration, method):
     own = np.abs(depth) < BESIDE
     blocked = np.zeros(len(points), bool)
     true = origins + np.where(own, hits.distance, length)[:, None] * directions
-    for view in views_of(calibration, method, placement):
+    for view in views_of(session, rig, placement):
         mine = np.flatnonzero((cloud.image == view.number) & np.isfinite(depth))
         eye = tilt(view.T_camera_platform.inv().translation, turn) + shift
         way = true[mine] - eye

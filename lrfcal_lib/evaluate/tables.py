@@ -20,13 +20,6 @@ UNITS = {  # of parameters, and the factor from radians and metres
     r"pitch_scale": ("%", 100.0),
     r"[fc][xy]": ("px", 1.0),
 }
-STEREO_COLUMNS = (
-    "method",
-    "baseline_mm",
-    "baseline_error_mm",
-    "translation_error_mm",
-    "rotation_error_deg",
-)
 SCAN_COLUMNS = (
     "placement",
     "n_points",
@@ -193,10 +186,10 @@ def platform_calibration_table(platform, truth=None):
     """
     names = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y")
     found = {}
-    for method, (values, covariance) in platform.parameters().items():
-        phi, ty = geometry.paper_parameters(platform.transform(method))
-        sigma = np.append(np.sqrt(np.diag(covariance)), np.full(4, np.nan))
-        found[method,] = names, [*values, *phi, ty], sigma
+    for method, axis in platform.axes.items():
+        phi, ty = geometry.paper_parameters(axis.T_head_lrf)
+        sigma = np.append(axis.sigma, np.full(4, np.nan))
+        found[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = _parameter_table(["method"], found)
     if truth is not None:
         errors = {method: axis_errors(platform.transform(method), truth) for (method,) in found}
@@ -316,7 +309,7 @@ def axis_knowledge_table(platform):
 
     Columns parameter, unit, sigma_data, sigma_rough, better.
     """
-    data = np.sqrt(np.diag(platform.parameters()["line_3d"][1]))
+    data = platform.axes["line_3d"].sigma
     rough = np.repeat(platform.stated_sigma, 2)
     units, factors = zip(*map(unit_of, AXIS_NAMES), strict=True)
     return pd.DataFrame(
@@ -328,23 +321,3 @@ def axis_knowledge_table(platform):
             "better": np.where(data < rough, "data", "rough measurement"),
         }
     )
-
-
-def stereo_check(solutions, cameras, T_second_first):
-    """What two cameras, calibrated apart, say about each other, against the chessboard in both.
-
-    Columns method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg. Both
-    calibrations use the same LRF points, so the check cannot see an error of the cloud.
-    """
-    rows = []
-    baseline = np.linalg.norm(T_second_first.translation)
-    for method in (*METHODS, "joint"):
-        if all((camera, method) in solutions for camera in cameras):
-            first, second = (solutions[camera, method].transform for camera in cameras)
-            between = second * first.inv()
-            angle, distance = geometry.transform_difference(between, T_second_first)
-            length = np.linalg.norm(between.translation)
-            error = length - baseline
-            angle_deg = np.rad2deg(angle)
-            rows.append((method, 1000 * length, 1000 * error, 1000 * distance, angle_deg))
-    return pd.DataFrame(rows, columns=STEREO_COLUMNS)

@@ -532,3 +532,21 @@ def placement_covariance(hessians, scores):
     gained = np.diagonal(without, axis1=-2, axis2=-1) - whole
     factor = np.sqrt(whole[..., 0, :] / (share * gained.sum(axis=-2)))
     return factor[..., :, None] * squares * factor[..., None, :], shifts
+
+
+def pad(group, count, width=1):
+    """Arrays of a group (with `placement`, an index below `count`) sorted into rectangles (count,
+    n, ...).
+
+    Rows of a placement keep their order; zeros stand behind them, and `used` marks what is no
+    padding. n is `width` at least.
+    """
+    order = np.argsort(group["placement"], kind="stable")
+    number = np.bincount(group["placement"], minlength=count)
+    used = np.arange(number.max(initial=width)) < number[:, None]
+    out = {"used": used}
+    for key, value in group.items():
+        if key != "placement":
+            out[key] = np.zeros(used.shape + value.shape[1:], value.dtype)
+            out[key][used] = value[order]
+    return out

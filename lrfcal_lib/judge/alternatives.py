@@ -3,7 +3,6 @@ cause and remedy.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -11,15 +10,13 @@ from itertools import permutations
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from lrfcal_lib.fit.least_squares import eliminate, whiten
-from lrfcal_lib.fit.residuals import SENSOR, gather, named_blocks
 from lrfcal_lib.model.geometry import (
-    DegenerateGeometry,
     axis_difference,
     axis_of,
     transform_difference,
 )
-from lrfcal_lib.solvers.joint import JointSolution, solve_joint
+from lrfcal_lib.solvers.joint import JointSolution
+from lrfcal_lib.solvers.joint_model import SENSOR
 
 STEP = 1e-4  # of the numeric derivative, in the unit of an alternative
 ADMITTED = 0.5  # the range offset that a maker admits is two standard deviations
@@ -37,7 +34,6 @@ FAR_SHIFT = 0.3
 # log odds; sides are expected to deviate no more than this while statements are weighed
 ALIKE = 0.15
 LEVER = 0.2  # metres, weighs turns against shifts
-BETTER = 3.0  # times less scatter of ranges with the other sense
 # of the best alternative's likelihood ratio: another one explains the data nearly as well
 AS_GOOD = 0.6
 
@@ -232,71 +228,44 @@ class ScoreTest:
     Attributes
     ----------
     solution : JointSolution
-    levels : dict
-        Noise levels; sides that may deviate, and beams that may say nothing, would take up what a
-        wrong statement does to edges.
-    blocks : dict of str to (ndarray, ndarray)
-        Whitened residuals and Jacobians.
+        With noise levels for the test: sides that may deviate, and beams that may say nothing,
+        would take up what a wrong statement does to edges.
     prior, pull : ndarray, shape (c + 1,)
         Information on the shared unknowns and one more that the maker's range offset adds, and its
         score.
     """
 
     solution: JointSolution
-    levels: dict
-    blocks: dict
     prior: np.ndarray
     pull: np.ndarray
 
     @classmethod
     def at(cls, solution, admitted_offset):
         """The test at a JointSolution."""
-        unknowns = solution.unknowns
-        levels = dict(solution.data.levels)
-        levels["side_sigma"] = min(solution.data.side_sigma, ALIKE)
-        levels["lapse"] = 0.0
-        data = gather(solution.observations, **levels)
-        blocks = named_blocks(solution.state, data, unknowns)
-        prior = np.zeros(unknowns.shared + 1)
-        pull = np.zeros(unknowns.shared + 1)
-        if "range_offset" in unknowns.sensor:
-            where = unknowns.columns["range_offset"]
+        names = solution.solution.names
+        prior = np.zeros(len(names) + 1)
+        pull = np.zeros(len(names) + 1)
+        if "range_offset" in names:
+            where = names.index("range_offset")
             prior[where] = 1 / (ADMITTED * admitted_offset) ** 2
             pull[where] = prior[where] * solution.sensor["range_offset"]
-        whitened = {name: whiten(block) for name, block in blocks.items()}
-        return cls(solution, levels, whitened, prior, pull)
-
-    def normal_equations(self, alternative):
-        """Hessian and gradient by placement, with the alternative's size as the last shared
-        unknown.
-        """
-        changed = gather(alternative.change(self.solution.observations, STEP), **self.levels)
-        after = named_blocks(self.solution.state, changed, self.solution.unknowns)
-        hessian = 0.0
-        gradient = 0.0
-        for name, (residuals, jacobian) in self.blocks.items():
-            by_size = (whiten(after[name], False)[0] - residuals) / STEP
-            J = np.insert(jacobian, self.solution.unknowns.shared, by_size, axis=-1)
-            back = np.swapaxes(J, -1, -2)
-            hessian = hessian + back @ J
-            gradient = gradient + (back @ residuals[..., None])[..., 0]
-        return hessian, gradient
+        side_sigma = min(solution.noise["side_sigma"], ALIKE)
+        return cls(solution.with_levels(side_sigma=side_sigma, lapse=0.0), prior, pull)
 
     def doubt(self, kind, alternative):
         """What the data say of an alternative, a Doubt."""
-        shared = self.solution.unknowns.shared
-        reduced, score, _ = eliminate(*self.normal_equations(alternative), shared + 1)
-        information = reduced.sum(axis=0) + np.diag(self.prior)
+        score = self.solution.score(alternative.change(self.solution.observations, STEP), STEP)
+        information = score.information.sum(axis=0) + np.diag(self.prior)
         covariance = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
-        step = -covariance @ (score.sum(axis=0) + self.pull)
+        step = -covariance @ (score.gradient.sum(axis=0) + self.pull)
         value = float(step[-1])
         # what each placement still pulls at the value found
-        pulls = (score + reduced @ step) @ covariance[-1]
+        pulls = (score.gradient + score.information @ step) @ covariance[-1]
         freedom = max(len(pulls) - 1, 1)
         noise = covariance[-1, -1]
         scatter = np.sum(pulls**2) * len(pulls) / freedom
         sigma = float(np.sqrt(max(noise, scatter)))
-        along = covariance[:shared, -1] / max(noise, 1e-300) * value
+        along = covariance[:-1, -1] / max(noise, 1e-300) * value
         handed = [i for i, name in enumerate(self.solution.solution.names) if name not in SENSOR]
         moves = np.abs(along[handed]) / self.solution.solution.trusted_sigma[handed]
         sizes = {"size": abs(value), "sigma": sigma}
@@ -357,39 +326,6 @@ def not_an_offset(solution, admitted_offset, stated=ALTERNATIVES):
     return replace(
         best, words=f"{best.words} (instead of a range offset of {1000 * offset:.0f} mm)"
     )
-
-
-def plausible(solution):
-    """Whether a JointSolution converged, with a pitch that counts in the sense that is stated."""
-    return solution.converged and solution.sensor["pitch_scale"] > -1
-
-
-def other_sense(joint):
-    """In words, if a hopeless estimate (JointCalibration) is none once bearings count the other way
-    round; else ''.
-
-    Everything is estimated again. A pitch of the other sense is the same but for a half turn of the
-    range finder. A camera on the base contradicts either; without one a mirrored rig fits as well,
-    see :func:`far_from_stated`.
-    """
-    obs = joint.solution.observations
-    level = joint.solution.noise["face_scale"]
-    turned = replace(
-        obs, face_bearing=2 * MIDDLE - obs.face_bearing, beam_bearing=2 * MIDDLE - obs.beam_bearing
-    )
-    with suppress(DegenerateGeometry, np.linalg.LinAlgError):  # so read it may fit nothing at all
-        again = solve_joint(turned, required=False, **joint.settings)
-        better = level / again.noise["face_scale"]
-        if (
-            again.converged
-            and not again.unobservable
-            and better > (BETTER if plausible(joint.solution) else 1.0)
-        ):
-            return (
-                f"bearings, or the pitch, count in the other sense: ranges fit {better:.1f} "
-                "times as well then"
-            )
-    return ""
 
 
 def far_from_stated(joint):

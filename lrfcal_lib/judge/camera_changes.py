@@ -7,8 +7,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc, fdtrc
 
-from lrfcal_lib.fit.least_squares import eliminate, linearise, whiten
-from lrfcal_lib.fit.residuals import gather, named_blocks
 from lrfcal_lib.model.camera import project
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
@@ -216,22 +214,18 @@ def likeliest_step(solution):
     A score test with all that was estimated free. Where placements scatter more than their noise
     explains, the statistic is measured by their scatter.
     """
-    unknowns = solution.unknowns
     placements = len(solution.observations.placements)
     last = placements - BESIDE
-    if last < BESIDE or not unknowns.poses or not len(solution.observations.cameras):
+    if last < BESIDE:
         return None
-    blocks = named_blocks(solution.state, solution.data, unknowns)
-    hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
-    reduced, score, _ = eliminate(hessian, gradient, unknowns.shared)
+    score = solution.score()
 
     tested = []
-    first_column = unknowns.columns["cameras"].start
-    for camera in range(unknowns.cameras):
-        columns = first_column + POSE * camera + np.arange(POSE)
+    for camera, name in enumerate(solution.observations.cameras):
+        columns = solution.columns(f"{name}_")
         for row in range(BESIDE, last + 1):
             if _seen_beside(solution.observations, camera, row):
-                p_value = _chance_of_step(reduced, score, columns, row)
+                p_value = _chance_of_step(score, columns, row)
                 tested.append(Step(camera, row, p_value))
     best = min(tested, key=lambda step: step.p_value, default=None)
     if best is None or best.p_value * len(tested) > LEVEL:
@@ -245,19 +239,19 @@ def _seen_beside(obs, camera, row):
     return min(np.sum(shown < row), np.sum(shown >= row)) >= BESIDE
 
 
-def _chance_of_step(reduced, score, columns, row):
+def _chance_of_step(score, columns, row):
     """Probability that chance makes the pose in these columns seem another one from a row on.
 
-    `reduced` (p, c, c) and `score` (p, c) are what each placement says about the shared unknowns.
+    `score` is what each placement says about the shared unknowns.
     """
-    count, shared = score.shape
+    count, shared = score.gradient.shape
     later = np.arange(count) >= row
     # the normal equations with the pose's change as more unknowns, placement by placement
     repeated = np.concatenate([np.arange(shared), columns])
     kept = np.ones((count, len(repeated)))
     kept[~later, shared:] = 0.0
-    whole = reduced[:, repeated][:, :, repeated] * kept[:, :, None] * kept[:, None, :]
-    gradient = score[:, repeated] * kept
+    whole = score.information[:, repeated][:, :, repeated] * kept[:, :, None] * kept[:, None, :]
+    gradient = score.gradient[:, repeated] * kept
 
     covariance = np.linalg.pinv(whole.sum(axis=0), rcond=RCOND, hermitian=True)
     step = -covariance @ gradient.sum(axis=0)
@@ -353,26 +347,11 @@ def growth_by_depth(solution, camera):
 
     A score test with all that was estimated free: who magnifies sees boards nearer than they are.
     """
-    unknowns = solution.unknowns
     obs = solution.observations
     nearer = obs.view_pose.copy()
     nearer[obs.view_camera == camera, 2, 3] *= 1 + STEP
-    levels = solution.data.levels
-    shared = unknowns.shared
-    before = named_blocks(solution.state, solution.data, unknowns)
-    after = named_blocks(solution.state, gather(replace(obs, view_pose=nearer), **levels), unknowns)
-
-    hessian = gradient = 0.0
-    for name, block in before.items():
-        residuals, jacobian = whiten(block)
-        by_growth = np.zeros_like(residuals)
-        if name == "view":
-            by_growth = (whiten(after[name], False)[0] - residuals) / STEP
-        jacobian = np.insert(jacobian, shared, by_growth, axis=-1)
-        transposed = np.swapaxes(jacobian, -1, -2)
-        hessian = hessian + transposed @ jacobian
-        gradient = gradient + (transposed @ residuals[..., None])[..., 0]
-    reduced, score, _ = eliminate(hessian, gradient, shared + 1)
-    covariance = np.linalg.pinv(reduced.sum(axis=0), rcond=RCOND, hermitian=True)
-    growth = -(covariance @ score.sum(axis=0))[-1]
+    score = solution.score(replace(obs, view_pose=nearer), STEP)
+    information = score.information.sum(axis=0)
+    covariance = np.linalg.pinv(information, rcond=RCOND, hermitian=True)
+    growth = -(covariance @ score.gradient.sum(axis=0))[-1]
     return float(growth), float(np.sqrt(max(covariance[-1, -1], 0.0)))

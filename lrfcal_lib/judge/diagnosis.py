@@ -1,19 +1,11 @@
-"""What is wrong with a recording, as tables and in words: boards that bend, a pitch that is off."""
-
-from dataclasses import dataclass
+"""What is wrong with a recording, in words: a lens that is not its model's, a pitch that is off."""
 
 import numpy as np
-import pandas as pd
 
-from lrfcal_lib.calibrate.observe import board_maps, rough_poses
 from lrfcal_lib.model.camera import fold, lens_terms, project
-from lrfcal_lib.preprocess.bend import BoardBends, board_bends
 from lrfcal_lib.preprocess.intrinsics import raised_points
-from lrfcal_lib.solvers.pitch import PitchErrors
 
 SIGNIFICANT = 3.0  # standard deviations of an offset by sweep direction
-# a sheet bent less than this share of what the scan shows does not explain the scan
-SHEET_SHARE = 0.5
 # of an image; corners in a part; pixels
 LENS_PARTS = np.array([6, 4])
 LENS_CORNERS = 20
@@ -25,74 +17,6 @@ REMEDY = "state intrinsics of this image size, or take sharp images with the che
 REMEDY_WIDE = (
     "use a lens below 110 deg, crop or undistort the images first, state intrinsics of this size"
 )
-# two cameras whose turns differ by less than this share of the larger one moved together
-SAME_TURN = 0.5
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What a recording says about itself before anything is calibrated.
-
-    `problems` are those of the prepared session: what cannot be used and why.
-    """
-
-    bends: BoardBends
-    pitch_errors: PitchErrors | None
-    problems: dict
-
-
-def diagnose(prepared, pitch_errors=None):
-    """Ask a recording (Prepared) whether its boards were flat: a :class:`Diagnosis`.
-
-    `pitch_errors` are those of :func:`lrfcal_lib.calibrate.pipeline.find_pitch_errors`.
-    """
-    # whose findings are in the problems already
-    maps = board_maps(prepared, rough_poses(prepared)[0])
-    return Diagnosis(board_bends(prepared, maps), pitch_errors, dict(prepared.problems))
-
-
-def bends_table(bends):
-    """Bend of the board (BoardBends) at every placement.
-
-    Columns placement, bend_mm, sigma_mm (in the scan), p_value, bends, sheet_bend_mm,
-    sheet_sigma_mm (in the images; NaN where not known), reason.
-    """
-    columns = [
-        "placement",
-        "bend_mm",
-        "sigma_mm",
-        "p_value",
-        "bends",
-        "sheet_bend_mm",
-        "sheet_sigma_mm",
-        "reason",
-    ]
-    rows = [
-        (
-            b.placement,
-            1e3 * b.size,
-            1e3 * b.sigma,
-            b.p_value,
-            b.bends,
-            1e3 * b.sheet,
-            1e3 * b.sheet_sigma,
-            b.reason,
-        )
-        for b in bends.placements.values()
-    ]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def findings_in_words(diagnosis):
-    """What a recording says about itself, one sentence a finding.
-
-    None for a recording without fault.
-    """
-    return (
-        pitch_words(diagnosis.pitch_errors)
-        + bend_words(diagnosis.bends)
-        + problem_words(diagnosis.problems)
-    )
 
 
 def lens_words(prepared):
@@ -174,60 +98,3 @@ def pitch_words(errors):
             "the pitch"
         )
     return out
-
-
-def bend_words(bends):
-    """Sentences about boards that bend and materials that read farther (BoardBends)."""
-    out = []
-    bent = {p: b for p, b in bends.placements.items() if b.bends}
-    if bends.level_applied:
-        level = 1000 * abs(bends.level)
-        sigma = 1000 * bends.level_sigma
-        further = "farther" if bends.level > 0 else "nearer"
-        out.append(
-            f"the board around the pattern reads {level:.1f} +- {sigma:.1f} mm {further} than "
-            "the pattern"
-        )
-    if bent:
-        who = (
-            f"placements {_listed(bent)} bend"
-            if len(bent) > 1
-            else f"placement {_listed(bent)} bends"
-        )
-        words = f"{who} by {_span(b.size for b in bent.values())} mm in the scan"
-        sheets = [b.sheet for b in bent.values() if np.isfinite(b.sheet)]
-        flat = [p for p, b in bent.items() if b.sheet < SHEET_SHARE * b.size]
-        if sheets:
-            words += (
-                "; in the images the printed sheet departs from its usual shape there by "
-                f"{_span(sheets)} mm"
-            )
-        if flat:
-            words += (
-                f" (at {_listed(flat)} by less than half: a pitch that is stretched looks like a "
-                "bent board)"
-            )
-        out.append(words)
-    return out
-
-
-def _span(metres):
-    """'7' or '7 to 12', millimetres."""
-    values = [f"{1000 * v:.0f}" for v in sorted(metres)]
-    return values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
-
-
-def _listed(names):
-    """Names as in a sentence: '1', '1 and 2', '1, 2 and 3'."""
-    *most, last = [str(name) for name in names]
-    return f"{', '.join(most)} and {last}" if most else last
-
-
-def problem_words(problems):
-    """Why placements or parts of them are left out, one sentence each, from the problems of a
-    prepared session.
-    """
-    return [
-        why if isinstance(key, str) or "placement" in why else f"placement {key}: {why}"
-        for key, why in problems.items()
-    ]

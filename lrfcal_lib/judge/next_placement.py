@@ -7,10 +7,8 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.least_squares import reduced_hessian, whiten
-from lrfcal_lib.fit.residuals import named_blocks, rays
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.uncertainty import beams_to, information, marginal
+from lrfcal_lib.judge.uncertainty import beams_to, marginal
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
 from lrfcal_lib.solvers.joint import UNSEEN, WORDS
@@ -127,39 +125,28 @@ def _view_covariance(pose, features, model):
 
 
 def typical_placement(solution):
-    """What the placement of median information recorded, thinned: data, state, and points.
-
-    The points (1, n, 3), of faces and of beams, are where their rays meet the board's plane, metres
-    in its frame.
-    """
-    by_unknown = np.diagonal(information(solution), axis1=1, axis2=2)
+    """Number of the placement of median information."""
+    by_unknown = np.diagonal(solution.information(), axis1=1, axis2=2)
     told = by_unknown @ scales_of(solution, solution.solution.names) ** 2
-    k = np.argsort(told)[[len(told) // 2]]
-    state = solution.state
-    data = solution.data
-    state = replace(state, boards=state.boards[k], sweeps=state.sweeps[k], sides=state.sides[k])
-    data = replace(data, middle=data.middle[k], direction=data.direction[k])
-    groups = {}
-    points = []
-    # a whitener of ranges, a number of beams
-    for name, weight in (("face", THINNED**0.5), ("beam", THINNED)):
-        group = getattr(data, name)
-        kept = np.flatnonzero(group["used"][k[0]])[::THINNED]
-        groups[name] = {key: values[k][:, kept] for key, values in group.items()}
-        groups[name]["used"] = np.full((1, len(kept)), weight)
-        origin, ray = rays(state, data, groups[name])[:2]
-        R, t = np.split(state.boards[0], [3], axis=1)
-        normal = R[:, 2]
-        away = (t[:, 0] - origin) @ normal / (ray @ normal)
-        points.append((origin + away[..., None] * ray - t[:, 0]) @ R)
-    return replace(data, **groups), state, points
+    return list(solution.boards)[np.argsort(told)[len(told) // 2]]
+
+
+def points_on_board(solution, placement, bearing, pitch):
+    """Where beams (k,) meet the plane of a placement's board, metres in its frame, (k, 3)."""
+    board = solution.boards[placement]
+    pitch = solution.corrections.pitch(placement, pitch)
+    ray = geometry.polar_to_points(1.0, bearing)
+    ends = board.inv().apply(geometry.lrf_to_platform(ray, pitch, solution.T_head_lrf))
+    start = board.inv().apply(geometry.lrf_to_platform(0 * ray, pitch, solution.T_head_lrf))
+    way = ends - start
+    return start - start[:, 2:] / way[:, 2:] * way
 
 
 def spot_growth(solution):
     """Radius of the spot by distance, a polynomial."""
     obs = solution.observations
     radius = pd.Series(obs.beam_radius).groupby(obs.beam_placement).median()
-    distance = np.linalg.norm(solution.state.boards[radius.index, :, 3], axis=1)
+    distance = np.linalg.norm(solution.board_poses[radius.index, :, 3], axis=1)
     if not len(radius):
         return np.array([0.0, 0.005])
     if len(radius) < 2 or np.ptp(distance) < 0.1 or np.ptp(radius) < 1e-6:
@@ -189,17 +176,17 @@ def _views(boards, pitches, solution, models, features):
             pose = (T_camera_platform * geometry.pose_transform(boards)).as_matrix()
             covariance = _view_covariance(pose, features, model)
             part = {
-                "camera": np.full(len(pitch), number),
-                "pitch": pitch,
-                "pose": pose,
-                "covariance": covariance * np.outer(pixels, pixels),
+                "view_camera": np.full(len(pitch), number),
+                "view_pitch": pitch,
+                "view_pose": pose,
+                "view_covariance": covariance * np.outer(pixels, pixels),
+                "view_placement": np.arange(len(pitch)),
+                "view_lens": np.zeros((len(pitch), 6, 9)),
             }
             parts.append(part)
     if not parts:
-        return {key: value[: len(boards)] for key, value in solution.data.view.items()}
-    group = {key: np.stack([part[key] for part in parts], axis=1) for key in parts[0]}
-    whitener = np.linalg.inv(np.linalg.cholesky(group["covariance"]))
-    return group | {"whitener": whitener, "used": np.ones(group["pitch"].shape, bool)}
+        return {}
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
 def candidate_information(boards, pitches, solution, models, features=None):
@@ -211,37 +198,70 @@ def candidate_information(boards, pitches, solution, models, features=None):
     board looks. Cameras see `features` of it (k, 3), those of its outline when left out. Its own
     pose and sweep are eliminated; at the noise levels of the solution.
     """
-    data, home, (face_points, beam_points) = typical_placement(solution)
-    n = len(boards)
+    home = typical_placement(solution)
+    typical = solution.observations.select([home])
+    typical = typical.keep(
+        face=np.arange(len(typical.face_range)) % THINNED == 0,
+        beam=np.arange(len(typical.beam_hit)) % THINNED == 0,
+    )
     middle = outline(solution).mean(axis=0, keepdims=True)
-    _, distance, size = _as_seen(home.boards, middle, solution.T_head_lrf)
+    home_board = geometry.pose_array(solution.boards[home])[None]
+    _, distance, size = _as_seen(home_board, middle, solution.T_head_lrf)
     pitch, away, seen = _as_seen(boards, middle, solution.T_head_lrf)
+    # as many more of them as the board looks larger, at most as many as a placement has
+    recorded = max(np.bincount(solution.observations.face_placement).max(initial=0), 1)
+    most = np.sqrt(recorded / max(THINNED * len(typical.face_range), 1))
+    more = np.minimum(seen / size, most)
     spot = spot_growth(solution)
     grown = np.polyval(spot, away) / np.polyval(spot, distance)
+    farther = replace(
+        typical,
+        placements=np.arange(len(boards)),
+        direction=np.ones(len(boards), int),
+        middle=pitch[:, 0],
+        **_faces(typical, home, boards, more, solution),
+        **_edge_beams(typical, home, boards, grown, away / distance, solution),
+        **_views(boards, pitches, solution, models, features),
+    )
+    return solution.forecast(farther, boards, THINNED * more[:, 0], home)
+
+
+def _faces(typical, home, boards, more, solution):
+    """Ranges to the points of a typical face on other boards (n, 3, 4), `more` (n, 1) times as
+    many.
+    """
+    points = points_on_board(solution, home, typical.face_bearing, typical.face_pitch)
+    bearing, pitch, distance = _beams(points, boards, solution)
+    return {
+        "face_range": distance.ravel(),
+        "face_bearing": bearing.ravel(),
+        "face_pitch": pitch.ravel(),
+        "face_sigma": (typical.face_sigma / (THINNED**0.5 * more)).ravel(),
+        "face_placement": np.repeat(np.arange(len(boards)), len(points)),
+    }
+
+
+def _edge_beams(typical, home, boards, grown, farther, solution):
+    """Beams about the edges of other boards (n, 3, 4) where spots and distances have grown
+    (n, 1).
+    """
+    points = points_on_board(solution, home, typical.beam_bearing, typical.beam_pitch)
     # beams stay as many spots off the edge as they were
-    line = data.lines[data.beam["edge"]]
-    off = np.sum((beam_points + [0, 0, 1.0]) * line, axis=-1)
-    moved = beam_points + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
-    # as many more of them as the board looks larger, at most as many as a placement has
-    recorded = max(solution.data.face["used"].sum(axis=1).max(), 1)
-    most = np.sqrt(recorded / max(THINNED * face_points.shape[1], 1))
-    more = np.minimum(seen / size, most)
-    face = _beams(data.face, face_points, boards, solution)
-    beam = _beams(data.beam, moved, boards, solution)
-    view = _views(boards, pitches, solution, models, features)
-    face["used"] = face["used"] * more
-    beam["used"] = beam["used"] * more
-    beam["radius"] = beam["radius"] * grown
-    beam["step"] = beam["step"] * (away / distance)
-    sides = np.repeat(home.sides, n, axis=0)
-    state = replace(home, boards=boards, sweeps=np.zeros((n, 2)), sides=sides)
-    data = replace(data, face=face, beam=beam, view=view)
-    data = replace(data, middle=pitch[:, 0], direction=np.ones(n, int))
-    hessian = 0.0
-    for block in named_blocks(state, data, solution.unknowns).values():
-        J = whiten(block)[1]
-        hessian = hessian + np.swapaxes(J, -1, -2) @ J
-    return reduced_hessian(hessian, solution.unknowns.shared) / solution.solution.inflation
+    line = typical.lines()[typical.beam_edge]
+    off = np.sum((points + [0, 0, 1.0]) * line, axis=-1)
+    moved = points + (grown * off - off)[..., None] * line * [1.0, 1.0, 0.0]
+    bearing, pitch, _ = _beams(moved, boards, solution)
+    n = len(boards)
+    return {
+        "beam_bearing": bearing.ravel(),
+        "beam_pitch": pitch.ravel(),
+        "beam_hit": np.tile(typical.beam_hit, n),
+        "beam_edge": np.tile(typical.beam_edge, n),
+        "beam_radius": (typical.beam_radius * grown).ravel(),
+        "beam_background": np.tile(typical.beam_background, n),
+        "beam_step": (typical.beam_step * farther).ravel(),
+        "beam_placement": np.repeat(np.arange(n), len(points)),
+    }
 
 
 def _as_seen(boards, middle, T_head_lrf):
@@ -253,17 +273,12 @@ def _as_seen(boards, middle, T_head_lrf):
     return pitch, away, np.sqrt(cosine) / away
 
 
-def _beams(group, points, boards, solution):
-    """The beams of a group to points (k, 3) of other boards (n, 3, 4)."""
+def _beams(points, boards, solution):
+    """Recorded bearing and pitch, and range (n, k) of beams to points (..., k, 3) on boards (n, 3,
+    4).
+    """
     bearing, pitch, distance = beams_to(geometry.apply_pose(boards, points), solution.T_head_lrf)
-    out = {}
-    for key, value in group.items():
-        out[key] = np.broadcast_to(value, (len(boards), *value.shape[1:]))
-    out["bearing"] = bearing
-    out["pitch"] = pitch / (1 + solution.sensor["pitch_scale"])  # as recorded
-    out["range"] = distance
-    out["ray"] = geometry.polar_to_points(1.0, bearing)
-    return out
+    return bearing, pitch / (1 + solution.sensor["pitch_scale"]), distance
 
 
 @dataclass(frozen=True)
@@ -299,7 +314,7 @@ def observability(solution):
     names = np.array(solution.solution.names)
     index = np.flatnonzero(names != "edge_log_softness")
     scales = scales_of(solution, names[index])
-    H = marginal(information(solution).sum(axis=0), index) * scales[:, None] * scales
+    H = marginal(solution.information().sum(axis=0), index) * scales[:, None] * scales
     values, vectors = np.linalg.eigh(H)
     least = max(1e-13 * values[-1], UNSEEN**-2)
     cameras = tuple(solution.transforms)
@@ -454,7 +469,7 @@ def suggest_placement(solution, models, *, field_of_view=FIELD_OF_VIEW, features
             f"cameras at a pitch from {low:.0f} to {high:.0f} deg: give other distances, wider "
             "limits, or check the calibration"
         )
-    known = information(solution).sum(axis=0)
+    known = solution.information().sum(axis=0)
     added = candidate_information(boards[rows], pitches, solution, models, features)
     # what is not observed counts as known to a metre at 2 m, not better, so that it can be compared
     # as well

@@ -29,7 +29,7 @@ def placements_table(prepared, observations):
         row = {
             "placement": placement,
             "used": any(placement in obs.all_placements for obs in own.values()),
-            "reason": prepared.problems.get(placement) or "; ".join(notes),
+            "reason": prepared.left_out.get(placement) or "; ".join(notes),
             "n_scan_lines": int(mask.any(axis=1).sum()),
             "n_points": int(mask.sum()),
         }

@@ -87,13 +87,6 @@ class SigmaMap:
         return np.where(number > 0, np.sqrt(mean), np.inf)
 
 
-def information(solution):
-    """What every placement says about the shared unknowns at the noise found, shape (p, c, c)."""
-    J = solution.solution.jacobian
-    hessian = np.swapaxes(J, -1, -2) @ J
-    return reduced_hessian(hessian, solution.unknowns.shared) / solution.solution.inflation
-
-
 def marginal(hessian, index):
     """Information on some unknowns with the others eliminated, shape (k, k)."""
     others = np.setdiff1d(np.arange(len(hessian)), index)
@@ -123,7 +116,7 @@ def chain_of(solution, camera=None):
     # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever
     # the edge bias.
     scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])
-    scaled = information(solution).sum(axis=0) * scales[:, None] * scales
+    scaled = solution.information().sum(axis=0) * scales[:, None] * scales
     hessian = marginal(scaled, index[known])
     motions = null_space(hessian, np.ones(len(hessian)), UNSEEN)[0] * scales[index[known]]
     unseen = np.zeros((len(motions), len(wanted)))
@@ -135,16 +128,7 @@ def chain_of(solution, camera=None):
         on_head = solution.observations.mounts[number] == "head"
         pose = pose_array(solution.transforms[camera])
     head = pose_array(solution.T_head_lrf)
-    return Chain(head, pose, on_head, tuple(covariances), unseen, _sweep_sigma(solution))
-
-
-def _sweep_sigma(solution):
-    """Offset (radians) and stretch of the pitch that every sweep has of its own."""
-    kind = solution.unknowns.sweep
-    offset, stretch = solution.data.sweep_sigma
-    if kind == "none":
-        return 0.0, 0.0
-    return offset, stretch * (kind == "offset_stretch")
+    return Chain(head, pose, on_head, tuple(covariances), unseen, solution.sweep_sigma)
 
 
 def carried(chain, bearing, pitch, distance, image_pitch=0.0):

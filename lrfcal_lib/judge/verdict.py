@@ -12,7 +12,6 @@ from scipy.special import stdtrit
 
 from lrfcal_lib.calibrate.pipeline import handed_over, largest_range
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge import alternatives
 from lrfcal_lib.judge.alternatives import (
     alternatives_of,
     doubtful,
@@ -20,7 +19,7 @@ from lrfcal_lib.judge.alternatives import (
     not_an_offset,
     places_of_cameras,
 )
-from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words, problem_words
+from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words
 from lrfcal_lib.judge.next_placement import (
     Suggestion,
     brief,
@@ -39,6 +38,7 @@ from lrfcal_lib.judge.uncertainty import (
     range_noise,
 )
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.model.problem import LEAVES_OUT, ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
 from lrfcal_lib.solvers.planes import rival_words
@@ -115,7 +115,7 @@ class Reason:
     answer : {'with care', 'no'}
     kind : str
         A key: 'handed over', 'left out', 'range offset', 'dependent', 'pitch scale', 'far from
-        stated', 'sense', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
+        stated', of :data:`lrfcal_lib.judge.alternatives.ALTERNATIVES`, 'not weighed',
         'convergence', 'unobservable', 'cameras', 'lens', 'second minimum', 'placements',
         'parallel', 'distance', 'pitch', 'image pitch', 'misfit', 'excluded', 'model error',
         'noise', 'warning', 'error'; of :class:`lrfcal_lib.session.faults.Fault`.
@@ -331,7 +331,7 @@ def judge(calibration, method=None, **options):
     method = method or handed_over(calibration)
     if method is None:
         refused = Reason(NO, "handed over", _refusal(calibration))
-        lost = problem_words(prepared.problems)
+        lost = [str(problem) for problem in prepared.problems]
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",) if lost else ()
         return replace(
             _answered(Verdict(NO, (), {}, np.nan, 0.0, None, RECORD), [*lens, *sizes, refused]),
@@ -370,10 +370,15 @@ def _refusal(calibration):
     an answer.
     """
     prepared = calibration.prepared
-    problems = calibration.problems
-    why = problems.get(("rig", "joint")) or "; ".join([*dict.fromkeys(problems.values())][:3])
+    at_once = calibration.problem("joint")
+    if at_once is not None:
+        why = at_once.words
+    else:
+        words = dict.fromkeys(problem.words for problem in calibration.problems)
+        why = "; ".join([*words][:3])
     if not prepared.views:
-        why = prepared.problems.get("images", "the session has no camera")
+        lost = prepared.problems_of(ProblemKind.NO_IMAGES)
+        why = lost[0].words if lost else "the session has no camera"
         why += "; the tilt axis is known from the edges in the sweeps" * bool(
             calibration.platform.solutions
         )
@@ -390,7 +395,6 @@ def sight_of(prepared):
 def _without_joint(calibration, method, doubt):
     """Verdict on cameras that were calibrated one by one with the axis of the platform step."""
     prepared = calibration.prepared
-    problems = calibration.problems
     joint = calibration.joint
     solved = {
         camera: found for (camera, name), found in calibration.solutions.items() if name == method
@@ -400,7 +404,9 @@ def _without_joint(calibration, method, doubt):
         if joint is None
         else [reason.words for reason in diagnose(joint.solution) if reason.answer == NO]
     )
-    why = "; ".join(bad) or problems.get(("rig", "joint"), "another method was asked for")
+    at_once = calibration.problem("joint")
+    asked = "another method was asked for" if at_once is None else at_once.words
+    why = "; ".join(bad) or asked
     answer = NO if joint is None or not joint.solution.converged else CARE
     reasons = [Reason(answer, "handed over", f"the joint estimate is not handed over ({why})")]
     fewest = min(
@@ -410,21 +416,20 @@ def _without_joint(calibration, method, doubt):
         reasons.append(
             Reason(NO, "placements", f"{fewest} placements only, {FEW} or more are needed")
         )
-    lost = {c: problems.get((c, method), "no result") for c in prepared.views if c not in solved}
-    reasons += [
-        Reason(CARE, "cameras", f"camera '{c}' is not handed over ({why})")
-        for c, why in lost.items()
-    ]
+    for camera in prepared.views:
+        if camera not in solved:
+            problem = calibration.problem(method, camera)
+            why = "no result" if problem is None else problem.words
+            reasons.append(Reason(CARE, "cameras", f"camera '{camera}' is not handed over ({why})"))
     reasons += [
         Reason(NO, "second minimum", rival_words(camera, found.transform, found.rival))
         for camera, found in solved.items()
         if found.rival is not None
     ]
-    unknown = calibration.platform.problems.get("combined")
-    if unknown and any(
-        np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values()
-    ):
-        reasons.append(Reason(NO, "far from stated", unknown))
+    sweeps = any(np.ptp(board.sweep.pitch) > LEAST_SWEEP for board in prepared.scans.values())
+    unknown = calibration.platform.problem("combined")
+    if unknown is not None and sweeps:
+        reasons.append(Reason(NO, "far from stated", unknown.words))
     # the range offset of the cloud may be what the maker admits
     platform = calibration.platform
     session = prepared.session
@@ -433,10 +438,11 @@ def _without_joint(calibration, method, doubt):
     admitted = session.lrf.admitted_offset
     head = pose_array(platform.transform("combined"))
     offset = np.diag([admitted**2, 0.0, 0.0])
-    sigma = block_diag(platform.covariance, np.zeros((6, 6)), offset)
+    of_axis = platform.axes["combined"].covariance
+    sigma = block_diag(of_axis, np.zeros((6, 6)), offset)
     chains = {None: Chain(head, None, True, (sigma,), *rest)}
     for camera, found in solved.items():
-        sigma = block_diag(platform.covariance, found.trusted[:6, :6], 0 * offset)
+        sigma = block_diag(of_axis, found.trusted[:6, :6], 0 * offset)
         on_head = session.cameras[camera].mount == "head"
         chains[camera] = Chain(head, pose_array(found.transform), on_head, (sigma,), *rest)
     pitch = np.concatenate([board.sweep.pitch for board in prepared.scans.values()])
@@ -455,10 +461,6 @@ def contradicts_stated(joint):
     reasons = []
     doubt = 0.0
     level = joint.solution.noise["face_scale"]
-    hopeless = not alternatives.plausible(joint.solution) or level > ABSURD
-    # what else is found wrong comes from that
-    if hopeless and (words := alternatives.other_sense(joint)):
-        return [Reason(NO, "sense", words)], doubt
     if not joint.solution.converged:
         return [Reason(NO, "not weighed", f"{NOT_WEIGHED}: the estimate has not converged")], doubt
     offset = joint.solution.sensor["range_offset"]
@@ -558,7 +560,7 @@ def _left_out(calibration, method):
     prepared = calibration.prepared
     excluded = {}
     table = placements_table(prepared, calibration.observations).set_index("placement")
-    used = set(table.index[table.used]) - set(prepared.problems)
+    used = set(table.index[table.used]) - set(prepared.left_out)
     if method == "joint":
         used = set(calibration.joint.solution.boards)
         excluded = calibration.joint.solution.excluded
@@ -574,8 +576,9 @@ def _left_out(calibration, method):
             )
             reasons.append(Reason(CARE, "left out", f"{words}: {', '.join(unseen)}"))
     large = len(lost) > LOST * len(table)
-    every = prepared.problems | (excluded if large else {})
-    parts = [words for key, words in every.items() if key not in table.index]
+    parts = [str(problem) for problem in prepared.problems if problem.kind not in LEAVES_OUT]
+    if large:
+        parts += [words for key, words in excluded.items() if key not in table.index]
     also = (
         f"Parts left out beside whole placements: {len(parts)} ({'; '.join(parts)})."
         if parts
@@ -584,7 +587,7 @@ def _left_out(calibration, method):
     if not lost:
         return reasons, f"All {len(table)} placements were used. {also}".strip()
     why = [
-        f"{p} ({excluded.get(p) or prepared.problems.get(p) or table.reason[p] or 'no edge'})"
+        f"{p} ({excluded.get(p) or prepared.left_out.get(p) or table.reason[p] or 'no edge'})"
         for p in lost
     ]
     words = f"{len(lost)} of {len(table)} placements are left out: {', '.join(why)}"
@@ -648,7 +651,7 @@ def diagnose(solution):
 def _of_placements(solution):
     """What is weak about the recorded poses: rows of whether, answer, kind and words."""
     obs = solution.observations
-    boards = solution.state.boards
+    boards = solution.board_poses
     n = len(solution.boards)
     head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
     turned = obs.view_pitch[head]

@@ -103,7 +103,8 @@ class CameraObservations(_Groups):
         the covariance without this spacing of the beams.
     crossing_radius, crossing_background : ndarray, shape (n,)
         Of the beam's spot there, metres (5 mm by default), and what the background adds to the log
-        odds at which a reading flips from the board to it (see :mod:`lrfcal_lib.fit.residuals`).
+        odds at which a reading flips from the board to it (see
+        :mod:`lrfcal_lib.fit.edge_likelihood`).
     plane_points, plane_covariance, plane_placement : ndarray, shapes (m, 3), (m, 3, 3), (m,)
         Points on the face of the board, metres.
     placements : ndarray of int, shape (p,)
@@ -303,8 +304,8 @@ class JointObservations(_Groups):
     beam_bearing, beam_pitch, beam_hit, beam_edge : ndarray, shape (n,)
         Of beams near an edge: radians, whether the beam read the board, index into `edges`.
     beam_radius, beam_background, beam_step : ndarray, shape (n,)
-        Of the spot at the board, metres; see :mod:`lrfcal_lib.fit.residuals`; distance at the board
-        to the next beam in the direction in which the edge was found, metres.
+        Of the spot at the board, metres; see :mod:`lrfcal_lib.fit.edge_likelihood`; distance at the
+        board to the next beam in the direction in which the edge was found, metres.
     beam_placement : ndarray of int, shape (n,)
     view_camera, view_pitch : ndarray, shape (v,)
         Index into `cameras`, and recorded pitch at the image, radians; only used for cameras on the

@@ -1,4 +1,4 @@
-"""Figures of results: bars, strips, maps, uncertainty, diagnosis."""
+"""Figures of results: bars, strips, maps, uncertainty."""
 
 import textwrap
 
@@ -253,37 +253,6 @@ def residuals_by_region(ax, uv, shift, model, name):
         title = f"{name}: {np.sqrt(np.mean(length**2)):.2g} px rms, predicted - seen"
     ax.set(xlim=(0, model.width), ylim=(model.height, 0), aspect="equal")
     ax.set(xlabel="u [px]", ylabel="v [px]", title=title)
-
-
-def board_bend(ax, bends):
-    """How bent each board looks in the scan, beside the printed sheet in the images (BoardBends).
-
-    A ValueError if no placement has a bend.
-    """
-    found = [b for b in bends.placements.values() if np.isfinite(b.size)]
-    if not found:
-        count = f"none of {len(bends.placements)} placements"
-        raise ValueError(f"no bends to draw: {count} shows enough of the board")
-    values = 1000 * np.array([(b.size, b.sigma, b.sheet, b.sheet_sigma) for b in found])
-    size, sigma, sheet, sheet_sigma = values.T
-    at = np.arange(len(found))
-    bent = np.array([b.bends for b in found])
-    kinds = (bent, "lrf", "scan: bends"), (~bent, "raw", "scan: too little to matter")
-    for rows, color, label in kinds:
-        if rows.any():
-            looks = {"color": COLORS[color], "width": 0.75} | SPREAD
-            ax.bar(at[rows], size[rows], yerr=sigma[rows], label=label, **looks)
-    if np.isfinite(sheet).any():
-        looks = {"fmt": "D", "color": COLORS["left"], "markersize": 4, "capsize": 2, "linewidth": 1}
-        label = "images: change of the printed sheet"
-        ax.errorbar(at, sheet, yerr=sheet_sigma, label=label, **looks)
-    by_placement(ax, [b.placement for b in found], "highest to lowest point [mm]")
-    title = "no board bends"
-    if bent.any():
-        count = f"{bent.sum()} of {len(found)} boards bend in the scan"
-        title = f"{count}, by up to {size[bent].max():.0f} mm"
-    ax.set(ylim=(0, 1.25 * np.nanmax(size + sigma)), title=title)
-    ax.legend(ncols=3, fontsize=8, loc="upper left")
 
 
 def over_view(ax, cloud, values, limit):

@@ -101,9 +101,7 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
     scan plane is taken then. BoardNotFound says what was seen instead.
     """
     if not np.isfinite(sweep.ranges).any():
-        raise BoardNotFound(
-            f"placement {sweep.placement}: no return in {len(sweep.pitch)} scan lines"
-        )
+        raise BoardNotFound(f"no return in {len(sweep.pitch)} scan lines")
     p_lrf = polar_to_points(sweep.ranges, sweep.bearings)
     points = lrf_to_platform(p_lrf, sweep.pitch[:, None], T_head_lrf)
     single = len(sweep.pitch) == 1 or np.ptp(sweep.pitch) <= 1e-4
@@ -132,10 +130,8 @@ def planar_surface(sweep, T_head_lrf, board, rng, lrf=None):
             if fits and not fault and reach < best[0]:
                 best = (reach, mask, *plane)
     if len(best) == 1:
-        found = "; ".join(seen[:4]) or "no flat surface"
-        raise BoardNotFound(
-            f"placement {sweep.placement}: no flat surface of the board's size; seen: {found}"
-        )
+        sizes = "; ".join(seen[:4]) or "no flat surface"
+        raise BoardNotFound(f"no flat surface of the board's size; seen: {sizes}")
     _, mask, normal, distance = best
     # with the returns in and beside it that only the noise of its own points takes off its plane
     miss = np.abs(points @ normal - distance)
@@ -366,9 +362,7 @@ def find_board(sweep, board=None, T_head_lrf=None, lrf=None, *, rng=None):
     residuals = np.where(mask, sweep.ranges - fitted, np.nan)
     residuals[np.abs(residuals) > PLANE_NOISE * 2] = np.nan
     if not np.isfinite(residuals).any():
-        raise BoardNotFound(
-            f"placement {sweep.placement}: no scan line has {FEWEST_BEAMS} beams on the board"
-        )
+        raise BoardNotFound(f"no scan line has {FEWEST_BEAMS} beams on the board")
     sigma = float(np.sqrt(np.nanmean(residuals**2)))
     covariance = np.linalg.inv(information) * sigma**2
     spot = 0.0

@@ -6,6 +6,7 @@ import numpy as np
 
 from lrfcal_lib.model.board import Board
 from lrfcal_lib.model.geometry import DegenerateGeometry
+from lrfcal_lib.model.problem import LEAVES_OUT, Problem, ProblemKind, Stage
 from lrfcal_lib.preprocess.board_in_scan import BoardNotFound, find_board
 from lrfcal_lib.preprocess.edges_in_scan import VARIANTS, crossings
 from lrfcal_lib.preprocess.survey import Outline, small_squares, views_of
@@ -91,8 +92,8 @@ class Prepared:
         Sides that got no name because the board has no edge there, likewise.
     pitch_noise : PitchNoise
         What the recordings themselves tell about it.
-    problems : dict of int or str to str
-        Why a placement (or a part of it) cannot be used.
+    problems : tuple of Problem
+        What cannot be used and why.
     """
 
     session: Session
@@ -107,7 +108,16 @@ class Prepared:
     names: dict = field(default_factory=dict)
     dropped: dict = field(default_factory=dict)
     pitch_noise: PitchNoise = PitchNoise()
-    problems: dict = field(default_factory=dict)
+    problems: tuple[Problem, ...] = ()
+
+    @property
+    def left_out(self) -> dict[int, str]:
+        """Why whole placements are left out, by placement."""
+        return {p.placement: p.words for p in self.problems if p.kind in LEAVES_OUT}
+
+    def problems_of(self, kind: ProblemKind) -> list[Problem]:
+        """Those of one kind."""
+        return [problem for problem in self.problems if problem.kind == kind]
 
     def seen(self, camera, placement):
         """The board in an image of a placement, and the very image that it was found in: there may
@@ -135,36 +145,38 @@ def prepare_scans(session):
     A Prepared without cameras.
     """
     scans = {}
-    problems = {}
+    problems = []
     edges = {variant: {} for variant in VARIANTS}
     swept = {variant: {} for variant in VARIANTS}
 
     def look(placement):
-        """The board and its crossings in one sweep, or in words why not."""
+        """The board and its crossings in one sweep, or why not."""
         try:
-            scan = find_board(
-                session.sweep(placement), session.board, session.T_head_lrf, session.lrf
+            sweep = session.sweep(placement)
+            scan = find_board(sweep, session.board, session.T_head_lrf, session.lrf)
+        except SessionError:
+            return Problem(
+                Stage.SCANS, ProblemKind.NO_BOARD, "no range in any scan line", placement
             )
-        except (BoardNotFound, SessionError) as error:
-            return str(error)
+        except BoardNotFound as error:
+            return Problem(Stage.SCANS, ProblemKind.NO_BOARD, str(error), placement)
         along, sides = crossings(scan)
-        return (
-            scan,
-            along,
-            crossings(scan, True, sides)[0] if np.ptp(scan.sweep.pitch) > LEAST_SWEEP else {},
-        )
+        across = {}
+        if np.ptp(scan.sweep.pitch) > LEAST_SWEEP:
+            across, _ = crossings(scan, True, sides)
+        return scan, along, across
 
-    for placement, seen in zip(
-        session.board_placements, spread(look, session.board_placements), strict=True
-    ):
-        if isinstance(seen, str):
-            problems[placement] = seen
+    for result in spread(look, session.board_placements):
+        if isinstance(result, Problem):
+            problems.append(result)
             continue
-        scans[placement] = seen[0]
-        for out, found in zip((edges, swept), seen[1:], strict=True):
-            for variant in found:
-                out[variant][placement] = found[variant]
-    return Prepared(session, session.board, scans, edges, swept, problems=problems)
+        scan, along, across = result
+        scans[scan.placement] = scan
+        for variant in along:
+            edges[variant][scan.placement] = along[variant]
+        for variant in across:
+            swept[variant][scan.placement] = across[variant]
+    return Prepared(session, session.board, scans, edges, swept, problems=tuple(problems))
 
 
 def prepare_images(prepared):
@@ -174,23 +186,24 @@ def prepare_images(prepared):
     try:
         seen = views_of(prepared.session, one_per_placement=True)
     except DegenerateGeometry as error:  # what remains is a session without cameras
-        return replace(
-            prepared, problems=prepared.problems | {"images": f"no image can be used: {error}"}
-        )
+        words = f"no image can be used: {error}"
+        lost = Problem(Stage.IMAGES, ProblemKind.NO_IMAGES, words)
+        return replace(prepared, problems=(*prepared.problems, lost))
     # an image that belongs to no placement is left out
     views = {
         c: {v.placement: v for v in sorted(own, key=lambda v: v.placement) if v.placement >= 0}
         for c, own in seen.views.items()
     }
-    problems = dict(prepared.problems)
+    problems = list(prepared.problems)
     if seen.unseen:
-        problems["outline"] = f"faces of the board only: {seen.unseen}"
+        words = f"faces of the board only: {seen.unseen}"
+        problems.append(Problem(Stage.IMAGES, ProblemKind.NO_OUTLINE, words))
     for camera, words in small_squares(views, seen.board.pattern).items():
-        problems[f"squares {camera}"] = words
+        problems.append(Problem(Stage.IMAGES, ProblemKind.SMALL_SQUARES, words, camera=camera))
     found = {
         "board": seen.board,
         "outline": seen.outline,
         "relief": seen.relief,
-        "problems": problems,
+        "problems": tuple(problems),
     }
     return replace(prepared, models=seen.models, views=views, **found)

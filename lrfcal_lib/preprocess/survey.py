@@ -264,12 +264,9 @@ def small_squares(views, pattern):
             continue
         least = min(small.values())
         words[camera] = (
-            f"camera '{camera}': squares are less than {SMALL_SQUARE_PX:.0f} px wide in "
-            f"{len(small)} of "
-            f"{len(sides)} images (placements {short(list(small))}), {least:.1f} px at least: "
-            "distances "
-            f"may be off by {100 * scale_error(least):.2g} %, more if the image is blurred; go "
-            "nearer, or "
+            f"squares are less than {SMALL_SQUARE_PX:.0f} px wide in {len(small)} of {len(sides)} "
+            f"images (placements {short(list(small))}), {least:.1f} px at least: distances may be "
+            f"off by {100 * scale_error(least):.2g} %, more if the image is blurred; go nearer, or "
             "print larger squares"
         )
     return words

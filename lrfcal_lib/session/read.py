@@ -373,6 +373,8 @@ class Session:
         What is missing without making the rest useless, such as a placement without scan lines.
     telegrams : TelegramLog or None
         What became of the recorded telegrams; None for a session of scan lines.
+    continuous : bool
+        The head moved on within a scan line: its pitch is that of the middle beam.
     """
 
     path: Path
@@ -392,6 +394,7 @@ class Session:
     problems: tuple[str, ...]
     scans: dict[str, np.ndarray] = field(repr=False)
     telegrams: TelegramLog | None = field(default=None, repr=False)
+    continuous: bool = False
 
     def sweep(self, placement):
         """The Sweep of a placement; SessionError if it is not in the session, or has no scan line

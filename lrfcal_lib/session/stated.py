@@ -555,6 +555,7 @@ class PlatformStated(BaseModel):
     T_head_lrf: Transform
     sigma_direction: Annotated[Step, Field(alias="sigma_direction_deg")] = math.radians(0.5)
     sigma_offset: Annotated[Length, Field(alias="sigma_offset_m")] = 0.010
+    continuous: bool = False
 
 
 class RigStated(BaseModel):
@@ -589,4 +590,9 @@ def parse_session(data, kind=SessionStated):
     rig = dict(found.pop("rig"))
     platform = rig.pop("platform")
     sigma = platform.sigma_direction, platform.sigma_offset
-    return found | rig | {"T_head_lrf": platform.T_head_lrf, "platform_sigma": sigma}
+    of_platform = {
+        "T_head_lrf": platform.T_head_lrf,
+        "platform_sigma": sigma,
+        "continuous": platform.continuous,
+    }
+    return found | rig | of_platform

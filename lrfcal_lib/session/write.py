@@ -41,7 +41,8 @@ class SessionWriter:
     ----------
     path : path-like
         Must not exist or be an empty folder; its name is the session's `name` by default.
-    board, lrf, cameras, T_head_lrf, platform_sigma, licence, source, simulated, reference
+    board, lrf, cameras, T_head_lrf, platform_sigma, licence, source, simulated, reference,
+    continuous
         See :class:`lrfcal_lib.session.read.Session`.
 
     Raises
@@ -69,6 +70,7 @@ class SessionWriter:
         simulated=False,
         platform_sigma=None,
         reference=None,
+        continuous=False,
     ):
         self.path = Path(path)
         self.cameras = {camera.name: camera for camera in cameras}
@@ -80,6 +82,8 @@ class SessionWriter:
         if platform_sigma is not None:
             platform["sigma_direction_deg"] = round(math.degrees(platform_sigma[0]), 9)
             platform["sigma_offset_m"] = platform_sigma[1]
+        if continuous:
+            platform["continuous"] = True
         rig = {
             "lrf": stated.lrf_to_json(lrf),
             "platform": platform,

@@ -3,13 +3,14 @@ angles.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import minimise, solve
-from lrfcal_lib.fit.residuals import SENSOR, Unknowns, gather, joint_blocks, move_state
+from lrfcal_lib.fit.axis_chart import chart_parameters
+from lrfcal_lib.fit.edge_likelihood import disc_edge
+from lrfcal_lib.fit.least_squares import eliminate, minimise, reduced_hessian, solve
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -21,6 +22,16 @@ from lrfcal_lib.model.geometry import (
 from lrfcal_lib.model.kinematics import Corrections, SweepPitch, camera_at
 from lrfcal_lib.model.observations import JointObservations
 from lrfcal_lib.solvers import joint_noise
+from lrfcal_lib.solvers.joint_model import (
+    SENSOR,
+    SWEEPS,
+    JointData,
+    JointState,
+    Unknowns,
+    gather,
+    move_state,
+)
+from lrfcal_lib.solvers.joint_residuals import joint_blocks, named_blocks
 from lrfcal_lib.solvers.joint_start import (
     FEWEST_ANGLE_POINTS,
     boards_in_images,
@@ -31,6 +42,7 @@ from lrfcal_lib.solvers.planes import NEARLY, SAME_TURN, rival_words
 
 SCALES = {"range_offset": 1.0, "edge_log_odds": 10.0, "edge_log_softness": 10.0, "pitch_scale": 1.0}
 SWEEP_SIGMA = (np.radians(0.5), 0.05)
+SWEEP_HELD = (0.0, 0.0)
 START_STEPS = 8
 FIRST_STEPS = 60
 NOISE_ROUNDS = 10
@@ -56,6 +68,21 @@ WORDS = dict(zip(AXIS_NAMES, AXIS_WORDS, strict=True)) | {
     "pitch_scale": "the scale of the pitch",
     "pitch_by_direction": "the pitch offset by sweep direction",
 }
+
+
+@dataclass(frozen=True)
+class Score:
+    """What placements say about the shared unknowns, all that is their own eliminated.
+
+    Attributes
+    ----------
+    information : ndarray, shape (p, c, c)
+    gradient : ndarray, shape (p, c)
+        Of half the sum of squares.
+    """
+
+    information: np.ndarray
+    gradient: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -101,7 +128,7 @@ class JointSolution:
 
     solution: Solution
     observations: JointObservations
-    data: residuals.JointData
+    data: JointData
     unknowns: Unknowns
     T_head_lrf: RigidTransform
     transforms: dict
@@ -119,6 +146,25 @@ class JointSolution:
     def state(self):
         """Everything that moved."""
         return self.solution.state
+
+    @property
+    def board_poses(self) -> np.ndarray:
+        """``T_platform_board`` in the order of the observations' placements, shape (p, 3, 4)."""
+        return self.state.boards
+
+    @property
+    def side_odds(self) -> np.ndarray:
+        """By how much the log odds of each side differ from the sensor's, shape (p, e)."""
+        return self.state.sides
+
+    @property
+    def sweep_sigma(self) -> tuple[float, float]:
+        """Standard deviations of the pitch's offset (radians) and stretch of every sweep; 0 where
+        held.
+        """
+        number = SWEEPS[self.unknowns.sweep]
+        offset, stretch = (*self.data.sweep_sigma[:number], *SWEEP_HELD[number:])
+        return offset, stretch
 
     @property
     def converged(self):
@@ -145,21 +191,105 @@ class JointSolution:
         """Where readings flip with a background as far and bright as the board, spot radii
         outside the edge.
         """
-        return float(residuals.disc_edge(self.sensor["edge_log_odds"])[0])
+        return float(disc_edge(self.sensor["edge_log_odds"])[0])
 
-    def residuals(self, group):
-        """Residuals in the order of the observations: 'face' (n, 1), metres, or 'view' (n, 6),
-        radians and metres.
+    @cached_property
+    def blocks(self):
+        """Residuals by name at the solution, dict of str to Block; for `solvers` only."""
+        return named_blocks(self.state, self.data, self.unknowns)
+
+    def residuals(self, group: str) -> np.ndarray:
+        """Residuals in the order of the observations.
+
+        Parameters
+        ----------
+        group : {'face', 'view'}
+
+        Returns
+        -------
+        ndarray, shape (m, 1) or (v, 6)
+            Of ranges to faces, metres, or of poses in images, radians and metres.
         """
+        if group not in self.blocks:
+            return np.zeros((0, {"face": 1, "view": 6}[group]))
         used = getattr(self.data, group)["used"]
+        return self._in_order(group, self.blocks[group].residuals.reshape(*used.shape, -1))
+
+    def face_points(self) -> np.ndarray:
+        """Measured points of the faces in the frames of their boards, metres, shape (m, 3)."""
+        return self._in_order("face", joint_noise.on_board(self.state, self.data))
+
+    def _in_order(self, group, padded):
+        """Rows of a group in the order of the observations, shape (p, n, k) -> (m, k)."""
         placement = getattr(self.observations, f"{group}_placement")
-        out = np.zeros((len(placement), {"face": 1, "view": 6}[group]))
-        blocks = residuals.named_blocks(self.state, self.data, self.unknowns)
-        if group in blocks:
-            out[np.argsort(placement, kind="stable")] = blocks[group].residuals.reshape(
-                used.shape + (-1,)
-            )[used]
-        return out
+        rows = np.zeros((len(placement), padded.shape[-1]))
+        rows[np.argsort(placement, kind="stable")] = padded[getattr(self.data, group)["used"]]
+        return rows
+
+    def with_levels(self, **levels) -> "JointSolution":
+        """The same estimate at other noise levels, fields of JointData by name."""
+        return replace(self, data=replace(self.data, **levels))
+
+    def information(self) -> np.ndarray:
+        """What every placement says about the shared unknowns, shape (p, c, c)."""
+        return self.score().information
+
+    def score(self, changed: JointObservations | None = None, step: float = 1.0) -> Score:
+        """What every placement says about the shared unknowns and, tested, about one more.
+
+        Parameters
+        ----------
+        changed : JointObservations, optional
+            As they would be if the truth were off by one unknown more.
+        step : float
+            The value of that unknown there.
+        """
+        shared = self.unknowns.shared
+        after = {}
+        if changed is not None:
+            data = gather(changed, **self.data.levels)
+            after = named_blocks(self.state, data, self.unknowns)
+        hessian = gradient = 0.0
+        for name, block in self.blocks.items():
+            J = block.white_jacobian
+            if after:
+                by_one_more = (after[name].white - block.white) / step
+                J = np.insert(J, shared, by_one_more, axis=-1)
+            transposed = np.swapaxes(J, -1, -2)
+            hessian = hessian + transposed @ J
+            gradient = gradient + (transposed @ block.white[..., None])[..., 0]
+        information, score, _ = eliminate(hessian, gradient, shared + bool(after))
+        return Score(information, score)
+
+    def forecast(
+        self, observations: JointObservations, boards: np.ndarray, weight: np.ndarray, like: int
+    ) -> np.ndarray:
+        """Information on the shared unknowns from placements that were not recorded, (n, c, c).
+
+        Parameters
+        ----------
+        observations : JointObservations
+            Of n placements; measured ranges do not matter.
+        boards : ndarray, shape (n, 3, 4)
+            ``T_platform_board``.
+        weight : ndarray, shape (n,)
+            How many beams about the edges each one stands for.
+        like : int
+            Number of the placement whose backgrounds they have.
+        """
+        n = len(boards)
+        row = list(self.boards).index(like)
+        data = gather(observations, **self.data.levels)
+        data.beam["used"] = data.beam["used"] * weight[:, None]
+        state = replace(
+            self.state,
+            boards=boards,
+            sweeps=np.zeros((n, 2)),
+            sides=np.repeat(self.state.sides[[row]], n, axis=0),
+        )
+        blocks = named_blocks(state, data, self.unknowns).values()
+        hessian = sum(np.swapaxes(b.white_jacobian, -1, -2) @ b.white_jacobian for b in blocks)
+        return reduced_hessian(hessian, self.unknowns.shared)
 
     def columns(self, prefix):
         """Indices of the shared unknowns whose names begin so."""
@@ -236,7 +366,7 @@ class Start:
     """
 
     kept: JointObservations
-    state: residuals.JointState
+    state: JointState
     left_out: dict
     settled: bool
     badness: float
@@ -271,7 +401,7 @@ def solve_joint(
     axis : bool
         False: the axis is the one of T0 (or the stated one), and known.
     sensor : sequence of str
-        Unknowns of the sensor, of :data:`lrfcal_lib.fit.residuals.SENSOR`; others stay zero
+        Unknowns of the sensor, of :data:`lrfcal_lib.solvers.joint_model.SENSOR`; others stay zero
         (softness: 0.2).
     sides : bool
         Every side of every placement deviates from the sensor's edge bias, because backgrounds are
@@ -626,7 +756,7 @@ def contradictions(state, data, unknowns):
     A wrong image raises the noise level of all images until ranges outvote it: images are compared
     with images.
     """
-    blocks = residuals.named_blocks(state, data, unknowns)
+    blocks = named_blocks(state, data, unknowns)
     several = data.view["used"].sum(axis=1) > 1
     found = np.stack(
         [joint_noise.misfits(blocks, data, groups) for groups in (("face", "view"), ("view",))],
@@ -711,9 +841,7 @@ def finished(obs, state, data, unknowns, excluded, required):
 
     def read(s):
         poses = pose_parameters(s.cameras).ravel() if len(s.cameras) else ()
-        return None, np.concatenate([residuals.chart_parameters(s.head), poses, s.sensor])[
-            unknowns.mask
-        ]
+        return None, np.concatenate([chart_parameters(s.head), poses, s.sensor])[unknowns.mask]
 
     found = solve(
         lambda s: joint_blocks(s, data, unknowns),
@@ -737,7 +865,7 @@ def finished(obs, state, data, unknowns, excluded, required):
     found = replace(found, covariance=found.covariance + lens - twice, covariance_placements=spread)
     wider = replace(unknowns, sensor=tuple(dict.fromkeys((*unknowns.sensor, *joint_noise.TERMS))))
     state = found.state
-    blocks = residuals.named_blocks(found.state, data, wider)
+    blocks = named_blocks(found.state, data, wider)
     numbers = obs.placements.tolist()
     levels = ("face_scale", "face_share", "beam_share", "sigma_pitch", "side_sigma")
     return JointSolution(

@@ -6,10 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lrfcal_lib.fit import residuals
-from lrfcal_lib.fit.least_squares import eliminate, linearise, medians, whiten
-from lrfcal_lib.fit.residuals import SIDE_FREEDOM, SWEEPS, Unknowns, rays, view_block
+from lrfcal_lib.fit.least_squares import eliminate, linearise, medians, pad, whiten
 from lrfcal_lib.model.camera import project_jacobians
+from lrfcal_lib.solvers.joint_model import SWEEPS, JointData, Unknowns
+from lrfcal_lib.solvers.joint_residuals import (
+    SIDE_FREEDOM,
+    edge_distance,
+    named_blocks,
+    rays,
+    view_block,
+)
 
 LENS = 9  # intrinsics of a camera, see CameraModel.parameters
 LEAST_CORNERS = 6
@@ -21,6 +27,8 @@ PITCH_LEVELS = np.radians(
 SCALE_ROUNDS = 4
 SCALE_LIMITS = (1e-4, 1e4)
 SIDE_ROUNDS = 20
+# of the curvature of the beams' cost over their information; below 0 where most contradict edges
+LEAST_CURVATURE = 0.1
 SETTLED = 0.02  # change of the logarithm of a noise level
 # scatter of residuals in stated standard deviations that still agrees with the statement
 NOISE_LIMITS = (0.5, 2.0)
@@ -70,9 +78,7 @@ def lens_covariance(obs, found, data, unknowns):
     block = view_block(found.state, data, unknowns)
     J = whiten(block)[1]
     used = data.view["used"]
-    lens = residuals.pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))[
-        "lens"
-    ]
+    lens = pad({"lens": obs.view_lens, "placement": obs.view_placement}, len(used))["lens"]
     hessian = np.swapaxes(found.jacobian, -1, -2) @ (found.weights[..., None] * found.jacobian)
     own = np.linalg.pinv(hessian[:, c:, c:], rcond=1e-13, hermitian=True)
     reduced = J[..., :c] - J[..., c:] @ own @ hessian[:, c:, :c]
@@ -99,7 +105,7 @@ def lens_covariance(obs, found, data, unknowns):
 
 def estimate_noise(state, data, unknowns):
     """Padded observations with noise levels from the residuals at a solution."""
-    blocks = residuals.named_blocks(state, data, unknowns)
+    blocks = named_blocks(state, data, unknowns)
     hessian, gradient, *_ = linearise(blocks.values(), None, 1.0, (-2, -1))
     own = hessian[:, unknowns.shared :, unknowns.shared :]
     spread = np.linalg.pinv(own, rcond=1e-13, hermitian=True)  # shared ones held
@@ -170,7 +176,7 @@ def beam_share(state, data, block, unknowns, spread):
     the spacing of the beams says.
     """
     ray = rays(state, data, data.beam)
-    a, t = residuals.edge_distance(state, data, data.beam, ray)[4:6]
+    a, t = edge_distance(state, data, data.beam, ray)[4:6]
     o, d = ray[:2]
     normal = state.boards[:, None, :, 2]
     origin = state.boards[:, None, :, 3]
@@ -195,7 +201,7 @@ def beam_share(state, data, block, unknowns, spread):
     left = np.sum(1 - taken / counted)
     if left < 1:
         return data.beam_share
-    gain = np.sum(true) / np.sum(counted)
+    gain = max(np.sum(true) / np.sum(counted), LEAST_CURVATURE)
     ratio = np.sum(score**2 / counted) / left / gain
     return float(gain / max(ratio, 1.0))
 
@@ -353,7 +359,7 @@ def side_level(sides, data, hessian, gradient):
         step = -(spread @ right[..., None])[..., 0]
         square = (sides + step[:, last]) ** 2 + spread[:, last, last]
         weight = (SIDE_FREEDOM + 1) / (SIDE_FREEDOM + square / sigma2)
-        total = np.sum((weight * square)[shown]) + residuals.JointData.side_sigma**2
+        total = np.sum((weight * square)[shown]) + JointData.side_sigma**2
         sigma2 = np.clip(total / (shown.sum() + 1), 1e-4, 4.0)
     return float(np.sqrt(sigma2))
 

@@ -7,7 +7,6 @@ from contextlib import suppress
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.residuals import JointState
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,
@@ -17,6 +16,7 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
 )
 from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers.joint_model import JointState
 from lrfcal_lib.solvers.planes import start_from_planes
 
 START_SOFTNESS = 0.2  # spot radii

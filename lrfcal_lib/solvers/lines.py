@@ -4,10 +4,9 @@ Bauermann.
 
 import numpy as np
 
+from lrfcal_lib.fit.edge_likelihood import edge_shift, interval_terms
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
-    edge_shift,
-    interval_terms,
     line_block,
     read_pose,
     sight_block,
@@ -152,9 +151,9 @@ def interval_block(state, obs, sight, half, sigma):
     of each crossing.
 
     The state is a pose with one more column, the sensor's log odds (see
-    :mod:`lrfcal_lib.fit.residuals`). The distance of a crossing from the plane through the camera's
-    centre and the image line stands for that of the beam from the edge: the same to first order
-    where the camera is near the LRF.
+    :mod:`lrfcal_lib.fit.edge_likelihood`). The distance of a crossing from the plane through the
+    camera's centre and the image line stands for that of the beam from the edge: the same to first
+    order where the camera is near the LRF.
     """
     margin, jacobian = interval_margins(state, obs, sight)
     cost, score, information = interval_terms(margin + half, margin - half, sigma)
@@ -239,7 +238,7 @@ def edge_bias(solution, radius=1.0, background=0.0):
     `radius`.
 
     The solution is one of the method 'line_ml'; a radius of 1 gives spot radii. For `background`
-    see :func:`lrfcal_lib.fit.residuals.edge_shift`; say the mean over the crossings.
+    see :func:`lrfcal_lib.fit.edge_likelihood.edge_shift`; say the mean over the crossings.
     """
     shift, slope = edge_shift(solution.parameters[..., 6], radius, background)
     return shift, np.abs(slope) * solution.sigma[..., 6]

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtrc
 
-from lrfcal_lib.fit.least_squares import Block, solve
-from lrfcal_lib.fit.residuals import pad, sight_normals
+from lrfcal_lib.fit.least_squares import Block, pad, solve
+from lrfcal_lib.fit.residuals import sight_normals
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
     DegenerateGeometry,

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
-from lrfcal_lib.fit.residuals import SIGMA_FLOOR, pad, plane_residuals_m, read_pose
+from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, pad, solve
+from lrfcal_lib.fit.residuals import SIGMA_FLOOR, plane_residuals_m, read_pose
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import INTRINSIC_NAMES, project, project_jacobians
 from lrfcal_lib.model.geometry import (

@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.least_squares import Block, name_words, solve
-from lrfcal_lib.fit.residuals import AXIS_COLUMNS, SIGMA_FLOOR, chart_parameters, move_head, pad
+from lrfcal_lib.fit.axis_chart import AXIS_COLUMNS, chart_parameters, move_head
+from lrfcal_lib.fit.least_squares import Block, name_words, pad, solve
+from lrfcal_lib.fit.residuals import SIGMA_FLOOR
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (

@@ -1,0 +1,154 @@
+"""Coloured clouds of a session: its sweeps and images, seen by a calibrated rig."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lrfcal_lib.calibrate import reconstruct
+from lrfcal_lib.calibrate.cameras import CalibratedRig
+from lrfcal_lib.calibrate.pipeline import Calibration, handed_over
+from lrfcal_lib.session.read import Session
+
+MARGIN = 20  # scan lines and beams about a board that are worked on with it
+
+
+def color_cloud(
+    calibration: Calibration, method: str | None = None, scene: bool = False
+) -> reconstruct.Cloud:
+    """Sweeps of a session as one coloured cloud in the platform frame.
+
+    Parameters
+    ----------
+    calibration, method, scene
+        See :func:`cloud_blocks`.
+
+    Returns
+    -------
+    Cloud
+    """
+    return reconstruct.join(cloud_blocks(calibration, method, scene))
+
+
+def cloud_blocks(
+    calibration: Calibration, method: str | None = None, scene: bool = False
+) -> Iterator[reconstruct.Cloud]:
+    """Coloured points of a session, block by block.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    method : str, optional
+        Whose camera poses and axis make the cloud; what is handed over by default.
+    scene : bool
+        The sweeps of scenes, with all their returns, instead of the boards.
+
+    Yields
+    ------
+    Cloud
+        Each sweep takes its colours from the images of its own placement, of all cameras that see
+        the point.
+
+    Raises
+    ------
+    ValueError
+        If there is no such sweep, or no method.
+    """
+    method = method or handed_over(calibration)
+    if method is None:
+        raise ValueError(
+            "no camera was calibrated that could colour a cloud: see `problems` of the calibration"
+        )
+    session = calibration.prepared.session
+    if scene:
+        what = "a scene"
+        masks = dict.fromkeys(session.scene_placements)
+    else:
+        what = "the board"
+        masks = {p: scan.mask for p, scan in calibration.prepared.scans.items()}
+    if not masks:
+        raise ValueError(f"{session.name}: no sweep of {what} to colour")
+    rig = calibration.rig(method)
+    for placement, mask in masks.items():
+        sweep = session.sweep(placement)
+        views = views_of(session, rig, placement)
+        if mask is not None:
+            sweep, mask = _about(sweep, mask)
+        yield from reconstruct.reconstruct(
+            sweep,
+            views,
+            rig.T_head_lrf,
+            rig.corrections,
+            lrf=session.lrf,
+            continuous=session.continuous,
+            mask=mask,
+        )
+
+
+def _about(sweep, mask):
+    """A Sweep cut down to what a mask shows and a margin about it, and the mask likewise."""
+    window = []
+    for shown in np.nonzero(mask):
+        window.append(slice(max(0, shown.min() - MARGIN), shown.max() + MARGIN + 1))
+    lines, beams = window
+    cut = replace(
+        sweep,
+        ranges=sweep.ranges[lines, beams],
+        pitch=sweep.pitch[lines],
+        time_s=sweep.time_s[lines],
+        bearings=sweep.bearings[beams],
+    )
+    if sweep.intensities is not None:
+        cut = replace(cut, intensities=sweep.intensities[lines, beams])
+    return cut, mask[lines, beams]
+
+
+def views_of(session: Session, rig: CalibratedRig, placement: int) -> list[reconstruct.View]:
+    """The images of a placement as a rig poses them; without those of which no pitch is known.
+
+    Parameters
+    ----------
+    session : Session
+    rig : CalibratedRig
+    placement : int
+
+    Returns
+    -------
+    list of View
+
+    Raises
+    ------
+    ValueError
+        Where there are images and none of them can be posed.
+    """
+    records = session.images(placement=placement)
+    views = []
+    for record in records:
+        camera = rig.cameras.get(record.camera)
+        if camera is None or (camera.mount == "head" and not np.isfinite(record.pitch)):
+            continue
+        pitch = float(rig.corrections.pitch(placement, record.pitch))
+        number = session.image_records.index(record)
+        T_camera_platform = rig.camera_at(record.camera, pitch)
+        image = session.read_image(record)
+        views.append(
+            reconstruct.View(number, record.camera, T_camera_platform, camera.model, image)
+        )
+    if records and not views:
+        raise ValueError(
+            f"{session.name}, placement {placement}: its {len(records)} images cannot colour it; "
+            f"{_why_unposed(records, rig)}"
+        )
+    return views
+
+
+def _why_unposed(records, rig):
+    """Why a rig poses none of these images."""
+    of = {record.camera for record in records}
+    if of & set(rig.cameras):
+        return "of none is the pitch known: state pitch_deg in images.csv"
+    known = ", ".join(rig.cameras) or "no camera"
+    return (
+        f"they are of {', '.join(sorted(of))}, the calibration by '{rig.method}' poses {known}: "
+        "take that of the same rig"
+    )

@@ -1,0 +1,133 @@
+"""Two cameras, calibrated apart, beside the chessboard that both see."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import RigidTransform
+
+from lrfcal_lib.fit.result import Solution
+from lrfcal_lib.model.geometry import transform_difference
+from lrfcal_lib.preprocess.intrinsics import adjust_robust, board_pose, waves
+from lrfcal_lib.preprocess.prepared import Prepared
+from lrfcal_lib.solvers import METHODS
+
+K3 = 8  # number of the sixth-power term of the lens among the intrinsics
+COLUMNS = (
+    "method",
+    "baseline_mm",
+    "baseline_error_mm",
+    "translation_error_mm",
+    "rotation_error_deg",
+)
+
+
+@dataclass(frozen=True)
+class StereoReference:
+    """Relative pose of two cameras.
+
+    Attributes
+    ----------
+    cameras : (str, str)
+        First and second.
+    T_second_first : RigidTransform
+    covariance : ndarray, shape (6, 6)
+        Of ``[w, v]``, radians and metres.
+    """
+
+    cameras: tuple[str, str]
+    T_second_first: RigidTransform
+    covariance: np.ndarray
+
+
+def stereo_reference(prepared: Prepared) -> StereoReference:
+    """Relative pose of the first two cameras from the chessboard in both images: the best knowledge
+    of the mounting.
+
+    The intrinsics of both are estimated along, and the shape of a wavy sheet.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    StereoReference
+
+    Raises
+    ------
+    ValueError
+        With fewer than two cameras, without a pattern, or when no placement is seen by both.
+    """
+    pattern = prepared.board.pattern
+    if len(prepared.views) < 2 or pattern is None:
+        raise ValueError(
+            f"a stereo reference needs two cameras and a pattern, got {len(prepared.views)} cameras"
+        )
+    first, second = list(prepared.views)[:2]
+    corners = {}
+    for camera in (first, second):
+        views = prepared.views[camera].items()
+        corners[camera] = {p: view.pixels for p, view in views if view.pixels is not None}
+    common = sorted(corners[first].keys() & corners[second].keys())
+    if not common:
+        raise ValueError(
+            "no placement shows the pattern to both cameras: the stereo check needs at least one"
+        )
+    models = [prepared.models[first], prepared.models[second]]
+    pixels = np.array([[of_camera[p] for p in common] for of_camera in corners.values()])
+    poses = []
+    for model, of_camera in zip(models, pixels, strict=True):
+        boards = [board_pose(image, pattern, model)[0] for image in of_camera]
+        poses.append(RigidTransform.concatenate(boards))
+    between = poses[1] * poses[0].inv()
+    rough = RigidTransform.from_components(
+        np.median(between.translation, axis=0), between.rotation.mean()
+    )
+    basis = None
+    if np.any(prepared.relief):
+        basis = waves(pattern.points())
+    fixed = ()
+    if all(model.distortion[4] == 0 for model in models):
+        fixed = (K3,)
+    adjusted = adjust_robust(
+        pixels,
+        pattern.points(),
+        models,
+        poses[0],
+        RigidTransform.concatenate([RigidTransform.identity(), rough]),
+        basis=basis,
+        fixed=fixed,
+    )
+    return StereoReference((first, second), adjusted.mounting[1], adjusted.mounting_covariance[0])
+
+
+def stereo_check(
+    solutions: dict[tuple[str, str], Solution], reference: StereoReference
+) -> pd.DataFrame:
+    """What two cameras, calibrated apart, say about each other, against the chessboard in both.
+
+    Parameters
+    ----------
+    solutions : dict of (str, str) to Solution
+        By camera and method.
+    reference : StereoReference
+
+    Returns
+    -------
+    DataFrame
+        Columns method, baseline_mm, baseline_error_mm, translation_error_mm, rotation_error_deg.
+        Both calibrations use the same LRF points, so the check cannot see an error of the cloud.
+    """
+    rows = []
+    baseline = np.linalg.norm(reference.T_second_first.translation)
+    for method in (*METHODS, "joint"):
+        if not all((camera, method) in solutions for camera in reference.cameras):
+            continue
+        first, second = (solutions[camera, method].transform for camera in reference.cameras)
+        between = second * first.inv()
+        turn, shift = transform_difference(between, reference.T_second_first)
+        length = np.linalg.norm(between.translation)
+        millimetres = 1000 * np.array([length, length - baseline, shift])
+        rows.append((method, *millimetres, np.rad2deg(turn)))
+    return pd.DataFrame(rows, columns=COLUMNS)

@@ -1,0 +1,122 @@
+"""Where beams flip from a board to its background: the share of a spot inside an edge, as a
+likelihood.
+"""
+
+from functools import cache
+
+import numpy as np
+from scipy.special import log_ndtr
+
+ROOT_2PI = np.sqrt(2 * np.pi)
+# of a beam step: least softness, so that an edge between two beams is put into their middle
+LEAST_STEP = 0.15
+LEAST_SHARE = 1e-12  # of a spot, so that odds stay finite
+
+
+def disc_share(x):
+    """Share of a unit disc inside a straight edge `x` radii inside of its centre: 1 for x <=
+    -1, 0 for x >= 1.
+    """
+    x = np.clip(np.asarray(x, float), -1.0, 1.0)
+    return (np.arccos(x) - x * np.sqrt(1 - x**2)) / np.pi
+
+
+def disc_edge(log_odds):
+    """Where an edge cuts a unit disc so that its inner share has log odds ``ln(share / (1 -
+    share))``.
+
+    Inverts :func:`disc_share`; returns the distance x of the disc's centre from the edge in radii,
+    positive outside, between -1 and 1, and ``dx / dlog_odds`` (negative).
+    """
+    log_odds = np.asarray(log_odds, float)
+    table, odds = _table()
+    x = np.interp(-log_odds, -odds, table)
+    slope, here = _slope(x)
+    # value and slope must agree for steps to converge
+    refined = x + slope * np.clip(log_odds - here, -1e-4, 1e-4)
+    return refined, _slope(refined)[0]
+
+
+@cache
+def _table():
+    """Distances of an edge in radii, dense where the share changes least, and their log odds."""
+    x = np.sin(np.linspace(-1, 1, 4001) * np.pi / 2)[1:-1]
+    return x, np.log(disc_share(x)) - np.log(disc_share(-x))
+
+
+def _slope(x):
+    """``dx / dlog_odds`` and the log odds of the share inside, at a distance of the edge in
+    radii.
+    """
+    inside, outside = (np.maximum(disc_share(v), LEAST_SHARE) for v in (x, -x))
+    slope = -inside * outside * np.pi / (2 * np.sqrt(np.maximum(1 - x**2, 1e-12)))
+    return slope, np.log(inside / outside)
+
+
+def edge_shift(log_odds, radius, background=0.0):
+    """By how far a spot's centre may lie outside an edge and still read the board, and its
+    derivative by `log_odds`.
+
+    Metres, positive where boards look larger. The log odds are the sensor's, for a background as
+    far and as bright as the board; `background` is what the real one adds: ``-2 ln(d_background /
+    d_board)``, 0 where it is not known.
+    """
+    x, slope = disc_edge(log_odds + np.asarray(background, float))
+    return radius * x, radius * slope
+
+
+def flip_sigma(softness, radius, step):
+    """Standard deviation of where readings flip (metres), and ``d ln sigma / d ln softness``, 0
+    (all floor) to 1.
+
+    `softness` is in spot radii. Beams a step apart (metres, at the board) cannot show a sharper
+    edge than a floor.
+    """
+    soft = softness * np.asarray(radius, float)
+    sigma = np.hypot(soft, LEAST_STEP * np.asarray(step, float))
+    return sigma, (soft / sigma) ** 2
+
+
+def beam_terms(margin, sigma, hit, lapse=0.0):
+    """Negative log likelihood of single beams near an edge, a probit: ``P(hit) = Phi(margin /
+    sigma)``.
+
+    `margin` and `sigma` (metres) are how far inside the place where readings flip the beam's centre
+    lies (shift - distance from the edge), and the standard deviation of that place; `hit` tells
+    whether the board was read, `lapse` is the share of beams that say nothing (something hid or
+    bent the edge there): their pull fades with distance. Returned are cost, score (its derivative
+    by the margin) and the observed information on the margin, never negative; with `lapse` that of
+    the majorising function of an EM step.
+    """
+    sign = np.where(hit, 1.0, -1.0)
+    z = sign * np.asarray(margin, float) / sigma
+    log_p = log_ndtr(z)
+    mills = np.exp(-0.5 * z**2 - log_p) / ROOT_2PI  # phi(z) / Phi(z) without overflow
+    weight = 1.0
+    cost = -log_p
+    if lapse:
+        cost = -np.logaddexp(np.log(lapse), np.log1p(-2 * lapse) + log_p)
+        weight = np.exp(np.log1p(-2 * lapse) + log_p + cost)
+    return cost, -weight * sign * mills / sigma, weight * mills * (z + mills) / sigma**2
+
+
+def interval_terms(inner, outer, sigma):
+    """Negative log likelihood that readings flip between two beams: ``P = Phi(inner / sigma) -
+    Phi(outer / sigma)``.
+
+    A uniform distribution over the interval, blurred; `inner` and `outer` are the margins (see
+    :func:`beam_terms`) of the last beam on the board and the first one off it. Returned are cost,
+    score and observed information by a shift of both margins, as by :func:`beam_terms`.
+    """
+    a = np.asarray(outer, float) / sigma
+    b = np.asarray(inner, float) / sigma
+    flip = a + b > 0  # mirrored, so that both tails stay on the side where log_ndtr is exact
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper = log_ndtr(b)
+    lower = log_ndtr(a)
+    log_p = upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-15)))
+    pb, pa = (np.exp(-0.5 * z**2 - log_p) / ROOT_2PI for z in (b, a))
+    ratio = pb - pa
+    curvature = ratio**2 + (b * pb - a * pa)
+    score = np.where(flip, 1.0, -1.0) * ratio / sigma
+    return -log_p, score, np.maximum(curvature, 0.0) / sigma**2
