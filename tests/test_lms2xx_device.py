@@ -115,6 +115,8 @@ def test_a_port_that_vanishes_is_a_lost_line(wire):
 class Far(SerialDevice):
     """A device that hears, and says what a test lets it say."""
 
+    baudrate = None
+
     def __init__(self, baudrate=38400):
         super().__init__("far", VirtualHost())
         self.heard, self.baudrate = [], baudrate

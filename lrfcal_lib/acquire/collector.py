@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class Task:
     title: str
     guidance: str  # where to put the board
     placement: Placement | None = None
-    close: tuple[str, int] | None = None  # of the board held close to a camera: its name, the view
+    close: tuple[str, int] = ("", 0)  # without a placement: camera of a close view, its number
 
 
 def next_task(recording: Recording, advice: str = "") -> Task | None:
@@ -136,14 +137,15 @@ def calibrate_recording(path: Path) -> Result:
     if not judged.errors:
         sentences += ("Nothing is written.",)
         return Result(judged.answer, sentences, "", {}, None, calibration)
-    method = handed_over(calibration)
+    method = handed_over(calibration) or ""
     poses = {}
     for (camera, name), solution in calibration.solutions.items():
         if name == method:
             sigma = solution.trusted_sigma
+            pose: Any = solution.transform
             poses[camera] = Pose(
-                turn=np.degrees(solution.transform.rotation.as_rotvec()),
-                shift=1000 * solution.transform.translation,
+                turn=np.degrees(pose.rotation.as_rotvec()),
+                shift=1000 * pose.translation,
                 turn_sigma=np.degrees(sigma[:3]),
                 shift_sigma=1000 * sigma[3:6],
             )
@@ -235,18 +237,13 @@ class Collector(Closed):
         return self.rig is not None and self.rig.stated.devices.control is not None
 
     @property
-    def limits_deg(self) -> tuple[float, float]:
-        """Lowest and highest pitch of the head."""
-        return self._needed().stated.devices.head.pitch_limits_deg
-
-    @property
     def finished(self) -> tuple[int, ...]:
         """Numbers of the placements that are recorded and safe."""
         if self.recording is None:
             return ()
         return self.recording.finished
 
-    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> None:
+    def connect(self, rig: str | os.PathLike, session: str | os.PathLike) -> Rig:
         """Open a rig and a session; one that was recorded with the same rig goes on.
 
         Parameters
@@ -275,6 +272,7 @@ class Collector(Closed):
             self.view = View()
             self.lights = {}
             self._advice = ""
+        return opened
 
     def close(self) -> None:
         """Stop the head, finish the session, close all devices; a second call does nothing.
@@ -311,7 +309,7 @@ class Collector(Closed):
         if self.rig is None:
             remedy = "name a rig file or an emulated rig, and press connect"
             raise DeviceError(f"no rig is connected: {remedy}")
-        return self.rig
+        return self.rig, self.recording
 
     def move_to(self, pitch: float) -> float:
         """Move the head.
@@ -333,7 +331,7 @@ class Collector(Closed):
         Busy
             If something else is under way.
         """
-        rig = self._needed()
+        rig, _ = self._needed()
         with self._own():
             self.stopped.clear()
             self.view.pitch = rig.head.move_to(pitch)
@@ -408,22 +406,22 @@ class Collector(Closed):
         DeviceError, RecordingError, Interrupted
             Or if it was stopped: the placement does not count.
         """
-        rig = self._needed()
-        recording = self.recording
+        rig, recording = self._needed()
         task = self.task()
         if task is None:
             remedy = "calibrate, or connect with another session"
             raise RecordingError(f"the plan of this rig is done: {remedy}")
         with self._own():
             self.stopped.clear()
-            if task.close:
+            placement = task.placement
+            if placement is None:
                 camera, view = task.close
                 rig.hold_close(camera, view)
                 return [recording.run_close(camera)]
-            number = task.placement.number
+            number = placement.number
             self.view.rows = {}
             rig.move_board(number)
-            self._record(task.placement, progress)
+            self._record(placement, progress)
         progress(1.0, "checking what was recorded")
         scenes = {placement.number for placement in recording.plan if placement.purpose == "scene"}
         adviser = None  # while every other placement helps
@@ -476,13 +474,13 @@ class Collector(Closed):
         RecordingError
             If there is none.
         """
-        self._needed()
+        _, recording = self._needed()
         if not self.finished:
             remedy = "press capture to record one"
             raise RecordingError(f"there is no placement to record again: {remedy}")
         with self._own():
             number = next(reversed(self.lights), self.finished[-1])
-            self.recording.drop(number)
+            recording.drop(number)
             self.lights.pop(number, None)
         return number
 
@@ -496,11 +494,11 @@ class Collector(Closed):
         ValueError
             If it determines no calibration.
         """
-        self._needed()
+        _, recording = self._needed()
         if not self.finished:
             remedy = "capture at least three placements of the board"
             raise RecordingError(f"nothing was recorded yet: {remedy}")
-        return calibrate_recording(self.recording.path)
+        return calibrate_recording(recording.path)
 
 
 def _stated(rig, stack):

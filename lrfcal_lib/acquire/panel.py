@@ -8,6 +8,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import ipywidgets as w
 import numpy as np
@@ -42,7 +43,7 @@ def _as_text(value):
     return Markup(escape(value))
 
 
-HTML = (  # macros that make parts of the panel
+HTML: Any = (  # macros that make parts of the panel
     Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -315,12 +316,11 @@ class Panel(Closed):
             collector = self.collector
             parts.rig.value = str(rig_named(parts.rig.value))
             parts.session.value = str(self.session)
-            collector.connect(parts.rig.value, self.session)
-            low, high = collector.limits_deg
+            rig = collector.connect(parts.rig.value, self.session)
+            limits: Any = rig.stated.devices.head.pitch_limits_deg
             with parts.slider.hold_trait_notifications():
-                parts.slider.min = low
-                parts.slider.max = high
-            parts.show_pictures(collector.rig.cameras)
+                parts.slider.min, parts.slider.max = limits
+            parts.show_pictures(rig.cameras)
             self._begin_sweep(collector.task())
             self._quit.clear()
             self._live = threading.Thread(target=self._keep_looking, name="panel view", daemon=True)
@@ -348,7 +348,8 @@ class Panel(Closed):
         with self._doing("recording"):
             self._begin_sweep(task)
             lights = self.collector.capture(self._show_progress)
-            self.parts.lights.value = HTML.lights(f"Quality of {task.title.lower()}", lights)
+            title = task.title.lower() if task else ""
+            self.parts.lights.value = HTML.lights(f"Quality of {title}", lights)
         return lights
 
     def again(self) -> int:

@@ -82,7 +82,7 @@ def scan_picture(
 
 def sweep_picture(
     rows: dict[float, np.ndarray],
-    bearings: np.ndarray | None,
+    bearings: np.ndarray,
     field_of_view: tuple[float, float],
     pitch: tuple[float, float],
     step: float,
@@ -96,7 +96,7 @@ def sweep_picture(
     rows
         Ranges (B,), metres, by pitch, radians.
     bearings
-        (B,), radians; None without rows.
+        (B,), radians; not used without rows.
     field_of_view, pitch
         Their ends, radians.
     step

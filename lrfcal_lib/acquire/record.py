@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,7 +135,7 @@ class Recording(Closed):
         taken = self.writer.shots_of("intrinsics")
         return [(camera, view) for camera in taken for view in range(taken[camera], wanted)]
 
-    def run(self, placement: Placement) -> Iterator[Event]:
+    def run(self, placement: Placement) -> Generator[Event, None, None]:
         """Record a placement, and yield every event once it is on the disk.
 
         When the generator ends the placement is finished. When it is closed or raises, the head is
@@ -176,12 +176,12 @@ class Recording(Closed):
             'bad' where the image shows no pattern and was not kept.
         """
         with contextlib.closing(self.rig.acquire_close(camera)) as events:
-            *_, event = events
+            (photo,) = (event for event in events if isinstance(event, Photographed))
         stated = self.rig.stated
         model = stated.cameras[camera].model
-        light = check_image(event.frame.image, stated.board, model, f"camera {camera}")
+        light = check_image(photo.frame.image, stated.board, model, f"camera {camera}")
         if light.state != "bad":
-            self.write(event)
+            self.write(photo)
         return light
 
     def check(self, number: int, advice: Callable[[Session], str] | None = None) -> list[Light]:

@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
 from lrfcal_lib.drivers.lms2xx_link import (
@@ -121,7 +122,7 @@ class LMS2xx(Closed):
         self._address = address
         self._interrupted = host.event()
         self._link = None
-        self._thread = None
+        self._thread: Thread | None = None
         self._interlaced = False
         self._readings: list[Reading] = []
         self._trouble = ""  # why no reading came

@@ -91,7 +91,9 @@ class Motion:
         if settings.absolute is False:
             self._obeys = False
         self._dead: set[int] = set()  # speed bytes at which the head does not move
-        self._going = None  # way (1 up, -1 down), speed byte and instant of the motion
+        self._going: tuple | None = (
+            None  # way (1 up, -1 down), speed byte and instant of the motion
+        )
         self._frame = b""
         self._repeated = 0.0
         self._pitch: float | None = None

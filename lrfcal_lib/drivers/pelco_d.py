@@ -107,7 +107,7 @@ def split_frames(data: bytes) -> tuple[tuple[Frame, ...], int]:
     pending : int
         From where on bytes must be kept: a frame may begin there whose end has not come yet.
     """
-    frames = []
+    frames: list[Frame] = []
     at = 0
     while (at := data.find(SYNC, at)) >= 0:
         raw = data[at : at + FRAME]

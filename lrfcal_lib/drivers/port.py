@@ -150,7 +150,7 @@ def set_rate(port: serial.Serial, baudrate: int) -> None:
 
 
 @contextmanager
-def line_lost(path: str) -> Iterator[None]:
+def line_lost(path: str | os.PathLike) -> Iterator[None]:
     """Turn what pyserial raises when a port vanishes into LineLost.
 
     Parameters

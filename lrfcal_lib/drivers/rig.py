@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
@@ -149,7 +149,7 @@ class Rig(Closed):
             skipped.add("variant")
         asked = devices.lrf.model_dump(exclude_none=True, exclude=skipped)
         camera = camera or partial(_camera, stated)
-        openers = {
+        openers: dict[str, Callable] = {
             "head": partial(PanTilt, devices.head.port, devices.head, host=host),
             "lrf": partial(LMS2xx, devices.lrf.port, host=host, **asked),
         }
@@ -185,7 +185,8 @@ class Rig(Closed):
         configuration = self.lrf.configuration
         view, step = self.lrf.variant
         if self.stated.devices.lrf.interlaced:
-            view, step = 180, 0.25
+            view = 180.0
+            step = 0.25
         unit = METRES[configuration.unit]
         return replace(
             stated,
@@ -271,7 +272,7 @@ class Rig(Closed):
     # ----------------------------------------------------------------------------------------------
     # recording
 
-    def acquire(self, placement: Placement) -> Iterator[Event]:
+    def acquire(self, placement: Placement) -> Generator[Event, None, None]:
         """Record a placement of the plan; its events, as they happen.
 
         Scans and images of a stop are later than the instant at which the head came to rest there.
@@ -312,7 +313,7 @@ class Rig(Closed):
             self.halt()
             raise
 
-    def acquire_close(self, camera: str) -> Iterator[Event]:
+    def acquire_close(self, camera: str) -> Generator[Photographed, None, None]:
         """Take one image of the board held close to a camera, the head at pitch 0.
 
         Parameters

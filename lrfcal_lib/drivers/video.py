@@ -7,8 +7,10 @@ import os
 import re
 import select
 import threading
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -130,22 +132,22 @@ class Camera(Closed):
             If the camera was closed.
         """
 
-        def there():
-            return self._frame is not None and (after is None or self._frame.time_s > after)
+        def fresh():
+            frame = self._frame
+            if frame is None or (after is not None and frame.time_s <= after):
+                return None
+            return frame
 
         with self._new:
             if self._thread is not None:
-                self._new.wait_for(lambda: self._quit.is_set() or there(), timeout)
+                self._new.wait_for(lambda: self._quit.is_set() or fresh(), timeout)
             if self._quit.is_set():
                 raise DeviceError(f"camera {self.name} is closed: open it again")
             if self._thread is None:
-                self.lost = not self._capture.grab() or not self._keep(REAL.time())
-                if self.lost:
-                    end = f"at the end of its {self._count} recorded images"
-                    raise LineLost(f"camera {self.name} is {end}: open it again")
-                return self._frame
-            if there():
-                return self._frame
+                return self._next()
+            frame = fresh()
+            if frame is not None:
+                return frame
         if self.lost:
             raise LineLost(f"camera {self.name} is lost: {self._remedy}")
         raise NoReply(f"camera {self.name} gave no new frame in {timeout:g} s: {self._remedy}")
@@ -208,6 +210,14 @@ class Camera(Closed):
         if self._capture is not None:
             self._capture.release()
         self._capture = None
+
+    def _next(self):
+        """The next image of a recorded source."""
+        self.lost = not self._capture.grab() or not self._keep(REAL.time())
+        if self.lost:
+            end = f"at the end of its {self._count} recorded images"
+            raise LineLost(f"camera {self.name} is {end}: open it again")
+        return self._frame
 
     def _grab(self):
         """Keep the newest frame; this thread alone touches the source."""
@@ -337,15 +347,16 @@ def _open_stream(path, silence_s):
     return _opened(f"{path} gives no video: {remedy_of(path)}", path, cv2.CAP_FFMPEG, waits)
 
 
-class Images:
-    """Encoded images that are read like cv2.VideoCapture.
-
-    A subclass has ``take()``, which gives the next one, None at the end.
-    """
+class Images(ABC):
+    """Encoded images that are read like cv2.VideoCapture."""
 
     def __init__(self):
         self._image = b""
         self._held = False
+
+    @abstractmethod
+    def take(self) -> bytes | None:
+        """The next one; None at the end."""
 
     def grab(self) -> bool:
         """Take the next image, if there is one."""
@@ -354,7 +365,7 @@ class Images:
         self._held = False
         return self._image is not None
 
-    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+    def retrieve(self) -> tuple[bool, Any]:
         """Decode the image grabbed last: whether it is one, and its pixels."""
         image = None
         if self._image:
@@ -480,7 +491,7 @@ class Files(Images):
             return None
         return self._path.read_bytes()
 
-    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+    def retrieve(self) -> tuple[bool, Any]:
         """Decode it: True and its pixels. PortError if it is no image."""
         done, image = super().retrieve()
         if not done:

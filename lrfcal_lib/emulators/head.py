@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, SYNC, TILT, UP, encode_extended
@@ -94,7 +93,7 @@ class Head:
         if self.moving(reacts):
             self._run(reacts, self.motor(reacts), 0.0)
 
-    def motor(self, instant: ArrayLike) -> np.ndarray:
+    def motor(self, instant: float | np.ndarray) -> np.ndarray:
         """Angle of the motor.
 
         Parameters
@@ -154,7 +153,7 @@ class Head:
         since, _ = self.resting(instant)
         return not self.moving(instant) and since >= self.platform.settle + rest_s
 
-    def pitch(self, instant: ArrayLike) -> np.ndarray:
+    def pitch(self, instant: float | np.ndarray) -> np.ndarray:
         """True pitch; after a stop it wobbles until it settled.
 
         Parameters

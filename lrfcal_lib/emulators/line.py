@@ -13,7 +13,9 @@ import select
 import termios
 import threading
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +28,14 @@ CHUNK_S = 0.005  # bytes that leave within this time are written at once
 LOOK_S = 0.02  # how often to see whether somebody opened the port
 END_S = 5  # longest wait for the end of the thread
 SOON = 1e-9  # s; so far ahead counts as now, whatever the rounding
+NONE = -1  # file of a terminal that is not plugged in
 SENDING = "sending"  # tag of what is planned for the bytes on their way out
 
 
-class SerialDevice:
+class SerialDevice(ABC):
     """What all devices on a line have in common; a context manager, or `start` and `close`.
 
-    A subclass has ``baudrate`` and ``receive(data, at)``. Instants are ``now()`` of the host that
-    it lives on, s.
+    Instants are ``now()`` of the host that it lives on, s.
 
     Parameters
     ----------
@@ -50,8 +52,6 @@ class SerialDevice:
         What ended the device by itself.
     """
 
-    baudrate: int
-
     def __init__(self, path: str | os.PathLike, host: Host, seed: int = 0):
         self.path = str(path)
         self.host = host
@@ -62,6 +62,23 @@ class SerialDevice:
         self._noise = np.random.default_rng([seed, 4])
         self._agenda: list = []  # heap of instant, order, action, tag
         self._order = itertools.count()
+
+    @property
+    @abstractmethod
+    def baudrate(self) -> int:
+        """Of the device."""
+
+    @abstractmethod
+    def receive(self, data: bytes, at: float) -> None:
+        """Take bytes of the host.
+
+        Parameters
+        ----------
+        data
+            As they arrived.
+        at
+            Instant of the last of them, s.
+        """
 
     @property
     def byte_s(self) -> float:
@@ -130,11 +147,11 @@ class SerialDevice:
         for first in range(0, len(data), at_once):
             chunk = data[first : first + at_once]
             out = begin + (first + len(chunk)) * byte_s
-            self.at(out, lambda _, chunk=chunk: self._put(chunk), SENDING)
+            self.at(out, partial(self._put, chunk), SENDING)
         if then is not None:
             self.at(self.busy_until, then, SENDING)
 
-    def _put(self, data):
+    def _put(self, data, _):
         if self.port.open:
             self.port.put(self._through(data, self.baudrate, self.port.rate))
 
@@ -193,12 +210,12 @@ class Terminal(threading.Thread):
         self.open = False
         self._device = device
         self._quit = False
-        self._master = None
+        self._master = NONE
 
     @property
     def there(self) -> bool:
         """Whether the port is plugged in."""
-        return self._master is not None
+        return self._master != NONE
 
     @property
     def rate(self) -> int:
@@ -216,9 +233,7 @@ class Terminal(threading.Thread):
         try:
             while not self._quit:
                 wait = min(self._device.due() - REAL.now(), LOOK_S)
-                listened = []
-                if self.open:
-                    listened.append(self._master)
+                listened = [self._master] if self.open else []
                 select.select(listened, [], [], max(0.0, wait))
                 if self.there:
                     self._listen()
@@ -279,5 +294,5 @@ class Terminal(threading.Thread):
         if self.there:
             Path(self._device.path).unlink(missing_ok=True)
             os.close(self._master)
-            self._master = None
+            self._master = NONE
             self.open = False

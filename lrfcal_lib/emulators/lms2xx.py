@@ -243,7 +243,7 @@ class EmulatedLms(SerialDevice):
         self._late_s = LATE_S  # a stream that lags so far leaves scans out
         self._buffer = b""  # bytes of a request that is not whole
         self._booting = False
-        self._effect = None  # of the command whose reply is on its way
+        self._effect: Callable | None = None  # of the command whose reply is on its way
         self._zero = host.now() - POWERED_S  # when turns of the mirror are counted from
         self._number = 0  # of the next scan
         self._told = Told()

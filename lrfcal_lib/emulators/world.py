@@ -76,7 +76,7 @@ class EmulatedWorld:
         self._rng = np.random.default_rng([seed, 3])
         # what a head at rest saw last, and without noise
         self._still_key: tuple | None = None
-        self._still = None
+        self._still: tuple = ()
         self.put(None)
 
     @property
@@ -163,7 +163,8 @@ class EmulatedWorld:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        return lrf.measured(rig.beam, *self._still, self._rng)
+        ideal, energy, dazzled = self._still
+        return lrf.measured(rig.beam, ideal, energy, dazzled, self._rng)
 
 
 def scaled(rig: Rig, width: int) -> Rig:
