@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx_link import Reading
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import DeviceError, LineLost, NoReply
 from lrfcal_lib.drivers.rig import Rig
 from lrfcal_lib.drivers.rig_file import rig_of

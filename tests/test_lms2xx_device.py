@@ -15,7 +15,8 @@ from virtual import lms as lms_on
 
 from lrfcal_lib.drivers import port
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import Assembler, Link, ScanClock, transfer_s
+from lrfcal_lib.drivers.lms2xx_link import Link
+from lrfcal_lib.drivers.lms2xx_scans import Assembler, ScanClock, transfer_s
 from lrfcal_lib.drivers.port import (
     DeviceError,
     LineLost,

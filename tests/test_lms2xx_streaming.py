@@ -5,7 +5,8 @@ import pytest
 from virtual import INDEXED, lms
 
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import RATES, interval_s
+from lrfcal_lib.drivers.lms2xx_link import RATES
+from lrfcal_lib.drivers.lms2xx_scans import interval_s
 from lrfcal_lib.model.kinematics import MIRROR_TURN
 
 # scans that a telegram takes by the manual's table 10-17: 812 (100/0.25), 732 (180/0.5), 372 bytes (180/1)

@@ -6,16 +6,8 @@ import os
 from threading import Thread
 
 from lrfcal_lib.drivers import lms2xx_link as wire
-from lrfcal_lib.drivers.lms2xx_link import (
-    POWER_ON,
-    RATES,
-    VARIANTS,
-    Arrival,
-    Assembler,
-    Link,
-    Reading,
-    ScanClock,
-)
+from lrfcal_lib.drivers.lms2xx_link import POWER_ON, RATES, Arrival, Link
+from lrfcal_lib.drivers.lms2xx_scans import VARIANTS, Assembler, Reading, ScanClock
 from lrfcal_lib.drivers.port import (
     REAL,
     Closed,

@@ -13,7 +13,7 @@ import urllib3
 
 from lrfcal_lib.drivers.head import PanTilt
 from lrfcal_lib.drivers.lms2xx import LMS2xx
-from lrfcal_lib.drivers.lms2xx_link import Reading
+from lrfcal_lib.drivers.lms2xx_scans import Reading
 from lrfcal_lib.drivers.port import REAL, Closed, DeviceError, Host, LineLost, NoReply
 from lrfcal_lib.drivers.rig_file import Placement, RigFile, RigFileError
 from lrfcal_lib.drivers.video import Camera, Frame

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lrfcal_lib.drivers import pelco_d
-from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, SYNC, TILT, UP, encode_extended
+from lrfcal_lib.drivers.pelco_d import DOWN, FASTEST, QUERY_TILT, TILT, UP, encode_extended
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.simulate.rig import Platform
@@ -222,29 +222,17 @@ class Habits:
         'full': tells its position except during an absolute move, and makes absolute moves.
         'partial': tells its position at rest only, and ignores absolute moves. 'none': neither;
         nothing is ever answered.
-    confirms : bool
-        Answers commands by 4 bytes.
-    echo : bool
-        The two-wire line hands back what the host sends.
     speeds : tuple of float
         Tilt speed at speed byte 0 and at 0x3F, between which it grows evenly; degrees a second.
     go_speed : float
         Of absolute moves, degrees a second.
-    watchdog_s : float or None
-        Stops when no frame came for so long.
-    invert : bool
-        'Up' and positive elevation lower the view.
     """
 
     baudrate: int = 2400
     address: int = 1
     feedback: str = "full"
-    confirms: bool = False
-    echo: bool = False
     speeds: tuple = (0.5, 12.0)
     go_speed: float = 8.0
-    watchdog_s: float | None = None
-    invert: bool = False
 
 
 class EmulatedHead(SerialDevice):
@@ -281,7 +269,6 @@ class EmulatedHead(SerialDevice):
         self.habits = Habits(**habits)
         self.frames: deque = deque(maxlen=10 * KEPT)
         self.absolute_until = -math.inf  # an absolute move is under way
-        self._sign = -1 if self.habits.invert else 1
         self._buffer = b""  # bytes of a frame that is not whole
 
     @property
@@ -303,8 +290,6 @@ class EmulatedHead(SerialDevice):
         at
             Instant of the last of them, s.
         """
-        if self.habits.echo:
-            self.write(data, at)
         self.cancel("fragment")
         data = self._buffer + data
         frames, pending = pelco_d.split_frames(data)
@@ -319,7 +304,7 @@ class EmulatedHead(SerialDevice):
         self._buffer = b""
 
     def obey(self, frame: pelco_d.Frame, at: float) -> None:
-        """Do what a frame says, and confirm it.
+        """Do what a frame says.
 
         Parameters
         ----------
@@ -328,31 +313,23 @@ class EmulatedHead(SerialDevice):
         at
             Instant of its last byte, s.
         """
-        habits = self.habits
         self.frames.append((self.host.time(), frame))
-        self.cancel("watchdog")
-        if habits.watchdog_s:
-            self.at(at + habits.watchdog_s, self.stop, "watchdog")
         if frame.command2 in ANSWERS:
             self.tell(frame.command2, at)
-            return
-        if not frame.command2 & 1:
-            self._turn(frame, at)
         elif frame.command2 == pelco_d.SET_TILT:
             self._set_tilt(frame.value, at)
-        if habits.confirms and habits.feedback != "none":
-            checksum = sum(vars(frame).values()) % 256
-            self.reply(bytes([SYNC, habits.address, 0, checksum]), at + TURN_AROUND_S)
+        elif not frame.command2 & 1:
+            self._turn(frame, at)
 
     def _turn(self, frame, at):
         """Move up or down; without a direction it is a stop, whatever the speeds say."""
-        way = {UP: self._sign, DOWN: -self._sign}.get(frame.command2 & (UP | DOWN))
-        if way is None:
+        goal = {UP: math.tau, DOWN: -math.tau}.get(frame.command2 & (UP | DOWN))
+        if goal is None:
             self.stop(at)
             return
         self.absolute_until = -math.inf
         speed = np.interp(frame.data2, (0, FASTEST), self.habits.speeds)
-        self.head.move(at, way * math.tau, math.radians(speed))
+        self.head.move(at, goal, math.radians(speed))
 
     def _set_tilt(self, value, at):
         """Move to an elevation; a second such move is lost while the first is under way."""
@@ -360,7 +337,7 @@ class EmulatedHead(SerialDevice):
             return
         head = self.head
         speed = math.radians(self.habits.go_speed)
-        goal = float(np.clip(self._sign * pelco_d.decode_tilt(value), *head.limits))
+        goal = float(np.clip(pelco_d.decode_tilt(value), *head.limits))
         self.absolute_until = at + abs(goal - float(head.motor(at))) / speed
         head.go(at, goal, speed)
 
@@ -391,6 +368,6 @@ class EmulatedHead(SerialDevice):
             return
         value = 0
         if opcode == QUERY_TILT:
-            value = pelco_d.encode_tilt(self._sign * self.head.measured(at))
+            value = pelco_d.encode_tilt(self.head.measured(at))
         reply = encode_extended(self.habits.address, ANSWERS[opcode], value)
         self.reply(reply, at + TURN_AROUND_S)

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lrfcal_lib.drivers.lms2xx_link import BURST, FASTEST, PARTIAL
+from lrfcal_lib.drivers.lms2xx_link import FASTEST
+from lrfcal_lib.drivers.lms2xx_scans import BURST, PARTIAL
 from lrfcal_lib.drivers.port import REAL, Host
 from lrfcal_lib.emulators.line import SerialDevice
 from lrfcal_lib.model.kinematics import MIRROR_TURN
