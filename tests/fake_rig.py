@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import reduce
 from types import SimpleNamespace
 
 import numpy as np
@@ -186,6 +187,17 @@ def rig_data(cameras=("left",), **plan):
         },
         "plan": {"pitch_deg": [-4, 4, 1], "image_pitch_deg": [0], "count": 3, **plan},
     }
+
+
+def changed(path, value, **plan):
+    """A rig file with one key changed (or removed, where the value is None)."""
+    data = rig_data(**plan)
+    *way, last = path.split(".")
+    at = reduce(dict.__getitem__, way, data)
+    at[last] = value
+    if value is None:
+        del at[last]
+    return data
 
 
 def make_rig(data=None, *, feedback=True, silent_moving=False):

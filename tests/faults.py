@@ -10,7 +10,8 @@ import numpy as np
 from lrfcal_lib.drivers import pelco_d
 from lrfcal_lib.drivers.pelco_d import SYNC, encode_extended
 from lrfcal_lib.emulators.head import ANSWERS, TURN_AROUND_S, EmulatedHead
-from lrfcal_lib.emulators.lms2xx import ACK, BAUD_WORD, RESET_S, EmulatedLms
+from lrfcal_lib.emulators.lms2xx import ACK, RESET_S, EmulatedLms
+from lrfcal_lib.emulators.lms2xx_memory import BAUD_WORD
 from lrfcal_lib.session import lms2xx_codec as codec
 
 DELAY_S, AWAY_S, SLIP_S, JUMP = 0.7, 0.5, 0.3, 1000  # JUMP in hundredths of a degree

@@ -67,8 +67,8 @@ class LMS2xx(Closed):
 
     Attributes
     ----------
-    type, firmware : str
-        Model and order number; version.
+    type : str
+        Model and order number.
     status : DeviceStatus
         As read last.
     configuration : Configuration
@@ -167,7 +167,7 @@ class LMS2xx(Closed):
         )
         self._clock = ScanClock()
         self._link.deadline = deadline
-        self._link.find([first, *(rate for rate in RATES if rate != first)], end - host.now())
+        self._link.find([first, *RATES], end - host.now())
         self._link.hush()
         self._read_status()
         self._link.senders = {0x80, 0x80 | self.status.address}
@@ -176,10 +176,7 @@ class LMS2xx(Closed):
             remedy = "name the port of the LMS2xx"
             raise WrongDevice(f"{self.port}: '{model}' answers, not an LMS2xx: {remedy}")
         self.type = "-".join([model, *rest[:1]])
-        self.firmware = self.status.firmware
         self._read_configuration()
-        told = (self.port, self.type, self.firmware, self.baudrate, *self.variant)
-        LOG.info("%s: %s %s at %d Bd, %g deg in steps of %g deg", *told)
 
     def _prepare(self, interlaced=False):
         """Expect scans as the device is set now; these settings are those to come back to."""
@@ -289,8 +286,7 @@ class LMS2xx(Closed):
         try:
             link.ask(wire.TYPE)
         except (NoReply, Refused) as error:
-            others = [other for other in RATES if other not in (before, rate)]
-            link.find([before, *others, rate], FIND_S)
+            link.find([before, *RATES], FIND_S)
             need = "a shorter cable"
             if rate == wire.FASTEST:
                 need = "RS-422 (a jumper in the plug of the device)"
@@ -299,11 +295,11 @@ class LMS2xx(Closed):
                 f"{self.baudrate} Bd now"
             ) from error
 
-    def _mode(self, data, what, sign=None):
+    def _mode(self, data, what):
         """Change the operating mode; replies A0 other than 00 are refusals."""
-        reply = self._opened().ask(wire.MODE, data, sign=sign)
-        if reply.code != sign and reply.raw[5]:
-            raise Refused(f"{self.port}: the device declines {what} (A0 {reply.raw[5]:02X})")
+        result = self._opened().ask(wire.MODE, data).raw[5]
+        if result:
+            raise Refused(f"{self.port}: the device declines {what} (A0 {result:02X})")
 
     def set_variant(self, fov_deg: float, resolution_deg: float) -> bool:
         """Set field of view and resolution.
@@ -487,7 +483,7 @@ class LMS2xx(Closed):
         data = STREAM
         if self._interlaced:
             data = INTERLACED
-        self._mode(data, "to stream", sign=SCAN)
+        self._mode(data, "to stream")
 
     def _run(self):
         """Read until the stream is to stop; whatever goes wrong with the line, find the device

@@ -212,9 +212,7 @@ class Link:
     # ----------------------------------------------------------------------------------------------
     # requests
 
-    def ask(
-        self, code: int, data: bytes = b"", *, limit_s: float = math.inf, sign: int | None = None
-    ) -> Arrival:
+    def ask(self, code: int, data: bytes = b"", *, limit_s: float = math.inf) -> Arrival:
         """Send a request until its reply comes.
 
         Parameters
@@ -223,8 +221,6 @@ class Link:
             Of the request.
         limit_s
             Seconds that it may take, beside what the manual allows this request.
-        sign
-            A reply of this code, too, shows that the request was obeyed; it stays to be received.
 
         Raises
         ------
@@ -241,7 +237,7 @@ class Link:
         refusal = None
         for _ in range(TRIES):
             self.send(code, data)
-            reply, refusal = self._await(code | 0x80, sign, again_s, end)
+            reply, refusal = self._await(code | 0x80, again_s, end)
             if reply is not None:
                 return reply
             if self.host.now() > end - NAK_PAUSE_S:
@@ -254,7 +250,7 @@ class Link:
             f"{self.path}: no reply to command {code:02X} at {self.baudrate} Bd; is the device on?"
         )
 
-    def _await(self, code, sign, again_s, end):
+    def _await(self, code, again_s, end):
         """The reply, or None and why the device declined (None: it is time to ask again)."""
         begin = self.host.now()
         patience = NO_ACK_S
@@ -263,9 +259,6 @@ class Link:
             for at, arrival in enumerate(arrivals):
                 if arrival.code == code:
                     self._kept = arrivals[at + 1 :]
-                    return arrival, None
-                if arrival.code == sign:
-                    self._kept = arrivals[at:]
                     return arrival, None
                 if arrival.code == NOT_UNDERSTOOD:
                     return None, "not allowed in its present mode, or unknown (92)"
@@ -300,13 +293,13 @@ class Link:
         """
         end = self.host.now() + limit_s
         heard = self.heard
-        windows = itertools.cycle(WINDOWS_S)
-        while self.host.now() < end:
-            window = next(windows)
-            for rate in rates:
+        for window in itertools.cycle(WINDOWS_S):
+            if self.host.now() >= end:
+                break
+            for rate in dict.fromkeys(rates):
                 if self._answers(rate, window, end):
                     return
-        tried = f"{', '.join(map(str, rates))} Bd, address {self.address}"
+        tried = f"{', '.join(map(str, dict.fromkeys(rates)))} Bd, address {self.address}"
         if self.address == 0:
             tried += " (any)"
         if self.heard > heard:
