@@ -17,9 +17,9 @@ from lrfcal_lib.calibrate.reconstruct import GREY, reconstruct
 from lrfcal_lib.evaluate.export import write_pcd
 from lrfcal_lib.evaluate.scenes import flatness, largest_plane
 from lrfcal_lib.model.camera import CameraModel, fold, project
-from lrfcal_lib.model.kinematics import AS_RECORDED
+from lrfcal_lib.model.kinematics import AS_RECORDED, MIRROR_TURN
 from lrfcal_lib.session.read import Sweep, open_session
-from lrfcal_lib.session.stated import MIRROR_TURN, LrfInfo
+from lrfcal_lib.session.stated import LrfInfo
 from lrfcal_lib.simulate import beam
 from lrfcal_lib.simulate.record import placements_of, stops_of, world_of
 from lrfcal_lib.simulate.rig import load_setup

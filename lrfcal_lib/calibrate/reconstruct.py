@@ -13,9 +13,9 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.model.kinematics import Corrections
+from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
-from lrfcal_lib.session.stated import MIRROR_TURN, LrfInfo
+from lrfcal_lib.session.stated import LrfInfo
 
 GREY = 128  # colour of points that no camera sees
 BLOCK = 1 << 18  # points worked on at once

@@ -227,7 +227,6 @@ SYSTEMATIC_ERROR = {
 # centimetres: so many standard deviations or steps of a range; the sheets above admit 2 to 4.2, and
 # 4 to 5 steps of a centimetre
 ASSUMED_SYSTEMATIC_ERROR = 5.0
-MIRROR_TURN = 1 / 75.08  # s, of an LMS2xx: 148 us for a ninetieth of a turn on a real device
 ASSUMED_SPOT_RADIUS = 0.005  # metres; only the unit of the edge bias where nobody stated the spot
 
 
