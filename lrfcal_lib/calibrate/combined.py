@@ -19,7 +19,7 @@ from lrfcal_lib.calibrate.outline import (
 )
 from lrfcal_lib.calibrate.pipeline import JointCalibration
 from lrfcal_lib.calibrate.recorded import in_platform, named_sides
-from lrfcal_lib.fit.least_squares import Block, linearise, minimise, whiten
+from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
@@ -140,7 +140,9 @@ def combined_outlines(
                 continue
             states[placement] = state
             if case.images:
-                r, J = whiten(sight_block(state, case, scale))
+                block = sight_block(state, case, scale)
+                r = block.white
+                J = block.white_jacobian
                 square += np.sum(r**2)
                 freedom += np.sum(1 - np.vecdot(J @ covariance, J))
         cases = {placement: cases[placement] for placement in measured}

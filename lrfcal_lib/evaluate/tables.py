@@ -10,7 +10,7 @@ import pandas as pd
 
 from lrfcal_lib.calibrate.cameras import PlatformCalibration
 from lrfcal_lib.calibrate.pipeline import JointCalibration
-from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors
+from lrfcal_lib.evaluate.truth import Truth, axis_errors, camera_errors, sigmas
 from lrfcal_lib.fit.residuals import edge_residuals_px, plane_residuals_m
 from lrfcal_lib.fit.result import AXIS_NAMES, Solution
 from lrfcal_lib.model import geometry
@@ -162,8 +162,8 @@ def method_comparison(
     -------
     DataFrame
         camera, method, n_placements, edge_median_px, edge_rms_px, plane_rms_mm,
-        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also rotation_error_deg,
-        translation_error_mm.
+        left_out_edge_rms_px, left_out_plane_rms_mm; with truth also the columns of
+        :func:`lrfcal_lib.evaluate.truth.camera_errors`.
     """
     rows = []
     for (camera, name), solution in solutions.items():
@@ -239,9 +239,10 @@ def platform_calibration_table(
     -------
     DataFrame
         Columns method, parameter, unit, value, sigma; with truth also axis_direction_error_deg and
-        axis_offset_error_mm of the method. The four numbers of the axis are its angles out of and
-        within the scan plane and its offsets within and across it; phi and t_y are the same axis in
-        the paper's chart.
+        axis_offset_error_mm of the method, and both over their standard deviations
+        (axis_direction_pull, axis_offset_pull). The four numbers of the axis are its angles out of
+        and within the scan plane and its offsets within and across it; phi and t_y are the same
+        axis in the paper's chart.
     """
     names = (*AXIS_NAMES, "phi_x", "phi_y", "phi_z", "t_y")
     parameters = {}
@@ -251,8 +252,14 @@ def platform_calibration_table(
         parameters[method,] = names, [*axis.parameters, *phi, ty], sigma
     table = _parameter_table(["method"], parameters)
     if truth is not None:
-        errors = {name: axis_errors(axis.T_head_lrf, truth) for name, axis in platform.axes.items()}
+        errors = {}
+        for method, axis in platform.axes.items():
+            direction, offset = axis_errors(axis.T_head_lrf, truth)
+            direction_sigma, offset_sigma = sigmas(axis.covariance)
+            pulls = np.radians(direction) / direction_sigma, offset / (1000 * offset_sigma)
+            errors[method] = direction, offset, *pulls
         columns = ["axis_direction_error_deg", "axis_offset_error_mm"]
+        columns += ["axis_direction_pull", "axis_offset_pull"]
         table[columns] = [errors[method] for method in table.method]
     return table
 

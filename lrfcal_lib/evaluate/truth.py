@@ -87,7 +87,7 @@ def _pose(stated):
 
 
 def camera_errors(solution: Solution, truth: Truth | None, camera: str) -> dict[str, float]:
-    """Errors of a camera.
+    """Errors of a camera's pose against the truth.
 
     Parameters
     ----------
@@ -99,12 +99,35 @@ def camera_errors(solution: Solution, truth: Truth | None, camera: str) -> dict[
     Returns
     -------
     dict of str to float
-        ``rotation_error_deg`` and ``translation_error_mm``; nothing without truth.
+        By column: rotation_error_deg, translation_error_mm, and both over their standard
+        deviations: rotation_pull, translation_pull. A pull of 1 is what a standard deviation
+        promises. Nothing without truth.
     """
     if truth is None:
         return {}
     angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
-    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+    turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
+    return {
+        "rotation_error_deg": np.rad2deg(angle),
+        "translation_error_mm": 1000 * distance,
+        "rotation_pull": angle / turn_sigma,
+        "translation_pull": distance / shift_sigma,
+    }
+
+
+def sigmas(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations of the length of a turn (radians) and of a shift (metres).
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (2 k, 2 k)
+        Of turns, then shifts.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+    """
+    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
 
 
 def axis_errors(T_head_lrf: RigidTransform, truth: Truth) -> tuple[float, float]:

@@ -41,7 +41,7 @@ from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import LEAVES_OUT, ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.planes import rival_words
+from lrfcal_lib.solvers.plane_start import rival_words
 
 YES = "yes"
 CARE = "with care"
