@@ -472,7 +472,7 @@ def test_the_order_of_corners_follows_the_outline():
         for start in pattern_orders(PATTERN):
             orders = exact[start][pattern_orders(PATTERN)]
             poses = RigidTransform.concatenate([first_pose(PATTERN.points(), pixels, MODEL) for pixels in orders])
-            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, orders, poses))], exact)
+            np.testing.assert_array_equal(orders[np.argmax(order_scores(picture, SHEET, MODEL, poses))], exact)
 
 
 def test_line_covariance_tells_the_error_over_noise():

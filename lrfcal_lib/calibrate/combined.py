@@ -23,9 +23,9 @@ from lrfcal_lib.fit.least_squares import Block, linearise, minimise
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import CameraModel
 from lrfcal_lib.model.geometry import DegenerateGeometry
-from lrfcal_lib.preprocess.board_in_image import line_misses
 from lrfcal_lib.preprocess.board_in_scan import face_points
 from lrfcal_lib.preprocess.edges_in_image import ImageEdge
+from lrfcal_lib.preprocess.pose_from_lines import line_misses
 from lrfcal_lib.solvers import joint_model, joint_residuals
 
 FEWEST_CELLS = 8  # beams about a side that no image shows

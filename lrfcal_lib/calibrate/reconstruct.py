@@ -13,8 +13,7 @@ from lrfcal_lib.calibrate.cloud import Cloud
 from lrfcal_lib.calibrate.mixed import mixed
 from lrfcal_lib.calibrate.painting import Painter, View
 from lrfcal_lib.model.geometry import lrf_to_platform, polar_to_points
-from lrfcal_lib.model.kinematics import Corrections
-from lrfcal_lib.session.lms2xx_codec import MIRROR_TURN
+from lrfcal_lib.model.kinematics import MIRROR_TURN, Corrections
 from lrfcal_lib.session.read import Sweep
 from lrfcal_lib.session.stated import LrfInfo
 

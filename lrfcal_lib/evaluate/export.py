@@ -7,8 +7,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from lrfcal_lib import __version__
-from lrfcal_lib.calibrate.cloud import write_ply
+from lrfcal_lib.calibrate.cloud import COLUMNS, point_type, write_ply
 from lrfcal_lib.calibrate.clouds import cloud_blocks
 from lrfcal_lib.calibrate.pipeline import Calibration
 from lrfcal_lib.evaluate.joint_tables import joint_fit
@@ -29,6 +31,13 @@ AXIS_PARAMETERS = [
     "offset_across_scan_plane_m",
 ]
 LENS_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # as OpenCV calls them
+# of a PCD file, as its readers call them
+PCD_COLUMNS = COLUMNS | {
+    "normals": ("<f4", "normal_x normal_y normal_z"),
+    "colors": ("<u4", "rgb"),
+}
+RGB = np.array([[1 << 16], [1 << 8], [1]], "<u4")  # red, green and blue in one number
+POINTS_AT_ONCE = 1_000_000  # that are copied, 60 MB
 FRAMES = (
     "destination first: p_camera = T_camera_source p_source; metres, radians; "
     "covariances of [w, v]: R <- exp(w) R, t <- t + v"
@@ -220,13 +229,41 @@ def _write_cloud(folder, calibration, method, scene):
 
 
 def write_pcd(path, ply):
-    """Write what a PLY of :func:`write_ply` holds as PCD.
+    """Write what a PLY of :func:`write_ply` holds as binary PCD.
 
     ValueError if the file cannot be written.
     """
-    import open3d as o3d
+    stored = point_type(COLUMNS)
+    with open(ply, "rb") as source, whole(path) as draft, open(draft, "wb") as file:
+        while source.readline() != b"end_header\n":
+            pass
+        count = (os.path.getsize(ply) - source.tell()) // stored.itemsize
+        file.write(_pcd_header(count).encode())
+        for start in range(0, count, POINTS_AT_ONCE):
+            points = np.fromfile(source, stored, min(POINTS_AT_ONCE, count - start))
+            packed = np.empty(len(points), point_type(PCD_COLUMNS))
+            for field in COLUMNS:
+                packed[field] = points[field] @ RGB if field == "colors" else points[field]
+            file.write(packed.tobytes())
 
-    cloud = o3d.t.io.read_point_cloud(str(ply))
-    with whole(path) as draft:
-        if not o3d.t.io.write_point_cloud(str(draft), cloud):
-            raise OSError("is the disk full?")
+
+def _pcd_header(count):
+    """The lines before the points of a PCD file."""
+    names = []
+    types = []
+    for kind, columns in PCD_COLUMNS.values():
+        names += columns.split()
+        types += [np.dtype(kind)] * len(columns.split())
+    lines = (
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in types)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary\n",
+    )
+    return "\n".join(lines)

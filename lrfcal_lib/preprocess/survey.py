@@ -518,8 +518,7 @@ def _by_outline(shots, orders, read, board, models):
     def score(number):
         shot = shots[number]
         model = models[shot.record.camera]
-        corners = orders.corners[number]
-        return order_scores(shot.image(read), board, model, corners, orders.poses[number])
+        return order_scores(shot.image(read), board, model, orders.poses[number])
 
     return decide(np.array(spread(score, range(len(shots)))), orders.leader)
 
