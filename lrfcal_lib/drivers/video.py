@@ -50,7 +50,7 @@ class Frame:
 
 
 class Camera(Closed):
-    """A camera, set to what is asked for; what could not be set is logged. A context manager.
+    """A camera, set to what is asked for; a context manager.
 
     A live source (V4L2 device, URL) is grabbed by a thread that keeps the newest frame only, and
     that looks for the source again when it is lost. A recorded one (video file, images) gives its
@@ -64,9 +64,9 @@ class Camera(Closed):
     name
         For messages.
     size
-        Width and height, pixels; by default as it is.
+        Width and height, pixels; by default as it is. The attribute tells whether it was obeyed.
     exposure
-        Seconds; by default the camera's automatic exposure is left alone.
+        Seconds; by default the camera's automatic exposure is left alone. Another one is logged.
     silence_s
         A stream that sends nothing for so long is taken for lost and opened again.
 
@@ -106,7 +106,7 @@ class Camera(Closed):
         self._quit = threading.Event()
         self._wanted = self._properties(size, exposure)
         self._open()
-        self._compare(size, exposure)
+        self._read_back(exposure)
         self._thread = None
         if self._remedy:
             self._thread = threading.Thread(target=self._grab, name=f"camera {name}", daemon=True)
@@ -182,17 +182,13 @@ class Camera(Closed):
         self._before = REAL.time()
         self._taken = {key for key, value in self._wanted.items() if self._capture.set(key, value)}
 
-    def _compare(self, size, exposure):
-        """Read back what was asked for, and say what is different."""
+    def _read_back(self, exposure):
+        """The size that it gives; an exposure that is not as asked for is logged."""
         capture = self._capture
         given = (int(capture.get(WIDTH)), int(capture.get(HEIGHT)))
         self.size = None
         if all(given):
             self.size = given
-        if size is not None and self.size is None:
-            LOG.warning("camera %s: size cannot be set, asked %s", self.name, tuple(size))
-        elif size is not None and self.size != tuple(size):
-            LOG.warning("camera %s: size is %s, asked %s", self.name, self.size, tuple(size))
         if exposure is None:
             return
         got = 0.0
