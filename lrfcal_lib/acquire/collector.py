@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lrfcal_lib.acquire.checks import Light
-from lrfcal_lib.acquire.record import Recording, RecordingError
+from lrfcal_lib.acquire.record import Recording, RecordingError, Sweeping
 from lrfcal_lib.calibrate.pipeline import (
     Calibration,
     calibrate,
@@ -432,10 +432,13 @@ class Collector(Closed):
 
     def _record(self, placement, progress):
         """Record a placement; Interrupted if the user stops it."""
+        sweeping = Sweeping()
         with contextlib.closing(self.recording.run(placement)) as events:
             try:
                 for event in events:
-                    self._note(event, progress)
+                    self._note(event)
+                    sweeping.note(event)
+                    progress(sweeping.share, f"{sweeping.stop}{sweeping.counts()}")
                     if self.stopped.is_set():
                         raise DeviceError("stopped")
             except DeviceError as error:
@@ -444,21 +447,18 @@ class Collector(Closed):
                 words = f"placement {placement.number} does not count, record it again"
                 raise Interrupted(f"stopped: {words}") from error
 
-    def _note(self, event, progress):
+    def _note(self, event):
         """Put an event into the view."""
         view = self.view
         if isinstance(event, Moved):
             view.pitch = event.pitch
             view.measured = event.measured
-            progress((event.number - 1) / event.of, f"stop {event.number} of {event.of}")
         elif isinstance(event, Scanned):
             for reading, pitch in zip(event.readings, event.pitch.tolist(), strict=True):
                 view.rows[pitch] = reading.ranges
             view.ranges = reading.ranges
             view.bearings = reading.bearings
             view.pitch = pitch
-            if np.isfinite(event.share):
-                progress(event.share, f"{100 * event.share:.0f} % of the sweep")
         elif isinstance(event, Photographed):
             view.frames[event.camera] = event.frame
 
