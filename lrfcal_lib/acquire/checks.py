@@ -216,9 +216,9 @@ def check_image(
         return Light(name, "bad", text)
     scale = math.ceil(LEAST_SQUARE_PX / np.linalg.norm(corners[1] - corners[0]))
     large = cv2.resize(grey(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-    there = (scale * corners + (scale - 1) / 2).astype(np.float32)
+    enlarged = (scale * corners + (scale - 1) / 2).astype(np.float32)
     size = (pattern.columns, pattern.rows)
-    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, there)
+    (rise, dark, white, _), _ = cv2.estimateChessboardSharpness(large, size, enlarged)
     rise /= scale
     faults = []
     if rise > BLURRED_PX:

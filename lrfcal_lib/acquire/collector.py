@@ -263,7 +263,7 @@ class Collector(Closed):
             If the session states another rig, or cannot be written.
         """
         self.close()
-        with self._own(), contextlib.ExitStack() as stack:
+        with self._exclusively(), contextlib.ExitStack() as stack:
             opened = stack.enter_context(Rig.open(_stated(rig, stack)))
             recording = stack.enter_context(Recording(opened, Path(session), resume=True))
             self.rig = opened
@@ -287,7 +287,7 @@ class Collector(Closed):
         if rig is None or recording is None:
             return
         self.stop()
-        with self._own():
+        with self._exclusively():
             self.rig = None
             self.recording = None
             with self._closing:
@@ -296,7 +296,7 @@ class Collector(Closed):
                     recording.finish()
 
     @contextlib.contextmanager
-    def _own(self):
+    def _exclusively(self):
         """The devices for oneself."""
         if not self._devices.acquire(timeout=WAIT_S):
             raise Busy("the rig is busy: wait until it is done, or press stop")
@@ -332,7 +332,7 @@ class Collector(Closed):
             If something else is under way.
         """
         rig, _ = self._needed()
-        with self._own():
+        with self._exclusively():
             self.stopped.clear()
             self.view.pitch = rig.head.move_to(pitch)
             self.view.measured = rig.head.has_feedback
@@ -411,7 +411,7 @@ class Collector(Closed):
         if task is None:
             remedy = "calibrate, or connect with another session"
             raise RecordingError(f"the plan of this rig is done: {remedy}")
-        with self._own():
+        with self._exclusively():
             self.stopped.clear()
             placement = task.placement
             if placement is None:
@@ -478,7 +478,7 @@ class Collector(Closed):
         if not self.finished:
             remedy = "press capture to record one"
             raise RecordingError(f"there is no placement to record again: {remedy}")
-        with self._own():
+        with self._exclusively():
             number = next(reversed(self.lights), self.finished[-1])
             recording.drop(number)
             self.lights.pop(number, None)

@@ -396,14 +396,14 @@ class Panel(Closed):
         try:
             yield
         except Exception as error:
-            said = str(error)
+            words = str(error)
             heading = f"{text} failed"
             if isinstance(error, Interrupted):
                 heading = "stopped"
             elif not isinstance(error, EXPECTED):
-                said = f"{type(error).__name__}: {error}"
+                words = f"{type(error).__name__}: {error}"
                 LOG.exception("the panel failed while %s", text)
-            parts.error.value = HTML.error(heading, said)
+            parts.error.value = HTML.error(heading, words)
             raise
         finally:
             self._show_progress(0.0, heading)
@@ -465,8 +465,8 @@ class Panel(Closed):
         if sweep is not None:
             rows = dict(view.rows)  # a copy: the recording goes on
             picture = sweep_picture(rows, view.bearings, *sweep)
-            said = f"{len(rows)} scan lines; near is bright, white is no range"
-            pictures["sweep"].show(png(picture), said)
+            words = f"{len(rows)} scan lines; near is bright, white is no range"
+            pictures["sweep"].show(png(picture), words)
         for name, frame in dict(view.frames).items():
             height, width = frame.image.shape[:2]
             picture = jpeg(frame.image, WIDTH)

@@ -191,13 +191,13 @@ class Camera(Closed):
             self.size = given
         if exposure is None:
             return
-        got = 0.0
+        given_s = 0.0
         if cv2.CAP_PROP_EXPOSURE in self._taken:
-            got = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
-        if got <= 0:
+            given_s = capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if given_s <= 0:
             LOG.warning("camera %s: exposure cannot be set, asked %s", self.name, exposure)
-        elif abs(got - exposure) > SAME_EXPOSURE * exposure:
-            LOG.warning("camera %s: exposure is %s, asked %s", self.name, got, exposure)
+        elif abs(given_s - exposure) > SAME_EXPOSURE * exposure:
+            LOG.warning("camera %s: exposure is %s, asked %s", self.name, given_s, exposure)
 
     # ---------------------------------------------------------------------------------------------
     # grabbing
@@ -300,11 +300,11 @@ def open_source(path: str, silence_s: float):
         return _open_stream(path, silence_s)
     if path.startswith("/dev/"):
         return _open_device(path)
-    there = os.path.exists(path)
-    pattern = glob.has_magic(path) and not there
+    exists = os.path.exists(path)
+    pattern = glob.has_magic(path) and not exists
     if os.path.isdir(path) or pattern or Path(path).suffix.lower() in IMAGES:
         return Files(path)
-    if not there:
+    if not exists:
         remedy = "name a file, a device, a folder of images or a URL"
         raise PortError(f"there is no video {path}: {remedy}")
     return _opened(f"{path} is no video that OpenCV can read", path)

@@ -326,7 +326,7 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
     try:
         with stream:
             stream.write(text)
-        ours = file.stat()
+        written = file.stat()
     except OSError as error:
         file.unlink()
         raise ValueError(
@@ -336,7 +336,7 @@ def written_rig_file(rig: EmulatedRig, file: Path) -> Iterator[None]:
         yield
     finally:
         with contextlib.suppress(OSError):  # somebody removed it
-            if os.path.samestat(file.lstat(), ours) and file.read_bytes() == text.encode():
+            if os.path.samestat(file.lstat(), written) and file.read_bytes() == text.encode():
                 file.unlink()
             else:
                 print(f"{file}: was changed, so it stays; its devices are gone", flush=True)
