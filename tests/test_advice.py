@@ -11,6 +11,7 @@ from lrfcal_lib.judge import next_placement
 from lrfcal_lib.judge.verdict import diagnose, verdict
 from lrfcal_lib.model.geometry import DegenerateGeometry
 from lrfcal_lib.model.observations import JointObservations
+from lrfcal_lib.model.problem import Problem, ProblemKind, Stage
 from lrfcal_lib.simulate.draw import CORNERS, bench, board_poses, observe
 from lrfcal_lib.solvers.joint import solve_joint
 
@@ -145,7 +146,7 @@ def test_misfit_model_error_and_noise_are_named(good):
     solution = good[2]
     inner = replace(solution.solution, covariance_placements=25 * solution.solution.covariance, converged=False)
     bad = replace(
-        solution, misfit=solution.misfit | {3: 30.0}, excluded={9: "placement 9: left out"}, solution=inner,
+        solution, misfit=solution.misfit | {3: 30.0}, excluded=(Problem(Stage.JOINT, ProblemKind.CONTRADICTS, "left out", 9),), solution=inner,
         warnings=("not converged after 60 iterations", "the data ask for the scale of the pitch"),
         noise=solution.noise | {"face_scale": 2.6},
     )  # fmt: skip

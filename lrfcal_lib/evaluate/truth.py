@@ -1,13 +1,14 @@
 """What a simulated session was made with, and the errors of calibrations against it."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.board import Board
+from lrfcal_lib.model.observations import PlatformObservations
 from lrfcal_lib.session.stated import TransformStated, board_from_json, from_json, naming, read_json
 
 
@@ -56,14 +57,32 @@ def _pose(stated):
 
 
 def camera_errors(solution, truth, camera):
-    """Rotation (degrees) and translation error (millimetres) of a camera, by column.
+    """Errors of a camera's pose against the truth, by column; empty without truth.
 
-    None without truth.
+    Columns rotation_error_deg, translation_error_mm, and both over their standard deviations:
+    rotation_pull, translation_pull. A pull of 1 is what a standard deviation promises.
     """
     if truth is None:
         return {}
     angle, distance = geometry.transform_difference(solution.transform, truth.cameras[camera])
-    return {"rotation_error_deg": np.rad2deg(angle), "translation_error_mm": 1000 * distance}
+    turn_sigma, shift_sigma = sigmas(solution.trusted[:6, :6])
+    return {
+        "rotation_error_deg": np.rad2deg(angle),
+        "translation_error_mm": 1000 * distance,
+        "rotation_pull": angle / turn_sigma,
+        "translation_pull": distance / shift_sigma,
+    }
+
+
+def sigmas(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations of the length of a turn (radians) and of a shift (metres).
+
+    Parameters
+    ----------
+    covariance : shape (2 k, 2 k)
+        Of turns, then shifts.
+    """
+    return np.sqrt(np.diag(covariance).reshape(2, -1).sum(axis=1))
 
 
 def axis_errors(T_head_lrf, truth):
@@ -71,3 +90,26 @@ def axis_errors(T_head_lrf, truth):
     true = geometry.axis_of(truth.T_head_lrf)
     angle, offset = geometry.axis_difference(geometry.axis_of(T_head_lrf), true)
     return np.rad2deg(angle), 1000 * offset
+
+
+def on_true_edges(observations: PlatformObservations, truth: Truth) -> PlatformObservations:
+    """The same observations, the points of each side moved onto the board's true edge.
+
+    With these points the edges are straight about the true axis at the recorded pitch: what an
+    estimate is off then is no error of edge points or pitch.
+    """
+    lines = truth.board.lines()
+    points = observations.edge_points.copy()
+    sides = np.column_stack([observations.edge_placement, observations.edge_number])
+    for placement, number in np.unique(sides, axis=0):
+        rows = (sides == (placement, number)).all(axis=1)
+        pitch = observations.edge_pitch[rows]
+        board = truth.boards[placement]
+        moved = geometry.lrf_to_platform(points[rows], pitch, truth.T_head_lrf)
+        flat = board.inv().apply(moved)[:, :2]
+        away = flat @ lines[:, :2].T + lines[:, 2]
+        edge = np.median(np.abs(away), axis=0).argmin()
+        flat = flat - away[:, [edge]] * lines[edge, :2]
+        on_edge = board.apply(np.column_stack([flat, np.zeros(len(flat))]))
+        points[rows] = truth.T_head_lrf.inv().apply(geometry.tilt(on_edge, -pitch))
+    return replace(observations, edge_points=points)

@@ -11,7 +11,8 @@ from lrfcal_lib.fit.result import AXIS_NAMES
 from lrfcal_lib.judge.uncertainty import beams_to, marginal
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.camera import project, project_jacobians
-from lrfcal_lib.solvers.joint import UNSEEN, WORDS
+from lrfcal_lib.solvers.joint import UNSEEN
+from lrfcal_lib.solvers.joint_solution import WORDS
 
 LEANS = {"": (0, 0), "back": (-1, 0), "forward": (1, 0), "left": (0, -1), "right": (0, 1)}
 PLACES = {

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.special import fdtri
 
-from lrfcal_lib.calibrate.observe import observe_joint
-from lrfcal_lib.calibrate.outline import platform_of
+from lrfcal_lib.calibrate.observe_joint import observe_joint
 from lrfcal_lib.calibrate.pipeline import Calibration, joint_settings
+from lrfcal_lib.calibrate.recorded import platform_of
 from lrfcal_lib.fit.residuals import plane_residuals_m
 from lrfcal_lib.judge.camera_changes import LEVER, NOISY, camera_changes, large_changes
 from lrfcal_lib.model.geometry import DegenerateGeometry, lrf_to_source, transform_difference
@@ -409,7 +409,7 @@ def exchanged_placements(calibration):
     lost = [
         p
         for p in session.board_placements
-        if p in prepared.left_out or p in joint.solution.excluded
+        if p in prepared.left_out or p in joint.solution.excluded_placements
     ]
     scans = {}
     for placement in lost[:MOST_LOST]:

@@ -18,6 +18,7 @@ from lrfcal_lib.judge.alternatives import (
     far_from_stated,
     not_an_offset,
     places_of_cameras,
+    step_not_told,
 )
 from lrfcal_lib.judge.diagnosis import OTHER_SIZE, lens_words
 from lrfcal_lib.judge.next_placement import (
@@ -41,7 +42,7 @@ from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import LEAVES_OUT, ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import solve_joint
-from lrfcal_lib.solvers.planes import rival_words
+from lrfcal_lib.solvers.plane_start import rival_words
 
 YES = "yes"
 CARE = "with care"
@@ -93,8 +94,6 @@ REGIONS = [
     for both in product(("top", "", "bottom"), ("left", "", "right"))
 ]
 NOT_WEIGHED = "whether session.json states sizes, step and spot rightly could not be weighed"
-# warnings of the solver that are findings of their own
-SAID = ("not converged", "the data do not determine")
 
 NO_BOUND = {"mm": 1e4, "px": 1e4}  # ten metres; more pixels than an image has
 
@@ -355,6 +354,9 @@ def judge(calibration, method=None, **options):
         *places,
         words,
     )
+    if method == "joint" and not sizes:
+        words = step_not_told(joint.solution, prepared.session.lrf.admitted_offset)
+        notes += (words,) if words else ()
     if method == "joint" and FEWEST <= (n := len(joint.solution.boards)) < MANY:
         known = 100 / np.sqrt(2 * (n - 1))
         within = stdtrit(n - 1, 0.95)
@@ -563,7 +565,7 @@ def _left_out(calibration, method):
     used = set(table.index[table.used]) - set(prepared.left_out)
     if method == "joint":
         used = set(calibration.joint.solution.boards)
-        excluded = calibration.joint.solution.excluded
+        excluded = calibration.joint.solution.excluded_placements
     lost = [p for p in table.index if p not in used]
     reasons = []
     for camera, views in prepared.views.items():
@@ -623,7 +625,7 @@ def diagnose(solution):
         (len(np.unique(obs.view_placement[obs.view_camera == i])), c)
         for i, c in enumerate(obs.cameras)
     ]
-    own = [words for words in solution.warnings if not words.startswith(SAID)]
+    own = solution.warnings
     findings = [
         (
             not solution.converged,
@@ -755,7 +757,7 @@ def _of_residuals(solution):
     share = solution.noise["face_share"]
     return [
         (misfits, CARE, "misfit", f"placements fit much worse than the others: {misfits}"),
-        (solution.excluded, CARE, "excluded", "; ".join(solution.excluded.values())),
+        (solution.excluded, CARE, "excluded", "; ".join(map(str, solution.excluded))),
         (
             ratio[worst] > MODEL_ERROR,
             CARE,

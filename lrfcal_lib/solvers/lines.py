@@ -1,34 +1,38 @@
-"""Residuals of cameras from lines (eqs. 16-21), by likelihood, after Wasielewski and Strauss, after
-Bauermann.
-"""
+"""Cameras from lines (equations 16 to 21), after Wasielewski and Strauss, and after Bauermann."""
+
+from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from lrfcal_lib.fit.edge_likelihood import edge_shift, interval_terms
 from lrfcal_lib.fit.least_squares import Block, minimise, minimise_in_rounds, solve
 from lrfcal_lib.fit.residuals import (
-    line_block,
-    read_pose,
     sight_block,
     sight_normals,
 )
+from lrfcal_lib.fit.result import Solution
 from lrfcal_lib.model.camera import pinhole_jacobian
 from lrfcal_lib.model.geometry import (
-    POSE_NAMES,
     DegenerateGeometry,
     apply_pose,
     gradient_by_pose,
-    motion_words,
     move_pose,
     moved_noise,
     noise_correction,
     pose_transform,
     rotate_points,
 )
-from lrfcal_lib.solvers.planes import shifted, start_rotations
+from lrfcal_lib.model.observations import CameraObservations
+from lrfcal_lib.solvers.plane_start import shifted, start_rotations
+from lrfcal_lib.solvers.planes import pose_unknowns
+
+# metres, of a crossing from its plane of sight, for the search of a start value
+START_SIGMA = 0.005
+AHEAD = 0.8  # of the points at least lie before the camera
+AGREEING = 0.75  # of the points tell the best start value; others may be wrong
 
 
-def distance_block(pose, obs):
+def distance_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Distances of crossings from the planes of sight (Wasielewski and Strauss), metres, with the
     noise of both.
 
@@ -52,7 +56,7 @@ def distance_block(pose, obs):
     return Block(plain.residuals, plain.jacobian, 1.0 / np.sqrt(variance), corrected=corrected)
 
 
-def point_block(pose, obs):
+def point_block(pose: np.ndarray, obs: CameraObservations) -> Block:
     """Reprojection errors of named points (Bauermann), pixels; a loss judges u and v of a point
     together.
     """
@@ -84,179 +88,78 @@ def point_block(pose, obs):
     )
 
 
-def estimate_pose(residual, obs, pose, *, method, uses, weighted=True, **options):
-    """The pose (..., 3, 4) of a camera by least squares, from ``residual(pose, obs) -> Block``.
+def estimate_pose(
+    residual,
+    obs: CameraObservations,
+    pose: np.ndarray,
+    *,
+    method: str,
+    uses: str,
+    weighted: bool = True,
+    **options,
+) -> Solution:
+    """The pose of a camera by least squares.
 
-    `uses` is the kind of observations that the residual has rows of. Without weights every residual
-    counts the same: the mean of their propagated variances.
+    Parameters
+    ----------
+    residual : callable
+        ``residual(pose, obs) -> Block``.
+    obs : CameraObservations
+    pose : ndarray, shape (..., 3, 4)
+        Start value of ``T_camera_source``.
+    method, uses : str
+        Its name, and the kind of observations that the residual has rows of.
+    weighted : bool
+        Without weights every residual counts the same: the mean of their propagated variances.
+    **options
+        Of :func:`lrfcal_lib.fit.least_squares.minimise`.
+
+    Returns
+    -------
+    Solution
     """
-
-    def evaluate(pose):
-        return residual(pose, obs)
 
     def equal_weights(pose, _):
         """The residuals with one weight for all, at a pose."""
-        weight = np.mean(evaluate(pose).whitener ** -2.0) ** -0.5
+        weight = np.mean(_variances(residual(pose, obs)), axis=-1, keepdims=True) ** -0.5
 
         def plain(pose):
-            block = evaluate(pose)
-            return Block(block.residuals, block.jacobian, np.full_like(block.residuals, weight))
+            block = residual(pose, obs)
+            weights = np.broadcast_to(weight, block.residuals.shape)
+            return Block(block.residuals, block.jacobian, weights)
 
         return plain
 
-    problem = evaluate
+    problem = partial(residual, obs=obs)
     earlier = []
     if not weighted:
         problem, pose, earlier = minimise_in_rounds(equal_weights, pose, move_pose, 2, **options)
+    placements = obs.group(uses)["placement"]
+    unknowns = pose_unknowns(method, obs.camera)
     return solve(
-        problem,
-        pose,
-        move_pose,
-        names=POSE_NAMES,
-        method=method,
-        read=read_pose,
-        groups=obs.group(uses)["placement"],
-        words=lambda direction: motion_words(direction, obs.camera),
-        earlier=earlier,
-        **options,
+        problem, pose, move_pose, groups=placements, earlier=earlier, **unknowns, **options
     )
 
 
-SOFTNESS = 0.2  # spot radii, start value
-# of a beam step: with a harder flip all places between two beams are alike, and none is the middle
-LEAST_STEP = 0.1
-# of that of a uniform distribution over the interval; keeps steps finite where it is flat
-LEAST_INFORMATION = 0.02
-MOST_ODDS = 6.0  # from there on the edge sits at the rim of the spot
-ROUNDS = 4
-LEAST_HALF = 0.02  # of the half step: an edge along the step would have an interval of no width
-# metres, of a crossing from its plane of sight, for the search of a start value
-START_SIGMA = 0.005
+def _variances(block):
+    """Variance of every residual, from its whitener."""
+    if block.whitener.ndim == block.residuals.ndim:
+        return block.whitener**-2.0
+    return np.sum(np.linalg.inv(block.whitener) ** 2, axis=-1).reshape(block.residuals.shape)
 
 
-def interval_margins(state, obs, sight):
-    """By how much readings flip outside the planes of sight (unit normals `sight`), and the
-    Jacobian, (..., n, 7).
-    """
-    rotated = rotate_points(state[..., :4], obs.crossing_points)
-    outside = np.sum(sight * (rotated + state[..., None, :, 3]), axis=-1)
-    shift, slope = edge_shift(state[..., 0, 4, None], obs.crossing_radius, obs.crossing_background)
-    by_pose = -gradient_by_pose(rotated, np.broadcast_to(sight, rotated.shape))
-    slope = np.broadcast_to(slope, outside.shape)
-    return shift - outside, np.concatenate([by_pose, slope[..., None]], axis=-1)
-
-
-def interval_block(state, obs, sight, half, sigma):
-    """Likelihood that readings flip between two neighbouring beams, `half` (metres) to either side
-    of each crossing.
-
-    The state is a pose with one more column, the sensor's log odds (see
-    :mod:`lrfcal_lib.fit.edge_likelihood`). The distance of a crossing from the plane through the
-    camera's centre and the image line stands for that of the beam from the edge: the same to first
-    order where the camera is near the LRF.
-    """
-    margin, jacobian = interval_margins(state, obs, sight)
-    cost, score, information = interval_terms(margin + half, margin - half, sigma)
-    root = np.sqrt(np.maximum(information, LEAST_INFORMATION / (half**2 / 3 + sigma**2)))
-    return Block(score / root, root[..., None] * jacobian, np.ones_like(root), cost=cost)
-
-
-def move_biased(state, step):
-    """Retraction of a pose with log odds in a fifth column."""
-    own = state[..., 4:].copy()
-    own[..., 0, 0] = np.clip(own[..., 0, 0] + step[..., 6], -MOST_ODDS, MOST_ODDS)
-    return np.concatenate([move_pose(state[..., :4], step), own], axis=-1)
-
-
-def freeze_intervals(state, obs, sight, lengths, softness):
-    """Half widths of the intervals across the planes of sight and standard deviations of where
-    readings flip, metres.
-
-    Of some values of the softness (spot radii) that is taken which makes the intervals most likely.
-    """
-    pose = state[..., :4]
-    half = np.abs(np.vecdot(sight, rotate_points(pose, obs.crossing_half_step)))
-    half = np.maximum(half, LEAST_HALF * np.linalg.norm(obs.crossing_half_step, axis=-1))
-    depth = np.abs(apply_pose(pose, obs.crossing_points)[..., 2])
-    noise = np.vecdot(moved_noise(pose, sight, obs.crossing_noise), sight)
-    noise = noise + (obs.crossing_line_sigma * depth / lengths) ** 2
-    margin, _ = interval_margins(state, obs, sight)
-    soft = np.reshape(softness, (-1,) + (1,) * margin.ndim) * obs.crossing_radius
-    variance = np.maximum(soft, 2 * LEAST_STEP * half) ** 2 + noise
-    costs, _, _ = interval_terms(margin + half, margin - half, np.sqrt(variance))
-    best = np.argmin(np.sum(costs, axis=-1), axis=0)[None, ..., None]
-    return half, np.sqrt(np.take_along_axis(variance, best, axis=0)[0])
-
-
-def estimate_likely(residual, obs, pose, *, method, uses):
-    """The pose of a camera and the sensor's edge bias from the intervals in which the board's edges
-    lie.
-
-    `parameters` end with the sensor's log odds; :func:`edge_bias` makes a length of it. The
-    softness of the flips is estimated too, and held while the covariance is computed. Start value
-    is the estimate from lines.
-    """
-    pose = minimise(lambda pose: line_block(pose, obs), pose, move_pose)[0]
-    sight, lengths = sight_normals(obs.crossing_lines, obs.model)
-
-    def freeze(state, number):
-        softness = SOFTNESS
-        if number > 0:
-            softness = np.geomspace(0.02, 2.0, 25)
-        half, sigma = freeze_intervals(state, obs, sight, lengths, softness)
-        return lambda state: residual(state, obs, sight, half, sigma)
-
-    def read(state):
-        transform, parameters = read_pose(state[..., :4])
-        return transform, np.concatenate([parameters, state[..., :1, 4]], axis=-1)
-
-    def words(direction):
-        if abs(direction[6]) > 0.5:
-            return "the sensor's edge bias"
-        return motion_words(direction[:6], obs.camera)
-
-    state = np.concatenate([pose, np.zeros(pose.shape[:-1] + (1,))], axis=-1)
-    problem, state, earlier = minimise_in_rounds(
-        freeze, state, move_biased, ROUNDS, max_iterations=30
-    )
-    return solve(
-        problem,
-        state,
-        move_biased,
-        names=(*POSE_NAMES, "log_odds"),
-        method=method,
-        read=read,
-        words=words,
-        scales=np.r_[np.ones(6), 10.0],
-        groups=obs.crossing_placement,
-        earlier=earlier,
-    )
-
-
-def edge_bias(solution, radius=1.0, background=0.0):
-    """By how much boards look larger at every edge, and its standard deviation, in units of
-    `radius`.
-
-    The solution is one of the method 'line_ml'; a radius of 1 gives spot radii. For `background`
-    see :func:`lrfcal_lib.fit.edge_likelihood.edge_shift`; say the mean over the crossings.
-    """
-    shift, slope = edge_shift(solution.parameters[..., 6], radius, background)
-    return shift, np.abs(slope) * solution.sigma[..., 6]
-
-
-def start_from_lines(obs):
+def start_from_lines(obs: CameraObservations) -> RigidTransform:
     """From crossings and the image lines of their edges."""
     obs.require("crossing", 6)
     return _start_from_sights(obs.crossing_points, obs.crossing_lines, obs)
 
 
-def start_from_scene(obs):
+def start_from_scene(obs: CameraObservations) -> RigidTransform:
     """From named points: each is seen where a column and a row of the image cross."""
     obs.require("scene", 4)
     u, v = obs.scene_pixels.T
-    zero = np.zeros(len(u))
-    columns = np.column_stack([zero + 1, zero, -u])
-    rows = np.column_stack([zero, zero + 1, -v])
+    columns = np.column_stack([1 + 0 * u, 0 * u, -u])
+    rows = np.column_stack([0 * v, 1 + 0 * v, -v])
     lines = np.concatenate([columns, rows])
     return _start_from_sights(np.tile(obs.scene_points, (2, 1)), lines, obs)
 
@@ -277,12 +180,12 @@ def _start_from_sights(points, lines, obs):
         options = {"loss": loss, "scale": "auto", "max_iterations": 40}
         poses = minimise(evaluate, poses, move_pose, **options)[0]
     depth = apply_pose(poses, points)[..., 2]
-    ahead = (depth > 0).mean(axis=1) > 0.8
+    ahead = (depth > 0).mean(axis=1) > AHEAD
     if not ahead.any():
         raise DegenerateGeometry(
             f"camera '{obs.camera}': no pose puts the {len(points)} points in front of the camera"
         )
     poses = poses[ahead]
     angle = np.abs(sight_block(poses, points, normals, 1.0).residuals) / np.abs(depth[ahead])
-    best = np.sort(angle, axis=1)[:, : max(6, int(0.75 * len(points)))]
+    best = np.sort(angle, axis=1)[:, : max(6, int(AGREEING * len(points)))]
     return pose_transform(poses[np.argmin(np.sum(best**2, axis=1))])
