@@ -230,12 +230,10 @@ class Camera(Closed):
         self._release()
 
     def _keep(self, instant):
-        """Decode what was grabbed, three channels of it; whether that was an image."""
+        """Decode what was grabbed; whether that was an image."""
         done, image = self._capture.retrieve()
         if not done:
             return False
-        if image.ndim == 2 or image.shape[2] == 1:
-            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
         with self._new:
             self._frame = Frame(image, instant, self._count)
             self._count += 1
