@@ -228,8 +228,8 @@ class Recording(Closed):
         resume
             Say how to go on, too.
         """
-        there = self._readable()
-        if there is None or set(self.finished) - there:
+        readable = self._readable()
+        if readable is None or set(self.finished) - readable:
             lost = "the session was removed or damaged while it was recorded"
             return f"{lost}: record again, to another folder"
         safe = "no placement was finished"
