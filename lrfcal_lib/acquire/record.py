@@ -16,8 +16,9 @@ from lrfcal_lib.drivers.rig import Moved, Photographed, Rig, Scanned, Tracked
 from lrfcal_lib.drivers.rig_file import read_rig_file
 from lrfcal_lib.session.progress import Progress, duration
 from lrfcal_lib.session.read import open_session
+from lrfcal_lib.session.recorder import SessionRecorder
 from lrfcal_lib.session.stated import SessionError
-from lrfcal_lib.session.write import SessionRecorder, not_written
+from lrfcal_lib.session.write import not_written
 
 FAILED = 2
 INTERRUPTED = 130  # exit codes
