@@ -122,7 +122,7 @@ class EmulatedWorld:
             self._still_key = key
             bearings = np.radians(quarters / 4)
             self._still = lrf.ideal_readings(rig.beam, world, bearings, pitch, rig.T_head_lrf)
-        ranges, reasons = lrf.measured(rig.beam, *self._still, self._rng)
+        ranges, reasons = lrf.measured(rig.beam, self._still, self._rng)
         return ranges, reasons, pitch[[np.argmin(times), np.argmax(times)]]
 
 

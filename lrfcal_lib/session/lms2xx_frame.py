@@ -158,7 +158,7 @@ def parse_telegram(raw: bytes) -> Telegram:
     return Telegram(raw[4], data)
 
 
-def split_stream(data: bytes, *, replies: bool = True) -> Stream:
+def split_stream(data: bytes | np.ndarray, *, replies: bool = True) -> Stream:
     """Find the telegrams in a byte stream, whatever lies between them.
 
     Parameters

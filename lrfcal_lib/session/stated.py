@@ -5,10 +5,11 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, PlainSerializer
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -103,8 +104,21 @@ def in_words(error):
 adapter = lru_cache(pydantic.TypeAdapter)
 
 
-def from_json(kind, data):
-    """What is stated in JSON as one of the types below; ValueError in words for anything else."""
+def from_json(kind: Any, data: Any) -> Any:
+    """What is stated in JSON as one of the types below.
+
+    Parameters
+    ----------
+    kind
+        The type.
+    data
+        As JSON has it.
+
+    Raises
+    ------
+    ValueError
+        In words for anything else.
+    """
     try:
         return adapter(kind).validate_python(data)
     except pydantic.ValidationError as error:
@@ -153,8 +167,13 @@ class TransformStated(BaseModel):
         )
 
 
-def transform_to_json(transform):
-    """A RigidTransform (or None) as rotation vector and translation."""
+def transform_to_json(transform: RigidTransform | None) -> dict | None:
+    """A transform as rotation vector and translation, as it stands in files.
+
+    Parameters
+    ----------
+    transform
+    """
     if transform is None:
         return None
     turn = transform.rotation.as_rotvec().tolist()
@@ -190,9 +209,16 @@ class LensStated(BaseModel):
         )
 
 
-def model_to_json(model):
-    """Intrinsics (or None) as they stand in session.json."""
-    return model and plain({name: getattr(model, name) for name in LensStated.model_fields})
+def model_to_json(model: CameraModel | None) -> dict | None:
+    """Intrinsics as they stand in session.json.
+
+    Parameters
+    ----------
+    model
+    """
+    if model is None:
+        return None
+    return plain({name: getattr(model, name) for name in LensStated.model_fields})
 
 
 class PatternStated(BaseModel):
@@ -245,21 +271,45 @@ class BoardStated(BaseModel):
         return Board(self.name, self.edges, corners, self.pattern, self.features)
 
 
-def board_to_json(board):
-    """A board as it stands in session.json."""
-    p = board.pattern
-    grid = p and {"kind": "chessboard", "columns": p.columns, "rows": p.rows}
-    named = {
-        "name": board.name,
-        "edges": board.edges,
-        "features": board.features,
-        "corners_m": board.corners,
-    }
-    return plain(named | {"pattern": p and grid | {"square_m": p.square, "origin_m": p.origin}})
+def board_to_json(board: Board) -> dict:
+    """A board as it stands in session.json.
+
+    Parameters
+    ----------
+    board
+    """
+    pattern = None
+    if board.pattern is not None:
+        pattern = {
+            "kind": "chessboard",
+            "columns": board.pattern.columns,
+            "rows": board.pattern.rows,
+            "square_m": board.pattern.square,
+            "origin_m": board.pattern.origin,
+        }
+    return plain(
+        {
+            "name": board.name,
+            "edges": board.edges,
+            "features": board.features,
+            "corners_m": board.corners,
+            "pattern": pattern,
+        }
+    )
 
 
-def board_from_json(data):
-    """Inverse of :func:`board_to_json`; ValueError for a wrong one."""
+def board_from_json(data: dict) -> Board:
+    """Inverse of :func:`board_to_json`.
+
+    Parameters
+    ----------
+    data
+
+    Raises
+    ------
+    ValueError
+        For a wrong one.
+    """
     return from_json(BoardStated, data).made()
 
 
@@ -320,26 +370,33 @@ class LrfInfo:
     ] = None
 
     @property
-    def admitted_offset(self):
-        """The largest range offset that the maker admits, metres: stated, or known of the model, or
-        assumed.
-        """
+    def admitted_offset(self) -> float:
+        """The largest range offset that the maker admits, metres: stated, or known, or assumed."""
         known = [value for name, value in SYSTEMATIC_ERROR.items() if name in self.model]
         if not known or self.range_resolution > 0.005:
             known = [ASSUMED_SYSTEMATIC_ERROR * max(self.sigma_range, self.range_resolution)]
         return self.systematic_error or known[0]
 
-    def spot_radius(self, distance):
-        """Radius of the spot at a distance, metres; 5 mm everywhere where the spot is not
-        stated.
+    def spot_radius(self, distance: ArrayLike) -> np.ndarray:
+        """Radius of the spot, metres; ASSUMED_SPOT_RADIUS everywhere where the spot is not stated.
+
+        Parameters
+        ----------
+        distance
+            From the window, metres.
         """
         if self.spot_exit is None:
             return np.full(np.shape(distance), ASSUMED_SPOT_RADIUS)
         return (self.spot_exit + (self.spot_divergence or 0.0) * np.asarray(distance, float)) / 2
 
 
-def lrf_to_json(lrf):
-    """An LrfInfo as it stands in session.json (degrees there)."""
+def lrf_to_json(lrf: LrfInfo) -> dict:
+    """A range finder as it stands in session.json (degrees there).
+
+    Parameters
+    ----------
+    lrf
+    """
     return adapter(LrfInfo).dump_python(lrf, by_alias=True, exclude_none=True)
 
 
@@ -384,15 +441,26 @@ class CameraInfo:
     guess: Annotated[Transform, PlainSerializer(transform_to_json)] = None
 
 
-def camera_to_json(camera):
-    """A CameraInfo as it stands in session.json."""
+def camera_to_json(camera: CameraInfo) -> dict:
+    """A camera as it stands in session.json.
+
+    Parameters
+    ----------
+    camera
+    """
     return adapter(CameraInfo).dump_python(camera, by_alias=True)
 
 
 def platform_to_json(
     T_head_lrf: RigidTransform | None, sigma: tuple[float, float] | None, continuous: bool
 ) -> dict:
-    """A platform as it stands in session.json; fields as of a Session."""
+    """A platform as it stands in session.json.
+
+    Parameters
+    ----------
+    T_head_lrf, sigma, continuous
+        Fields of a Session; sigma is `platform_sigma`, radians and metres.
+    """
     platform = {"T_head_lrf": transform_to_json(T_head_lrf)}
     if sigma is not None:
         direction, offset = sigma
@@ -445,9 +513,20 @@ class SessionStated(BaseModel):
     unfinished: Annotated[tuple[Whole, ...], Field(fail_fast=True)] | None = None
 
 
-def parse_session(data, kind=SessionStated):
-    """The statements of session.json (or more of its `kind`) as fields of a Session; ValueError for
-    a wrong one.
+def parse_session(data: dict, kind: type = SessionStated) -> dict:
+    """The statements of session.json as fields of a Session.
+
+    Parameters
+    ----------
+    data
+        As JSON has it.
+    kind
+        SessionStated, or what states more.
+
+    Raises
+    ------
+    ValueError
+        For a wrong one.
     """
     found = dict(from_json(kind, data))
     rig = dict(found.pop("rig"))

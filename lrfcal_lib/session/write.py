@@ -298,7 +298,7 @@ class SessionWriter:
         if camera not in self.cameras or purpose not in read.PURPOSES:
             known = f"cameras are {short(self.cameras)}, purposes {short(read.PURPOSES)}"
             raise SessionError(f"{self.path}: camera '{camera}', purpose '{purpose}': {known}")
-        what = f"camera '{camera}'"
+        what: str | os.PathLike = f"camera '{camera}'"
         if isinstance(image, np.ndarray):
             content = cv2.imencode(".png", image)[1].tobytes()
         elif isinstance(image, bytes):
