@@ -4,13 +4,14 @@ What counts is relative to the head at the pitch of the image: a point measured 
 nothing to the axis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lrfcal_lib.fit.least_squares import null_space, reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.model.camera import project_jacobians, undistort
+from lrfcal_lib.model.camera import CameraModel, project_jacobians, undistort
 from lrfcal_lib.model.geometry import (
     POSE_NAMES,
     hat,
@@ -19,15 +20,10 @@ from lrfcal_lib.model.geometry import (
     pose_transform,
     tilt,
 )
-from lrfcal_lib.solvers.joint import SCALES, UNSEEN
+from lrfcal_lib.solvers.joint import SCALES, UNSEEN, JointSolution
 
+# what may be wrong about the way of a beam: radians and metres; metres, a fraction, radians
 COLUMNS = (*AXIS_NAMES, *POSE_NAMES, "range_offset", "pitch_scale", "pitch_by_direction")
-PARTS = {
-    "axis": range(4),
-    "camera": range(4, 10),
-    "range offset": range(10, 11),
-    "pitch": range(11, 13),
-}
 # a motion that moves a point less than this, relative to all others, does not matter to it
 SEEN = 1e-3
 ROUNDS = 12  # of the search for the beam that ends in a pixel
@@ -37,90 +33,77 @@ ROUNDS = 12  # of the search for the beam that ends in a pixel
 class Chain:
     """From a beam to the frame of an image, and how well each link is known.
 
-    `head` is ``T_head_lrf`` (3, 4); `camera` ``T_camera_lrf`` of a camera on the head, or
-    ``T_camera_platform``, None for points of the cloud. `covariances`, each (13, 13), are those of
-    `COLUMNS` (increments ``[w, v]`` of the transforms; metres; fraction; radians): where there are
-    several, the one that gives more counts, quantity by quantity. `unseen` (m, 13) are motions that
-    nothing determines: what depends on them has no bound. `sweep_sigma`: offset (radians) and
-    stretch of the pitch that every sweep has of its own.
+    Attributes
+    ----------
+    head : ndarray, shape (3, 4)
+        ``T_head_lrf``.
+    camera : ndarray, shape (3, 4), or None
+        ``T_camera_lrf`` of a camera on the head, or ``T_camera_platform``; None for points of the
+        cloud.
+    on_head : bool
+    covariances : tuple of ndarray, shape (13, 13)
+        Of `COLUMNS` (increments ``[w, v]`` of the transforms). Where there are several, the one
+        that gives more counts, quantity by quantity.
+    unseen : ndarray, shape (m, 13)
+        Motions that nothing determines: what depends on them has no bound.
+    sweep_sigma : tuple of float
+        Of the offset (radians) and the stretch that the pitch of every sweep has of its own.
     """
 
     head: np.ndarray
     camera: np.ndarray | None
     on_head: bool
-    covariances: tuple
+    covariances: tuple[np.ndarray, ...]
     unseen: np.ndarray
-    sweep_sigma: tuple = (0.0, 0.0)
+    sweep_sigma: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class SigmaMap:
-    """Standard deviations over an image or a field of view.
-
-    Attributes
-    ----------
-    columns : ndarray, shape (c,)
-        Pixels u, or bearings (radians).
-    rows : ndarray, shape (r,)
-        Pixels v, or pitch angles (radians).
-    distances : ndarray, shape (d,)
-        Metres.
-    sigma : ndarray, shape (d, r, c)
-        Root mean square distance from the true place, pixels or metres; inf where a motion that
-        matters is not determined, NaN where no scan reaches.
-    parts : dict of str to ndarray, shape (d, r, c)
-        The same with only some links uncertain: 'axis', 'camera', 'range offset', 'pitch', 'sweep',
-        and for points 'range noise', which `sigma` does not contain. Errors of axis and camera may
-        compensate: parts larger than the whole are no contradiction.
-    """
-
-    columns: np.ndarray
-    rows: np.ndarray
-    distances: np.ndarray
-    sigma: np.ndarray
-    parts: dict
-
-    def rms(self):
-        """Root mean square over what scans reach, shape (d,); inf where they reach nothing."""
-        number = np.sum(~np.isnan(self.sigma), axis=(1, 2))
-        mean = np.nansum(self.sigma**2, axis=(1, 2)) / np.maximum(number, 1)
-        return np.where(number > 0, np.sqrt(mean), np.inf)
+def columns_of(solution: JointSolution, camera: str | None = None) -> np.ndarray:
+    """Where each of `COLUMNS` stands among the shared unknowns, -1 where it was none, (13,)."""
+    names = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
+    place = {name: i for i, name in enumerate(solution.solution.names)}
+    return np.array([place.get(name, -1) for name in names])
 
 
-def marginal(hessian, index):
-    """Information on some unknowns with the others eliminated, shape (k, k)."""
-    others = np.setdiff1d(np.arange(len(hessian)), index)
-    order = np.concatenate([index, others]).astype(int)
-    return reduced_hessian(hessian[np.ix_(order, order)][None], len(index))[0]
-
-
-def chain_of(solution, camera=None):
+def chain_of(solution: JointSolution, camera: str | None = None) -> Chain:
     """The chain of a joint solution to a camera, or to points of the cloud.
 
-    A ValueError if there is no such camera.
+    Parameters
+    ----------
+    solution
+    camera
+        Its name; None for points of the cloud.
+
+    Raises
+    ------
+    ValueError
+        If there is no such camera.
     """
     if camera is not None and camera not in solution.transforms:
         cameras = ", ".join(solution.transforms) or "none"
         raise ValueError(f"cameras are {cameras}; got '{camera}'")
     estimate = solution.solution
-    wanted = [*AXIS_NAMES, *(f"{camera}_{name}" for name in POSE_NAMES), *COLUMNS[10:]]
-    place = {name: i for i, name in enumerate(estimate.names)}
-    index = np.array([place.get(name, -1) for name in wanted])
+    index = columns_of(solution, camera)
     known = index >= 0
     covariances = []
-    for C in (estimate.covariance, estimate.trusted):
-        part = C[np.ix_(index, index)]
+    for whole in (estimate.covariance, estimate.trusted):
+        part = whole[np.ix_(index, index)]
         # zero for what is known; what has no bound is among `unseen`
         estimated = np.outer(known, known) & np.isfinite(part)
         covariances.append(np.where(estimated, part, 0.0))
+
     # What stays open beside the links leaves no trace: cameras that planes fix are known, whatever
     # the edge bias.
-    scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])
-    scaled = solution.information().sum(axis=0) * scales[:, None] * scales
-    hessian = marginal(scaled, index[known])
-    motions = null_space(hessian, np.ones(len(hessian)), UNSEEN)[0] * scales[index[known]]
-    unseen = np.zeros((len(motions), len(wanted)))
-    unseen[:, known] = motions
+    links = index[known]
+    others = np.setdiff1d(np.arange(len(estimate.names)), links)
+    order = np.concatenate([links, others])
+    scales = np.array([SCALES.get(name, 1.0) for name in estimate.names])[order]
+    whole = solution.information().sum(axis=0)[np.ix_(order, order)]
+    hessian = reduced_hessian((whole * scales[:, None] * scales)[None], len(links))[0]
+    motions, _ = null_space(hessian, np.ones(len(links)), UNSEEN)
+    unseen = np.zeros((len(motions), len(COLUMNS)))
+    unseen[:, known] = motions * scales[: len(links)]
+
     on_head = True
     pose = None
     if camera is not None:
@@ -129,6 +112,119 @@ def chain_of(solution, camera=None):
         pose = pose_array(solution.transforms[camera])
     head = pose_array(solution.T_head_lrf)
     return Chain(head, pose, on_head, tuple(covariances), unseen, solution.sweep_sigma)
+
+
+def projection_sigma(
+    chain: Chain,
+    model: CameraModel,
+    distances: ArrayLike,
+    grid: tuple[int, int],
+    *,
+    image_pitch: float = 0.0,
+    pitches: tuple[float, float] = (-np.pi, np.pi),
+) -> np.ndarray:
+    """How far off the pixel of an LRF point may be, over the image.
+
+    Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head
+    the tilt axis matters the more, the farther the two are apart.
+
+    Parameters
+    ----------
+    chain
+        To the camera.
+    model
+    distances : array_like, shape (d,)
+        From the LRF, metres.
+    grid
+        Columns and rows, see :func:`pixel_grid`.
+    image_pitch
+        Radians.
+    pitches
+        First and last pitch of the sweeps, radians. A sweep's own stretch acts about their middle
+        (cameras on the base).
+
+    Returns
+    -------
+    ndarray, shape (d, rows, columns)
+        Root mean square distance from the true pixel; inf where a motion that matters is not
+        determined, NaN where no scan reaches.
+    """
+    away = positive(distances)[:, None, None]
+    bearing, pitch = beams_of_pixels(chain, model, pixel_grid(model, grid), away, image_pitch)
+    points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
+    P, *_ = project_jacobians(points, model)
+    offset, stretch = chain.sweep_sigma
+    sigma_pitch = np.hypot(offset, stretch * (pitch - np.mean(pitches)))
+    if chain.on_head:  # the offset is that of the image, too
+        sigma_pitch = stretch * (pitch - image_pitch)
+    by_sweep = sigma_pitch * np.linalg.norm((P @ by_pitch[..., None])[..., 0], axis=-1)
+    sigma = np.hypot(spread(chain, P @ by_link), by_sweep)
+    low, high = pitches
+    return np.where((pitch >= low) & (pitch <= high), sigma, np.nan)
+
+
+def pixel_grid(model: CameraModel, grid: tuple[int, int]) -> np.ndarray:
+    """Middles of the cells that columns and rows cut an image into, (rows, columns, 2), pixels."""
+    columns, rows = grid
+    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
+    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def point_sigma(
+    chain: Chain,
+    bearings: np.ndarray,
+    pitches: np.ndarray,
+    distances: ArrayLike,
+    *,
+    reference: float = 0.0,
+) -> np.ndarray:
+    """How far off a reconstructed point may be, over the field of view.
+
+    Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
+    of single sweeps do: they shift sweeps against each other. The range noise of single points is
+    no part of it.
+
+    Parameters
+    ----------
+    chain
+        To the cloud.
+    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
+        Radians, radians, metres.
+    reference
+        Radians.
+
+    Returns
+    -------
+    ndarray, shape (d, r, c)
+        Metres; inf where a motion that matters is not determined.
+    """
+    away = positive(distances)[:, None, None]
+    _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
+    offset, stretch = chain.sweep_sigma
+    sigma_pitch = np.hypot(offset, stretch * (pitches - reference))[:, None]
+    return np.hypot(spread(chain, by_link), sigma_pitch * np.linalg.norm(by_pitch, axis=-1))
+
+
+def root_mean_square(sigma: np.ndarray) -> float:
+    """Of what scans reach (no NaN); inf where they reach nothing."""
+    reached = sigma[~np.isnan(sigma)]
+    return float(np.sqrt(np.mean(reached**2))) if reached.size else np.inf
+
+
+def positive(distances: ArrayLike) -> np.ndarray:
+    """Distances as an array, metres; a ValueError where one is none."""
+    distances = np.atleast_1d(np.asarray(distances, float))
+    if not (np.isfinite(distances).all() and distances.min() > 0):
+        raise ValueError(f"distances must be positive, metres; got {distances.tolist()}")
+    return distances
+
+
+def range_noise(solution: JointSolution) -> float:
+    """Standard deviation of one range as the solution found or took it, metres."""
+    if not len(solution.observations.face_sigma):
+        return 0.0
+    return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
 
 
 def carried(chain, bearing, pitch, distance, image_pitch=0.0):
@@ -230,119 +326,3 @@ def beams_of_pixels(chain, model, uv, distance, image_pitch):
     if chain.on_head:
         pitch = pitch + image_pitch
     return bearing, pitch
-
-
-def _sigma_map(chain, axes, jacobian, by_pitch, turn, offset):
-    """Standard deviations from Jacobians (d, r, c, m, 13) and by the pitch (d, r, c, m) of beams.
-
-    The beams are `turn` off the middle; `offset` says whether the offset that the pitch of every
-    sweep has of its own matters.
-    """
-    parts = {}
-    for name, columns in PARTS.items():
-        link = np.isin(range(len(COLUMNS)), columns)
-        parts[name] = spread(chain, jacobian * link)
-    sigma_offset, sigma_stretch = chain.sweep_sigma
-    sigma_pitch = np.hypot(offset * sigma_offset, sigma_stretch * turn)
-    parts["sweep"] = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
-    sigma = np.hypot(spread(chain, jacobian), parts["sweep"])
-    return SigmaMap(*axes, sigma, parts)
-
-
-def projection_sigma(
-    solution, camera, model, distances, grid=(32, 24), *, image_pitch=0.0, pitches=None
-):
-    """How far off the pixel of an LRF point may be, over the image.
-
-    Every point is measured at its own pitch, the image at `image_pitch`. For a camera on the head
-    the tilt axis matters the more, the farther the two are apart.
-
-    Parameters
-    ----------
-    solution : JointSolution or Chain
-    camera : str
-        Ignored for a Chain.
-    model : CameraModel
-    distances : array_like, shape (d,)
-        From the LRF, metres.
-    grid : tuple of int
-        Columns and rows of the map.
-    image_pitch : float
-        Radians.
-    pitches : tuple of float, optional
-        First and last pitch of the sweeps, radians: pixels that they do not reach stay NaN. A
-        sweep's own stretch acts about their middle (cameras on the base).
-
-    Returns
-    -------
-    SigmaMap
-        Pixels.
-    """
-    chain, distances = _asked(solution, camera, distances)
-    columns, rows = grid
-    u = (np.arange(columns) + 0.5) * model.width / columns - 0.5
-    v = (np.arange(rows) + 0.5) * model.height / rows - 0.5
-    uv = np.stack(np.meshgrid(u, v), axis=-1)
-    away = distances[:, None, None]
-    bearing, pitch = beams_of_pixels(chain, model, uv, away, image_pitch)
-    points, J, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
-    P = project_jacobians(points, model)[0]
-    by_pitch = (P @ by_pitch[..., None])[..., 0]
-    middle = image_pitch
-    if pitches is not None and not chain.on_head:
-        middle = np.mean(pitches)
-    axes = u, v, distances
-    out = _sigma_map(chain, axes, P @ J, by_pitch, pitch - middle, not chain.on_head)
-    if pitches is None:
-        return replace(out, sigma=np.where(np.isnan(pitch), np.nan, out.sigma))
-    low, high = pitches
-    reached = (pitch >= low) & (pitch <= high)
-    return replace(out, sigma=np.where(reached, out.sigma, np.nan))
-
-
-def point_sigma(solution, bearings, pitches, distances, *, reference=0.0):
-    """How far off a reconstructed point may be, over the field of view.
-
-    Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
-    of single sweeps do: they shift sweeps against each other.
-
-    Parameters
-    ----------
-    solution : JointSolution or Chain
-    bearings, pitches, distances : array_like, shapes (c,), (r,), (d,)
-        Radians, radians, metres.
-    reference : float
-        Radians.
-
-    Returns
-    -------
-    SigmaMap
-        Metres. `sigma` is the calibration's part, common to all points near each other;
-        ``parts['range noise']`` is that of every single point.
-    """
-    chain, distances = _asked(solution, None, distances)
-    bearings = np.atleast_1d(bearings).astype(float)
-    pitches = np.atleast_1d(pitches).astype(float)
-    away = distances[:, None, None]
-    _, J, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
-    axes = bearings, pitches, distances
-    out = _sigma_map(chain, axes, J, by_pitch, (pitches - reference)[:, None], True)
-    out.parts["range noise"] = np.full(out.sigma.shape, range_noise(solution))
-    return out
-
-
-def range_noise(solution):
-    """Standard deviation of one range as the solution found or took it, metres (0 for a Chain)."""
-    if isinstance(solution, Chain) or not len(solution.observations.face_sigma):
-        return 0.0
-    return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
-
-
-def _asked(solution, camera, distances):
-    """The chain of a solution (or the Chain given) and distances as an array."""
-    distances = np.atleast_1d(np.asarray(distances, float))
-    if not (np.isfinite(distances).all() and distances.min() > 0):
-        raise ValueError(f"distances must be positive, metres; got {distances.tolist()}")
-    if isinstance(solution, Chain):
-        return solution, distances
-    return chain_of(solution, camera), distances

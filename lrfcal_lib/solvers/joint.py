@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from lrfcal_lib.fit.axis_chart import chart_parameters
 from lrfcal_lib.fit.edge_likelihood import disc_edge
-from lrfcal_lib.fit.least_squares import eliminate, minimise, reduced_hessian, solve
+from lrfcal_lib.fit.least_squares import eliminate, minimise, solve
 from lrfcal_lib.fit.result import AXIS_NAMES, AXIS_WORDS, Solution
 from lrfcal_lib.model import geometry
 from lrfcal_lib.model.geometry import (
@@ -122,7 +122,7 @@ class JointSolution:
         By how much errors of the intrinsics let board poses in images scatter, in stated standard
         deviations.
     warnings : tuple of str
-        What is suspicious: no convergence, noise that contradicts what is stated, a weak axis,
+        What is suspicious: noise that contradicts what is stated, a weak axis,
         errors of the pitch that the data ask for.
     """
 
@@ -261,35 +261,17 @@ class JointSolution:
         information, score, _ = eliminate(hessian, gradient, shared + bool(after))
         return Score(information, score)
 
-    def forecast(
-        self, observations: JointObservations, boards: np.ndarray, weight: np.ndarray, like: int
-    ) -> np.ndarray:
-        """Information on the shared unknowns from placements that were not recorded, (n, c, c).
+    def board_information(self) -> np.ndarray:
+        """What the scans of every placement say about the pose of its board, shape (p, 6, 6).
 
-        Parameters
-        ----------
-        observations : JointObservations
-            Of n placements; measured ranges do not matter.
-        boards : ndarray, shape (n, 3, 4)
-            ``T_platform_board``.
-        weight : ndarray, shape (n,)
-            How many beams about the edges each one stands for.
-        like : int
-            Number of the placement whose backgrounds they have.
+        By increments ``[w, v]`` of ``T_platform_board``, with everything else known.
         """
-        n = len(boards)
-        row = list(self.boards).index(like)
-        data = gather(observations, **self.data.levels)
-        data.beam["used"] = data.beam["used"] * weight[:, None]
-        state = replace(
-            self.state,
-            boards=boards,
-            sweeps=np.zeros((n, 2)),
-            sides=np.repeat(self.state.sides[[row]], n, axis=0),
-        )
-        blocks = named_blocks(state, data, self.unknowns).values()
-        hessian = sum(np.swapaxes(b.white_jacobian, -1, -2) @ b.white_jacobian for b in blocks)
-        return reduced_hessian(hessian, self.unknowns.shared)
+        columns = self.unknowns.columns["board"]
+        information = np.zeros((len(self.boards), 6, 6))
+        for group in self.blocks.keys() & {"face", "beam"}:
+            J = self.blocks[group].white_jacobian[..., columns]
+            information += np.swapaxes(J, -1, -2) @ J
+        return information
 
     def columns(self, prefix):
         """Indices of the shared unknowns whose names begin so."""

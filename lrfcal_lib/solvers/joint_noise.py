@@ -416,13 +416,7 @@ def joint_warnings(blocks, data, unknowns, found, names):
     `blocks` hold derivatives by `TERMS` too, which `unknowns` name, whether they were estimated or
     not.
     """
-    words = (
-        []
-        if found.converged
-        else [f"not converged after {found.iterations} iterations: do not use the result"]
-    )
-    words += [f"the data do not determine {motion}" for motion in found.unobservable]
-    words += noise_words(blocks, data, names)
+    words = noise_words(blocks, data, names)
     turn, shift = (
         np.linalg.norm(found.sigma[:4].reshape(2, 2), axis=1) if unknowns.axis else (0.0, 0.0)
     )
