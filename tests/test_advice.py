@@ -51,21 +51,19 @@ def test_the_suggested_placement_brings_what_it_promises(good, suggested):
     rig, poses, solution = good
 
     def with_board(pose, seed):
-        """By how much one more placement really shrinks the uncertainty, and the sigmas then."""
+        """By how much one more placement really shrinks the uncertainty."""
         found = solve(rig, [*poses, pose], np.random.default_rng(seed))
         before, after = (next_placement.group_sigma(s.solution.covariance, s) for s in (solution, found))
-        return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()]), after
+        return 1 - np.linalg.norm([*after.values()]) / np.linalg.norm([*before.values()])
 
-    gain, after = with_board(suggested.T_platform_board, 5)
-    assert gain > 0.8 * suggested.gain and suggested.after == pytest.approx(after, rel=0.2)
-    blind = [with_board(pose, 6)[0] for pose in board_poses(np.random.default_rng(7), 5)]
+    gain = with_board(suggested.T_platform_board, 5)
+    assert gain > 0.8 * suggested.gain and 1 - gain == pytest.approx(1 - suggested.gain, rel=0.2)
+    blind = [with_board(pose, 6) for pose in board_poses(np.random.default_rng(7), 5)]
     assert gain > 1.2 * np.median(blind) and suggested.gain > 1.5 * suggested.median_gain > 0
 
 
 def test_suggestions_refuse_bad_input(good):
     rig, _, solution = good
-    with pytest.raises(ValueError, match="camera 'right' has no intrinsics"):
-        next_placement.suggest_placement(solution, {"left": rig.model})
     with pytest.raises(DegenerateGeometry, match="none of .* board poses lies wholly in the view"):
         next_placement.suggest_placement(solution, models_of(rig), field_of_view=NOWHERE)
     last = verdict(solution, models_of(rig), field_of_view=NOWHERE).sentences()[-1]

@@ -66,7 +66,7 @@ def test_an_edge_that_lies_elsewhere_in_most_scans_is_a_reason(dropped, named, w
         names={p: {0: "ab", 1: "bc"} for p in range(named)} | {p: {0: "ab"} for p in range(100, 100 + dropped)},
         dropped={p: {1: turned} for p in range(100, 100 + dropped)},
     )
-    reasons = weaknesses.sides_elsewhere(prepared)
+    reasons = list(weaknesses.sides_elsewhere(prepared))
     assert [reason.kind for reason in reasons] == ["outline"] * (words is not None)
     assert all("edge 'bc'" in reason.words and words in reason.words for reason in reasons)
 

@@ -1,17 +1,15 @@
 """Which placement of the board would help a joint estimate most if it were recorded next."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from lrfcal_lib.fit.least_squares import reduced_hessian
 from lrfcal_lib.fit.result import AXIS_NAMES
-from lrfcal_lib.judge.findings import brief
 from lrfcal_lib.judge.uncertainty import beams_to, carried, chain_of, columns_of
 from lrfcal_lib.model import geometry
-from lrfcal_lib.model.camera import CameraModel, project, project_jacobians
+from lrfcal_lib.model.camera import CameraModel, pinhole, project_jacobians
 from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry
 from lrfcal_lib.solvers.joint import JointSolution
 
@@ -35,8 +33,7 @@ FIELD_OF_VIEW = (np.radians(40), np.radians(140))  # bearings, of the paper's LM
 PITCH_LIMITS = (np.radians(-30), np.radians(30))  # of a head that is asked to look at a board
 LATTICE = np.linspace(*PITCH_LIMITS, 41)  # pitch angles that images are tried at
 IMAGES = 3  # of each camera on the head, spread over the pitch angles at which all see the board
-MARGIN = 0.02  # of the image, that a board keeps from its border
-NEAR = 0.65  # of the image, from its middle: farther out the lens model may fold back
+MARGIN = 0.04  # of the image, that a board keeps from its border, distortion included
 STEEPEST = np.radians(60.0)  # incidence of beams and of lines of sight
 RADIUS = 2.0  # metres: a turn counts as much as what it shifts at this distance
 USUAL_SPOT = 0.01  # metres, radius where no beam was recorded
@@ -53,19 +50,14 @@ class Suggestion:
         Distance (metres), bearing, elevation and turn (degrees), number of `LEANS`.
     pitches : ndarray, shape (k,)
         Of the images, radians; empty where no camera is on the head.
-    before, after : dict of str to float
-        Standard deviation of 'axis' and of each camera, metres at 2 m (root of the sum of the
-        variances of rotation times 2 m and of translation), of the propagated noise.
     gain, median_gain : float
-        By how much the standard deviation of all of them shrinks, a fraction; of all candidates,
-        what a placement chosen blindly brings.
+        By how much the standard deviation of axis and cameras together shrinks, a fraction, at the
+        propagated noise; of all candidates, what a placement chosen blindly brings.
     """
 
     T_platform_board: RigidTransform
     place: tuple[float, ...]
     pitches: np.ndarray
-    before: dict[str, float]
-    after: dict[str, float]
     gain: float
     median_gain: float
 
@@ -79,8 +71,7 @@ class Suggestion:
             parts.append(f"{abs(elevation):.0f} deg {'up' if elevation > 0 else 'down'}")
         if turn:
             parts.append(f"turned by {turn:.0f} deg in its plane")
-        parts.append(list(LEANS)[int(lean)])
-        words = ", ".join(parts)
+        words = ", ".join([*parts, list(LEANS)[int(lean)]])
         if len(self.pitches):
             *most, last = [f"{pitch:+.0f}" for pitch in np.degrees(self.pitches)]
             words += f"; images at pitch {', '.join(most)} and {last} deg"
@@ -88,21 +79,16 @@ class Suggestion:
 
     def sentence(self) -> str:
         """What to record next and what it brings."""
-        changes = []
-        for name, sigma in self.before.items():
-            after = brief(1000 * self.after[name])
-            changes.append(f"{name} from {brief(1000 * sigma)} to {after} mm")
         return (
-            f"Record next: {self.words()}. Predicted standard deviations at 2 m: "
-            f"{', '.join(changes)} ({100 * self.gain:.0f} % less; a placement chosen blindly "
-            f"brings {100 * self.median_gain:.0f} %)."
+            f"Record next: {self.words()}. The standard deviations of axis and cameras would "
+            f"shrink by about {100 * self.gain:.0f} % (after a placement chosen blindly by "
+            f"{100 * self.median_gain:.0f} %)."
         )
 
 
 def suggest_placement(
     solution: JointSolution,
     models: dict[str, CameraModel],
-    *,
     field_of_view: tuple[float, float] = FIELD_OF_VIEW,
 ) -> Suggestion:
     """The board pose and pitch angles of images that would make axis and cameras known best.
@@ -122,49 +108,44 @@ def suggest_placement(
     ------
     DegenerateGeometry
         When no pose of the grid is seen by all.
-    ValueError
-        When a camera has no model.
     """
-    for camera in solution.transforms:
-        if camera not in models:
-            raise ValueError(
-                f"camera '{camera}' has no intrinsics: give its CameraModel in `models`"
-            )
     grid = np.array(list(product(*PLACES)))
-    every_board = board_poses(solution, grid)
-    pitches = pitches_of_images(every_board, solution, models, field_of_view)
-    rows = np.flatnonzero(np.isfinite(pitches[:, 0]))
-    if len(rows) == 0:
+    boards = board_poses(solution, grid)
+    pitches = pitches_of_images(boards, solution, models, field_of_view)
+    seen = np.isfinite(pitches[:, 0])
+    if not seen.any():
         low, high = np.degrees(PITCH_LIMITS)
         raise DegenerateGeometry(
             f"none of {len(grid)} board poses lies wholly in the view of the LRF and of all "
-            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: check the field of view "
-            "and the calibration"
+            f"cameras at a pitch from {low:.0f} to {high:.0f} deg: check the field of view and "
+            "the calibration"
         )
-    boards = every_board[rows]
-    pitches = pitches[rows]
-    added = candidate_information(boards, pitches, solution, models)
-
+    grid = grid[seen]
+    boards = boards[seen]
+    pitches = pitches[seen]
     known = solution.information().sum(axis=0)
-    # what is not observed counts as known to a metre at 2 m, so that it can be compared as well
-    scales = scales_of(solution)
-    unit = np.outer(scales, scales)
-    prior = np.eye(len(unit))
-    before = group_sigma(np.linalg.inv(known * unit + prior) * unit, solution)
-    after = group_sigma(np.linalg.inv((known + added) * unit + prior) * unit, solution)
-    total_before = np.sqrt(sum(sigma**2 for sigma in before.values()))
-    total_after = np.sqrt(sum(sigma**2 for sigma in after.values()))
-    best = int(np.argmin(total_after))
-    gains = 1 - total_after / total_before
+    added = candidate_information(boards, pitches, solution, models)
+    before = total_sigma(known, solution)
+    after = total_sigma(known + added, solution)
+    best = int(np.argmin(after))
     return Suggestion(
         T_platform_board=geometry.pose_transform(boards[best]),
-        place=tuple(grid[rows[best]].tolist()),
+        place=tuple(grid[best].tolist()),
         pitches=pitches[best] if "head" in solution.observations.mounts else np.zeros(0),
-        before={name: float(sigma) for name, sigma in before.items()},
-        after={name: float(sigma[best]) for name, sigma in after.items()},
-        gain=float(gains[best]),
-        median_gain=float(np.median(gains)),
+        gain=float(1 - after[best] / before),
+        median_gain=float(1 - np.median(after) / before),
     )
+
+
+def total_sigma(information, solution):
+    """Standard deviation of axis and cameras together, metres at 2 m, from information (..., c, c).
+
+    What is not observed counts as known to a metre at 2 m, so that it can be compared as well.
+    """
+    scales = scales_of(solution)
+    unit = np.outer(scales, scales)
+    covariance = np.linalg.inv(information * unit + np.eye(len(unit))) * unit
+    return np.sqrt(sum(sigma**2 for sigma in group_sigma(covariance, solution).values()))
 
 
 def scales_of(solution: JointSolution) -> np.ndarray:
@@ -255,10 +236,8 @@ def pitches_of_images(boards, solution, models, field_of_view):
 def wholly_in_image(p_camera, normals, model):
     """Which boards, by corners (n, e, 3) and normals (n, 3) in a camera's frame, are in view."""
     size = np.array([model.width, model.height])
-    depth = np.where(p_camera[..., 2:] > 0, p_camera[..., 2:], np.nan)
-    near = np.abs(p_camera[..., :2] / depth) < NEAR * size / [model.fx, model.fy]
-    uv = project(p_camera, model)
-    inside = near & (uv > MARGIN * size) & (uv < size - MARGIN * size)
+    uv = pinhole(p_camera, model)  # far outside the image a lens model would fold back
+    inside = (uv > MARGIN * size) & (uv < size - MARGIN * size) & (p_camera[..., 2:] > 0)
     towards = -np.vecdot(p_camera, normals[:, None])
     facing = towards > np.cos(STEEPEST) * np.linalg.norm(p_camera, axis=-1)
     return np.all(inside.all(axis=-1) & facing, axis=1)
@@ -267,77 +246,60 @@ def wholly_in_image(p_camera, normals, model):
 def candidate_information(boards, pitches, solution, models):
     """Information that boards would add about the shared unknowns, shape (n, c, c).
 
-    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. Scans and
-    images tell where points of the board are, as well as they did for the recorded placements; the
-    pose of the board is eliminated.
+    `boards` (n, 3, 4) are ``T_platform_board``, `pitches` (n, k) those of the images. Points of a
+    board that a scan knows, with its errors, are compared with where images show them; all images
+    share the errors of the one scan.
     """
-    points = points_of_face(solution)
-    x_platform = geometry.apply_pose(boards, points)  # (n, k, 3)
-    beams = beams_to(x_platform, solution.T_head_lrf)
-    by_board = np.concatenate(
-        [
-            -geometry.hat(x_platform - boards[:, None, :, 3]),
-            np.tile(np.eye(3), (*beams[0].shape, 1, 1)),
-        ],
-        axis=-1,
-    )  # of points by the pose of their board, (n, k, 3, 6)
-    to_platform = replace(chain_of(solution), on_head=False)
-    _, by_rig, _ = carried(to_platform, *beams)
-    into_board = np.swapaxes(boards[:, None, :, :3], -1, -2)
-    known = np.sqrt(scan_information(solution, boards))[:, None, :, None]
-    shared = len(solution.solution.names)
-    hessian = np.zeros((len(boards), shared + 6, shared + 6))
-
-    def add(by_unknowns, by_board, camera=None):
-        """What whitened rows (n, ..., m, 13) and (n, ..., m, 6) say."""
-        index = columns_of(solution, camera)
-        unknown = index >= 0
-        J = np.concatenate([by_unknowns[..., unknown], by_board], axis=-1)
-        J = J.reshape(len(boards), -1, J.shape[-1])
-        where = np.append(index[unknown], shared + np.arange(6))
-        hessian[:, where[:, None], where] += np.swapaxes(J, -1, -2) @ J
-
-    add(known * (into_board @ by_rig), -known * (into_board @ by_board))
-    for camera, mount in zip(solution.transforms, solution.observations.mounts, strict=True):
+    obs = solution.observations
+    beams = beams_to(geometry.apply_pose(boards, points_of_face(solution)), solution.T_head_lrf)
+    images = [pitches if mount == "head" else pitches[:, :1] for mount in obs.mounts]
+    count = sum(at.shape[1] for at in images)
+    by_scan = np.sqrt(count) * scan_sigma(solution, boards)[:, None]
+    unknowns = len(solution.solution.names)
+    information = np.zeros((len(boards), unknowns, unknowns))
+    for camera, at in zip(obs.cameras, images, strict=True):
+        model = models[camera]
+        by_image = image_sigma(solution, camera, model)
         chain = chain_of(solution, camera)
-        sigma = image_sigma(solution, camera, models[camera])
-        for pitch in pitches.T if mount == "head" else pitches.T[:1]:
-            p_camera, from_beam, _ = carried(chain, *beams, image_pitch=pitch[:, None])
-            P = project_jacobians(p_camera, models[camera])[0] / sigma
-            R_camera_platform = solution.camera_at(camera, pitch).rotation.as_matrix()
-            R = R_camera_platform[..., None, :, :]
-            # a point of the board, which stays where it is, instead of the end of a beam
-            add(P @ (from_beam - R @ by_rig), P @ R @ by_board, camera)
-    return reduced_hessian(hessian, shared) / solution.solution.inflation
+        links = columns_of(solution, camera)
+        unknown = links >= 0
+        index = links[unknown]
+        for pitch in at.T:
+            p_camera, by_link, _ = carried(chain, *beams, image_pitch=pitch[:, None])
+            by_point = project_jacobians(p_camera, model)[0]
+            sigma = np.hypot(by_image, by_scan * model.fx / p_camera[..., 2])
+            J = (by_point @ by_link)[..., unknown] / sigma[..., None, None]
+            J = J.reshape(len(boards), -1, len(index))
+            information[:, index[:, None], index] += np.swapaxes(J, -1, -2) @ J
+    return information
 
 
 def points_of_face(solution):
-    """Points (k, 3) that are spread about the middle of the board like its face, metres."""
-    corners = outline(solution)
-    middle = corners.mean(axis=0)
-    sides = (corners + np.roll(corners, 1, axis=0)) / 2
-    return np.concatenate([middle + 0.6 * (corners - middle), middle + 0.8 * (sides - middle)])
+    """Points (e, 3) half-way from the middle of the board to its corners, metres.
 
-
-def scan_information(solution, boards):
-    """What a scan says about each of the :func:`points_of_face` of boards, 1/m^2, shape (n, 3).
-
-    Along the axes of the boards: as the recorded scans do, in proportion to how large the boards
-    look from the LRF, and never more.
+    They are spread about the middle as the face is.
     """
-    recorded = solution.board_poses
-    R = recorded[:, :, :3]
-    by_shift = np.swapaxes(R, -1, -2) @ solution.board_information()[:, 3:, 3:] @ R
-    each = np.diagonal(by_shift, axis1=1, axis2=2) / len(points_of_face(solution))
-    usual = np.median(each / _solid_angle(recorded, solution), axis=0)
-    return np.minimum(usual * _solid_angle(boards, solution), each.max(axis=0))
+    corners = outline(solution)
+    return (corners + corners.mean(axis=0)) / 2
 
 
-def _solid_angle(boards, solution):
-    """How large boards (n, 3, 4) look from the LRF, relative to their area, (n, 1)."""
+def scan_sigma(solution, boards):
+    """Standard deviation of each of the :func:`points_of_face` of boards in a scan, metres, (n,).
+
+    As in the recorded scans, in proportion to how large the boards look from the LRF, and never
+    less.
+    """
+    by_shift = np.linalg.inv(solution.board_information()[:, 3:, 3:])
+    variance = len(outline(solution)) * np.linalg.trace(by_shift) / 3
+    usual = np.median(variance * solid_angle(solution, solution.board_poses))
+    return np.sqrt(np.maximum(usual / solid_angle(solution, boards), variance.min()))
+
+
+def solid_angle(solution, boards):
+    """How large boards (n, 3, 4) look from the LRF, relative to their area, (n,)."""
     sight = sights(boards, solution)
     distance = np.linalg.norm(sight, axis=1)
-    return (np.abs(np.vecdot(sight, boards[:, :, 2])) / distance**3)[:, None]
+    return np.abs(np.vecdot(sight, boards[:, :, 2])) / distance**3
 
 
 def image_sigma(solution, camera, model):

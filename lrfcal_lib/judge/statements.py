@@ -1,5 +1,6 @@
 """Does session.json state the devices as they are? What the data contradict."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -63,13 +64,12 @@ def contradicts_stated(joint: JointCalibration) -> tuple[list[Finding], float]:
         findings.append(Finding(NO, Kind.NOT_WEIGHED, f"{NOT_WEIGHED}: {why}"))
     sizes = [abs(doubt.value) for doubt in doubts if doubt.kind in SIZES]
     range_doubt = max(sizes, default=0.0) * float(np.median(solution.observations.face_range))
-
-    offset = solution.sensor["range_offset"]
-    stands_for_offset = instead in doubts
-    beyond = [] if stands_for_offset else beyond_admitted(joint)
-    if stands_for_offset or beyond:
-        range_doubt = max(range_doubt, abs(offset))
-    findings += beyond + beyond_spot(solution) + pitch_turns_otherwise(solution)
+    beyond = []
+    if instead not in doubts:
+        beyond = list(beyond_admitted(joint))
+    if beyond or instead in doubts:
+        range_doubt = max(range_doubt, abs(solution.sensor["range_offset"]))
+    findings += [*beyond, *beyond_spot(solution), *pitch_turns_otherwise(solution)]
     for far in far_from_stated(joint):
         answer = NO if far.angle > np.pi / 2 else CARE
         findings.append(Finding(answer, Kind.FAR_FROM_STATED, far.words))
@@ -100,48 +100,46 @@ def finding_of(doubts):
     return Finding(NO if certain and large else CARE, best.kind, words)
 
 
-def beyond_admitted(joint):
-    """Finding about a range offset that the maker of the range finder does not admit."""
+def beyond_admitted(joint) -> Iterator[Finding]:
+    """A range offset that the maker of the range finder does not admit."""
     offset = joint.solution.sensor["range_offset"]
     admitted = joint.prepared.session.lrf.admitted_offset
     margin = CONTRADICTS * joint.solution.sigma.get("range_offset", 0.0)
-    if abs(offset) <= admitted + margin:
-        return []
-    words = (
-        f"the range offset of {1000 * offset:.0f} mm exceeds the {1000 * admitted:.0f} mm that the "
-        "maker of the range finder admits (session.json may state systematic_error_m): check the "
-        "stated size of the board and of the squares of its chessboard (the expected errors count "
-        "this as an error of every range), the unit of the ranges and the angular step"
-    )
-    answer = NO if abs(offset) > 2 * admitted + margin else CARE
-    return [Finding(answer, Kind.RANGE_OFFSET, words)]
+    if abs(offset) > admitted + margin:
+        words = (
+            f"the range offset of {1000 * offset:.0f} mm exceeds the {1000 * admitted:.0f} mm that "
+            "the maker of the range finder admits (session.json may state systematic_error_m): "
+            "check the stated size of the board and of the squares of its chessboard (the expected "
+            "errors count this as an error of every range), the unit of the ranges and the angular "
+            "step"
+        )
+        answer = NO if abs(offset) > 2 * admitted + margin else CARE
+        yield Finding(answer, Kind.RANGE_OFFSET, words)
 
 
-def beyond_spot(solution):
-    """Finding about readings that change where the stated spot no longer touches the board."""
+def beyond_spot(solution) -> Iterator[Finding]:
+    """Readings that change where the stated spot no longer touches the board."""
     bias = solution.edge_bias
-    if abs(bias) <= RIM:
-        return []
-    words = (
-        f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius outside "
-        "the edges): state spot_exit_m and spot_divergence_rad as they are, or measure the "
-        "board's edges"
-    )
-    return [Finding(CARE, Kind.SPOT, words)]
+    if abs(bias) > RIM:
+        words = (
+            f"readings change at the rim of the stated spot ({100 * bias:.0f} % of its radius "
+            "outside the edges): state spot_exit_m and spot_divergence_rad as they are, or measure "
+            "the board's edges"
+        )
+        yield Finding(CARE, Kind.SPOT, words)
 
 
-def pitch_turns_otherwise(solution):
-    """Finding about a platform that turns more or less than its recorded pitch says."""
+def pitch_turns_otherwise(solution) -> Iterator[Finding]:
+    """A platform that turns more or less than its recorded pitch says."""
     scale = solution.sensor["pitch_scale"]
     sigma = solution.sigma.get("pitch_scale", 0.0)
-    if abs(scale) <= max(CONTRADICTS * sigma, LARGE_SCALE):
-        return []
-    words = (
-        f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
-        f"{'more' if scale > 0 else 'less'} than its recorded pitch says: check its gear or "
-        "encoder (the estimate has taken this off)"
-    )
-    return [Finding(CARE, Kind.PITCH_SCALE, words)]
+    if abs(scale) > max(CONTRADICTS * sigma, LARGE_SCALE):
+        words = (
+            f"the platform turns {100 * abs(scale):.1f} +- {100 * sigma:.1f} % "
+            f"{'more' if scale > 0 else 'less'} than its recorded pitch says: check its gear or "
+            "encoder (the estimate has taken this off)"
+        )
+        yield Finding(CARE, Kind.PITCH_SCALE, words)
 
 
 def falsified(joint: JointCalibration) -> pd.DataFrame:

@@ -4,7 +4,7 @@ What counts is relative to the head at the pitch of the image: a point measured 
 nothing to the axis.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,6 +57,16 @@ class Chain:
     unseen: np.ndarray
     sweep_sigma: tuple[float, float] = (0.0, 0.0)
 
+    def doubted(self, doubt: float) -> "Chain":
+        """The same where all ranges may be wrong by so many metres beside what is known.
+
+        Boards of a wrong size stand elsewhere before the cameras: the range offset or the cameras'
+        places have taken it up.
+        """
+        taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
+        unsure = np.diag(doubt**2 * taken_up)
+        return replace(self, covariances=tuple(C + unsure for C in self.covariances))
+
 
 def columns_of(solution: JointSolution, camera: str | None = None) -> np.ndarray:
     """Where each of `COLUMNS` stands among the shared unknowns, -1 where it was none, (13,)."""
@@ -73,15 +83,7 @@ def chain_of(solution: JointSolution, camera: str | None = None) -> Chain:
     solution
     camera
         Its name; None for points of the cloud.
-
-    Raises
-    ------
-    ValueError
-        If there is no such camera.
     """
-    if camera is not None and camera not in solution.transforms:
-        cameras = ", ".join(solution.transforms) or "none"
-        raise ValueError(f"cameras are {cameras}; got '{camera}'")
     estimate = solution.solution
     index = columns_of(solution, camera)
     known = index >= 0
@@ -149,7 +151,7 @@ def projection_sigma(
         Root mean square distance from the true pixel; inf where a motion that matters is not
         determined, NaN where no scan reaches.
     """
-    away = positive(distances)[:, None, None]
+    away = np.reshape(distances, (-1, 1, 1))
     bearing, pitch = beams_of_pixels(chain, model, pixel_grid(model, grid), away, image_pitch)
     points, by_link, by_pitch = carried(chain, bearing, pitch, away, image_pitch)
     P, *_ = project_jacobians(points, model)
@@ -178,7 +180,7 @@ def point_sigma(
     distances: ArrayLike,
     *,
     reference: float = 0.0,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """How far off a reconstructed point may be, over the field of view.
 
     Relative to the head at the pitch `reference`: a turn of the whole cloud does not count. Errors
@@ -198,26 +200,21 @@ def point_sigma(
     -------
     ndarray, shape (d, r, c)
         Metres; inf where a motion that matters is not determined.
+    ndarray, shape (d, r, c)
+        What errors of single sweeps contribute, metres.
     """
-    away = positive(distances)[:, None, None]
+    away = np.reshape(distances, (-1, 1, 1))
     _, by_link, by_pitch = carried(chain, bearings, pitches[:, None], away, reference)
     offset, stretch = chain.sweep_sigma
     sigma_pitch = np.hypot(offset, stretch * (pitches - reference))[:, None]
-    return np.hypot(spread(chain, by_link), sigma_pitch * np.linalg.norm(by_pitch, axis=-1))
+    by_sweep = sigma_pitch * np.linalg.norm(by_pitch, axis=-1)
+    return np.hypot(spread(chain, by_link), by_sweep), by_sweep
 
 
 def root_mean_square(sigma: np.ndarray) -> float:
     """Of what scans reach (no NaN); inf where they reach nothing."""
     reached = sigma[~np.isnan(sigma)]
     return float(np.sqrt(np.mean(reached**2))) if reached.size else np.inf
-
-
-def positive(distances: ArrayLike) -> np.ndarray:
-    """Distances as an array, metres; a ValueError where one is none."""
-    distances = np.atleast_1d(np.asarray(distances, float))
-    if not (np.isfinite(distances).all() and distances.min() > 0):
-        raise ValueError(f"distances must be positive, metres; got {distances.tolist()}")
-    return distances
 
 
 def range_noise(solution: JointSolution) -> float:
@@ -227,40 +224,50 @@ def range_noise(solution: JointSolution) -> float:
     return float(np.median(solution.observations.face_sigma) * solution.noise["face_scale"])
 
 
-def carried(chain, bearing, pitch, distance, image_pitch=0.0):
+def carried(
+    chain: Chain,
+    bearing: ArrayLike,
+    pitch: ArrayLike,
+    distance: ArrayLike,
+    image_pitch: ArrayLike = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ends of beams in the frame of an image, and what moves them.
 
-    Of beams with bearing, pitch (radians) and distance from the mirror (metres), and for an image
-    of a camera on the head at `image_pitch`: points (..., 3) in the camera frame (without a camera
-    the LRF frame of a scan at that pitch), metres, and their derivatives by `COLUMNS` (..., 3, 13)
-    and by the pitch of the beam (..., 3).
+    Parameters
+    ----------
+    chain
+    bearing, pitch, distance : array_like, shape (...)
+        Of the beams: radians, and metres from the mirror.
+    image_pitch : array_like
+        Of a camera on the head, radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Points in the camera frame (without a camera the LRF frame of a scan at `image_pitch`),
+        metres.
+    ndarray, shape (..., 3, 13)
+        Their derivatives by `COLUMNS`.
+    ndarray, shape (..., 3)
+        Their derivatives by the pitch of the beam.
     """
-    beams = (np.asarray(values, float) for values in (bearing, pitch, distance))
-    bearing, pitch, distance = np.broadcast_arrays(*beams)
+    bearing, pitch, distance = np.broadcast_arrays(bearing, pitch, distance)
     R = chain.head[:, :3]
     t = chain.head[:, 3]
-    identity = np.eye(3)
-    turn = pitch
-    back = 0.0  # 1 where the image is taken from the head: points go back through the axis
-    if chain.on_head:
-        turn = pitch - image_pitch
-        back = 1.0
-    d_head = polar_to_points(np.ones_like(distance), bearing) @ R.T
-    p = distance[..., None] * d_head
-    x = tilt(p + t, turn)
-    axes = tilt(np.broadcast_to(identity, turn.shape + (3, 3)), turn[..., None])
-    M = np.swapaxes(axes, -1, -2)  # rotation by the turn
-    by_rotation = back * hat(x - t) - M @ hat(p)
-    by_translation = M - back * identity
-    by_head = np.concatenate([by_rotation, by_translation], axis=-1)
-    by_axis = by_head[..., [1, 2, 4, 5]]  # a turn about x and a shift along it change nothing
-    by_range = -tilt(d_head, turn)[..., None]
-    by_turn = np.cross([1.0, 0.0, 0.0], x)[..., None]
-    by_scale = by_turn * turn[..., None, None]
-    by_direction = (1 - back) * by_turn
-    A = identity
-    if chain.on_head:
-        A = R.T
+    back = float(chain.on_head)  # 1: points go back through the axis to the head at the image
+    turn = pitch - back * image_pitch
+    beam = polar_to_points(1.0, bearing) @ R.T
+    p_head = distance[..., None] * beam
+    x = tilt(p_head + t, turn)
+    M = np.swapaxes(tilt(np.eye(3), turn[..., None]), -1, -2)
+    # a turn of the head about x and a shift along it change nothing
+    by_turn_of_axis = (back * hat(x - t) - M @ hat(p_head))[..., 1:]
+    by_shift_of_axis = (M - back * np.eye(3))[..., 1:]
+    by_pitch = np.cross([1.0, 0.0, 0.0], x)
+    by_scale = turn[..., None] * by_pitch
+    by_sensor = np.stack([-tilt(beam, turn), by_scale, (1 - back) * by_pitch], axis=-1)
+
+    A = R.T if chain.on_head else np.eye(3)
     points = (x - back * t) @ A.T
     by_camera = np.zeros((*points.shape, 6))
     if chain.camera is not None:
@@ -268,10 +275,11 @@ def carried(chain, bearing, pitch, distance, image_pitch=0.0):
         A = C @ A
         points = points @ C.T
         by_camera[..., :3] = -hat(points)
-        by_camera[..., 3:] = identity
+        by_camera[..., 3:] = np.eye(3)
         points = points + chain.camera[:, 3]
-    columns = [A @ by_axis, by_camera, A @ by_range, A @ by_scale, A @ by_direction]
-    return points, np.concatenate(columns, axis=-1), (A @ by_turn)[..., 0]
+    by_axis = A @ np.concatenate([by_turn_of_axis, by_shift_of_axis], axis=-1)
+    by_link = np.concatenate([by_axis, by_camera, A @ by_sensor], axis=-1)
+    return points, by_link, by_pitch @ A.T
 
 
 def spread(chain, jacobian):
@@ -313,8 +321,7 @@ def beams_to(points, T_head_lrf):
 
 def beams_of_pixels(chain, model, uv, distance, image_pitch):
     """Bearing and pitch of beams of a given length that end on the rays of pixels (..., 2)."""
-    normal = (undistort(uv, model) - [model.cx, model.cy]) / [model.fx, model.fy]
-    ray = np.concatenate([normal, np.ones_like(normal[..., :1])], axis=-1)
+    ray = np.insert(undistort(uv, model), 2, 1.0, axis=-1) @ np.linalg.inv(model.matrix).T
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = distance * np.ones(ray.shape[:-1])
     for _ in range(ROUNDS):

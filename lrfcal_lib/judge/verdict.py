@@ -33,7 +33,7 @@ from lrfcal_lib.judge.weaknesses import (
     sides_elsewhere,
 )
 from lrfcal_lib.model.camera import CameraModel
-from lrfcal_lib.model.geometry import POSE_NAMES, DegenerateGeometry, pose_array
+from lrfcal_lib.model.geometry import DegenerateGeometry, pose_array
 from lrfcal_lib.model.problem import ProblemKind
 from lrfcal_lib.preprocess.prepared import LEAST_SWEEP
 from lrfcal_lib.solvers.joint import JointSolution
@@ -53,8 +53,6 @@ BEARINGS = np.radians(np.linspace(60, 120, 7))
 PITCHES = 9  # of the field that errors are judged over
 LEAST_FIELD = np.radians(10.0)  # at least so far up and down from the middle of the sweeps
 PIXELS = (12, 9)  # columns and rows of pixels that errors are judged at
-ROWS = ("top", "", "bottom")
-SIDES = ("left", "", "right")
 MANY = 12  # placements that are enough to know their scatter
 RECORD = (
     f"Record next: {FEW} or more placements that all cameras see, the board leaning every way by "
@@ -118,9 +116,6 @@ class Verdict:
     errors : dict of float to ExpectedError
         By distance in metres, errors of the model included as far as they scatter over placements;
         empty where nothing is handed over.
-    regions : dict of str to dict of str to float
-        By camera and ninth of its image ('top left', 'top', ..., 'middle'): pixels at 2 m; NaN
-        where no scan reaches.
     range_noise_mm : float
         Of every single point, on top.
     sweep_mm : float
@@ -136,7 +131,6 @@ class Verdict:
     answer: Answer
     reasons: tuple[Finding, ...]
     errors: dict[float, ExpectedError]
-    regions: dict[str, dict[str, float]]
     range_noise_mm: float
     sweep_mm: float
     suggestion: Suggestion | None = None
@@ -150,7 +144,6 @@ class Verdict:
             "reasons": [vars(reason) for reason in self.reasons],
             "notes": self.notes,
             "expected_error_at_m": {f"{d:g}": error.record() for d, error in self.errors.items()},
-            "expected_px_at_2_m": self.regions,
         }
 
     def sentences(self) -> list[str]:
@@ -161,14 +154,6 @@ class Verdict:
         sentences = [f"{first}."]
         for distance, error in self.errors.items():
             sentences.append(f"Expected error at {distance:g} m: {error.words()}.")
-        for camera, by_region in self.regions.items():
-            ordered = sorted((px, region) for region, px in by_region.items() if np.isfinite(px))
-            if ordered:
-                (least, best), (most, worst) = ordered[0], ordered[-1]
-                sentences.append(
-                    f"In the image of '{camera}' at {WORKING:g} m the expected error ranges from "
-                    f"{brief(least)} px ({best}) to {brief(most)} px ({worst})."
-                )
         sentences += self.notes
         if self.errors:
             sentences.append(
@@ -280,7 +265,7 @@ def verdict(
     if not suggest:
         return judged
     try:
-        suggestion = suggest_placement(solution, models, field_of_view=field_of_view)
+        suggestion = suggest_placement(solution, models, field_of_view)
     except DegenerateGeometry as error:
         return replace(judged, no_suggestion=f"No placement can be suggested: {error}.")
     return replace(judged, suggestion=suggestion)
@@ -303,19 +288,9 @@ class Ways:
     pitch: np.ndarray
 
     def doubted(self, doubt: float) -> "Ways":
-        """The same where all ranges may be wrong by so many metres beside what is known.
-
-        Boards of a wrong size stand elsewhere before the cameras: ranges or the cameras' places
-        have taken it up.
-        """
-        taken_up = np.isin(COLUMNS, ["range_offset", *POSE_NAMES[3:]])
-        unsure = np.diag(doubt**2 * taken_up)
-
-        def of(chain):
-            return replace(chain, covariances=tuple(C + unsure for C in chain.covariances))
-
-        cameras = {camera: of(chain) for camera, chain in self.cameras.items()}
-        return Ways(of(self.cloud), cameras, self.pitch)
+        """The same where all ranges may be wrong by so many metres beside what is known."""
+        cameras = {camera: chain.doubted(doubt) for camera, chain in self.cameras.items()}
+        return Ways(self.cloud.doubted(doubt), cameras, self.pitch)
 
 
 def _expected(ways, models, noise):
@@ -323,15 +298,14 @@ def _expected(ways, models, noise):
 
     `noise` is that of single ranges, metres.
     """
-    low = ways.pitch.min(initial=np.inf)
-    high = ways.pitch.max(initial=-np.inf)
-    if not len(ways.pitch):
-        low = high = 0.0
+    low = high = 0.0
+    if len(ways.pitch):
+        low, high = ways.pitch.min(), ways.pitch.max()
     middle = (low + high) / 2
     field = (min(low, middle - LEAST_FIELD), max(high, middle + LEAST_FIELD))
     middle = sum(field) / 2
     pitches = np.linspace(*field, PITCHES)
-    cloud = point_sigma(ways.cloud, BEARINGS, pitches, DISTANCES, reference=middle)
+    cloud, sweeps = point_sigma(ways.cloud, BEARINGS, pitches, DISTANCES, reference=middle)
     images = {
         camera: projection_sigma(
             chain, models[camera], DISTANCES, PIXELS, image_pitch=middle, pitches=field
@@ -343,17 +317,12 @@ def _expected(ways, models, noise):
         pixels = {camera: bounded(root_mean_square(px[i])) for camera, px in images.items()}
         errors[distance] = ExpectedError(bounded(1000 * root_mean_square(cloud[i])), pixels)
 
-    known = np.zeros((len(COLUMNS), len(COLUMNS)))
-    only_sweeps = replace(ways.cloud, covariances=(known,), unseen=np.zeros((0, len(COLUMNS))))
-    sweeps = point_sigma(only_sweeps, BEARINGS, pitches, WORKING, reference=middle)
-    at_work = DISTANCES.index(WORKING)
     judged = Verdict(
         YES,
         (),
         errors,
-        regions={camera: ninths(px[at_work]) for camera, px in images.items()},
         range_noise_mm=1000 * float(noise),
-        sweep_mm=1000 * root_mean_square(sweeps),
+        sweep_mm=1000 * root_mean_square(sweeps[DISTANCES.index(WORKING)]),
     )
     large = errors[WORKING].words(POOR_MM, POOR_PX)
     if not large:
@@ -361,20 +330,6 @@ def _expected(ways, models, noise):
     answer = NO if errors[WORKING].words(BAD_MM, BAD_PX) else CARE
     words = f"the expected error at {WORKING:g} m is {large}"
     return judged.because([Finding(answer, Kind.ERROR, words)])
-
-
-def ninths(sigma: np.ndarray) -> dict[str, float]:
-    """Root mean square of errors (rows, columns) over the ninths of an image, by their names.
-
-    NaN where no scan reaches.
-    """
-    regions = {}
-    for row, rows in zip(ROWS, np.array_split(sigma, 3), strict=True):
-        for side, part in zip(SIDES, np.array_split(rows, 3, axis=1), strict=True):
-            name = f"{row} {side}".strip() or "middle"
-            reached = part[~np.isnan(part)]
-            regions[name] = root_mean_square(reached) if reached.size else np.nan
-    return regions
 
 
 def _refused(calibration, findings):
@@ -399,7 +354,7 @@ def _refused(calibration, findings):
     if prepared.problems:
         lost = [str(problem) for problem in prepared.problems]
         notes = (f"Left out: {len(lost)} ({'; '.join(lost)}).",)
-    judged = Verdict(NO, (), {}, {}, np.nan, 0.0, no_suggestion=RECORD, notes=notes)
+    judged = Verdict(NO, (), {}, np.nan, 0.0, no_suggestion=RECORD, notes=notes)
     return judged.because([*findings, refused])
 
 

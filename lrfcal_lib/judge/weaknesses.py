@@ -1,5 +1,6 @@
 """What is weak about a joint estimate, and about the recording behind any result."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,41 +43,49 @@ def diagnose(solution: JointSolution) -> list[Finding]:
     -------
     list of Finding
     """
-    findings = []
+    return [
+        *weak_estimate(solution),
+        *weak_placements(solution),
+        *weak_pitch(solution),
+        *weak_poses(solution),
+        *large_residuals(solution),
+        *(Finding(CARE, Kind.WARNING, words) for words in solution.warnings),
+    ]
+
+
+def weak_estimate(solution) -> Iterator[Finding]:
+    """What keeps the estimate from an answer."""
     if not solution.converged:
-        words = f"the estimate has not converged after {solution.solution.iterations} iterations"
-        findings.append(Finding(NO, Kind.CONVERGENCE, words))
+        iterations = solution.solution.iterations
+        words = f"the estimate has not converged after {iterations} iterations"
+        yield Finding(NO, Kind.CONVERGENCE, words)
     obs = solution.observations
     for number, camera in enumerate(obs.cameras):
         count = len(np.unique(obs.view_placement[obs.view_camera == number]))
         if count < FEWEST:
             words = f"camera '{camera}' sees the board in {count} placements only"
-            findings.append(Finding(CARE, Kind.CAMERAS, words))
+            yield Finding(CARE, Kind.CAMERAS, words)
     if solution.unobservable:
         words = f"the data do not determine {'; '.join(solution.unobservable)}"
-        findings.append(Finding(NO, Kind.UNOBSERVABLE, words))
-    findings += weak_placements(solution) + weak_pitch(solution) + weak_poses(solution)
-    findings += large_residuals(solution)
-    return findings + [Finding(CARE, Kind.WARNING, words) for words in solution.warnings]
+        yield Finding(NO, Kind.UNOBSERVABLE, words)
 
 
-def weak_placements(solution):
-    """Findings about the number of placements."""
+def weak_placements(solution) -> Iterator[Finding]:
+    """The number of placements."""
     count = len(solution.boards)
-    if count >= FEW:
-        return []
-    words = f"{count} placements only, {FEW} or more are needed to see errors of the model"
-    return [Finding(NO if count < FEWEST else CARE, Kind.PLACEMENTS, words)]
+    if count < FEW:
+        words = f"{count} placements only, {FEW} or more are needed to see errors of the model"
+        yield Finding(NO if count < FEWEST else CARE, Kind.PLACEMENTS, words)
 
 
-def weak_pitch(solution):
-    """Findings about the pitch of scans and images, which shows the axis."""
-    if not any(name in solution.solution.names for name in AXIS_NAMES):
-        return []
+def weak_pitch(solution) -> Iterator[Finding]:
+    """The pitch of scans and images, which shows the axis."""
+    if AXIS_NAMES[0] not in solution.solution.names:
+        return
     obs = solution.observations
-    on_head = np.array([mount == "head" for mount in obs.mounts], bool)[obs.view_camera]
-    image_pitch = obs.view_pitch[on_head]
-    image_placement = obs.view_placement[on_head]
+    of_view = np.isin(obs.view_camera, np.flatnonzero(np.array(obs.mounts) == "head"))
+    image_pitch = obs.view_pitch[of_view]
+    image_placement = obs.view_placement[of_view]
     pitch = np.concatenate([obs.face_pitch, obs.beam_pitch, image_pitch])
     placement = np.concatenate([obs.face_placement, obs.beam_placement, image_placement])
     where = " within a placement"
@@ -89,22 +98,20 @@ def weak_pitch(solution):
             f"the recorded pitch ranges over {np.degrees(span):.1f} deg only{where}: the tilt axis "
             "is hardly determined"
         )
-        return [Finding(NO, Kind.PITCH, words)]
-    if len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH:
+        yield Finding(NO, Kind.PITCH, words)
+    elif len(image_pitch) and largest_range(image_pitch, image_placement) < SMALL_IMAGE_PITCH:
         words = (
             "every placement has its images at one pitch: the tilt axis rests on the scans of "
             "small boards"
         )
-        return [Finding(CARE, Kind.IMAGE_PITCH, words)]
-    return []
+        yield Finding(CARE, Kind.IMAGE_PITCH, words)
 
 
-def weak_poses(solution):
-    """Findings about boards that stand alike."""
+def weak_poses(solution) -> Iterator[Finding]:
+    """Boards that stand alike."""
     boards = solution.board_poses
     if len(boards) < 2:
-        return []
-    findings = []
+        return
     normals = boards[:, :, 2]
     mean = normals.mean(axis=0)
     apart = np.arccos(np.clip(normals @ mean / np.linalg.norm(mean), -1, 1)).max()
@@ -113,7 +120,7 @@ def weak_poses(solution):
             f"all boards are parallel (within {np.degrees(apart):.1f} deg): lean them every way "
             "by 20 deg and more"
         )
-        findings.append(Finding(CARE, Kind.PARALLEL, words))
+        yield Finding(CARE, Kind.PARALLEL, words)
     distance = np.linalg.norm(sights(boards, solution), axis=1)
     if np.ptp(distance) < SAME_DISTANCE * np.median(distance):
         words = (
@@ -121,13 +128,11 @@ def weak_poses(solution):
             "errors at other distances are extrapolated, and a range offset is hard to tell from "
             "shifts"
         )
-        findings.append(Finding(CARE, Kind.DISTANCE, words))
-    return findings
+        yield Finding(CARE, Kind.DISTANCE, words)
 
 
-def large_residuals(solution):
+def large_residuals(solution) -> Iterator[Finding]:
     """What residuals and their scatter over placements say against the model."""
-    findings = []
     usual = max(np.median([*solution.misfit.values()]), 1.0)
     misfits = [
         f"{placement} ({np.sqrt(square / usual):.1f} times)"
@@ -136,27 +141,25 @@ def large_residuals(solution):
     ]
     if misfits:
         words = f"placements fit much worse than the others: {', '.join(misfits)}"
-        findings.append(Finding(CARE, Kind.MISFIT, words))
+        yield Finding(CARE, Kind.MISFIT, words)
     if solution.excluded:
-        words = "; ".join(solution.excluded.values())
-        findings.append(Finding(CARE, Kind.EXCLUDED, words))
+        yield Finding(CARE, Kind.EXCLUDED, "; ".join(solution.excluded.values()))
 
     ratio = scatter_over_placements(solution)
-    worst = max(ratio, key=ratio.__getitem__, default="axis")
-    if ratio.get(worst, 0.0) > MODEL_ERROR:
+    worst = max(ratio, key=ratio.__getitem__)
+    if ratio[worst] > MODEL_ERROR:
         what = "the axis" if worst == "axis" else f"camera '{worst}'"
         words = (
             f"placements disagree about {what} {ratio[worst]:.1f} times more than noise explains: "
             "an error of the model"
         )
-        findings.append(Finding(CARE, Kind.MODEL_ERROR, words))
+        yield Finding(CARE, Kind.MODEL_ERROR, words)
 
     noise = {"ranges": solution.noise["face_scale"]} | noise_of_images(solution)
     large = [f"{name} {scale:.1f} times" for name, scale in noise.items() if scale > STATED]
     if large:
-        answer = NO if max(noise.values()) > ABSURD else CARE
         words = f"residuals are larger than the stated noise ({', '.join(large)})"
-        findings.append(Finding(answer, Kind.NOISE, words))
+        yield Finding(NO if max(noise.values()) > ABSURD else CARE, Kind.NOISE, words)
 
     # beams about an edge always repeat errors: they share a background
     share = solution.noise["face_share"]
@@ -165,15 +168,14 @@ def large_residuals(solution):
             f"only {100 * share:.0f} % of the errors of ranges are independent: neighbouring "
             "ranges have the same error (boards that bend, a pitch that is off)"
         )
-        findings.append(Finding(CARE, Kind.DEPENDENT, words))
-    return findings
+        yield Finding(CARE, Kind.DEPENDENT, words)
 
 
 def scatter_over_placements(solution):
     """Scatter of axis and cameras over placements, in standard deviations of the noise."""
     clustered = solution.solution.covariance_placements
     if clustered is None:
-        return {}
+        return {"axis": 0.0}
     noise = group_sigma(solution.solution.covariance, solution)
     scatter = group_sigma(clustered, solution)
     return {name: scatter[name] / max(sigma, 1e-12) for name, sigma in noise.items()}
@@ -204,39 +206,45 @@ def noise_of_images(solution: JointSolution) -> dict[str, float]:
     return scatter
 
 
-def sides_elsewhere(prepared: Prepared) -> list[Finding]:
+def sides_elsewhere(prepared: Prepared) -> Iterator[Finding]:
     """Edges of the board that lie elsewhere than stated in most scans across them.
 
     Parameters
     ----------
     prepared
+
+    Yields
+    ------
+    Finding
+        One an edge.
     """
-    findings = []
     elsewhere = [side for sides in prepared.dropped.values() for side in sides.values()]
     for edge in prepared.board.edges:
         dropped = [side for side in elsewhere if side.edge == edge]
         crossed = len(dropped) + sum(edge in names.values() for names in prepared.names.values())
-        if len(dropped) < FEWEST or len(dropped) <= MOST * crossed:
-            continue
-        turn = np.degrees(np.median([side.turn for side in dropped]))
-        off = 1000 * np.median([side.distance for side in dropped])
-        words = (
-            f"the board's edge '{edge}' lies elsewhere than its outline says in {len(dropped)} of "
-            f"{crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) and is not used there: "
-            "measure the board's edges (corners_m)"
-        )
-        findings.append(Finding(CARE, Kind.OUTLINE, words))
-    return findings
+        if len(dropped) >= FEWEST and len(dropped) > MOST * crossed:
+            turn = np.degrees(np.median([side.turn for side in dropped]))
+            off = 1000 * np.median([side.distance for side in dropped])
+            words = (
+                f"the board's edge '{edge}' lies elsewhere than its outline says in "
+                f"{len(dropped)} of {crossed} scans ({off:.0f} mm off, turned by {turn:.1f} deg) "
+                "and is not used there: measure the board's edges (corners_m)"
+            )
+            yield Finding(CARE, Kind.OUTLINE, words)
 
 
-def blind_cameras(prepared: Prepared) -> list[Finding]:
+def blind_cameras(prepared: Prepared) -> Iterator[Finding]:
     """Cameras that do not see the board in many placements.
 
     Parameters
     ----------
     prepared
+
+    Yields
+    ------
+    Finding
+        One a camera.
     """
-    findings = []
     placements = prepared.session.board_placements
     for camera, views in prepared.views.items():
         why = {p: views[p].reason if p in views else "no image" for p in placements}
@@ -246,8 +254,7 @@ def blind_cameras(prepared: Prepared) -> list[Finding]:
                 f"camera '{camera}' does not see the board in {len(unseen)} of {len(placements)} "
                 f"placements: {', '.join(unseen)}"
             )
-            findings.append(Finding(CARE, Kind.LEFT_OUT, words))
-    return findings
+            yield Finding(CARE, Kind.LEFT_OUT, words)
 
 
 @dataclass(frozen=True)
